@@ -1,0 +1,226 @@
+"""The encoders installed on a machine: those packaged here and those of the user's directory.
+
+An encoder is one file ``<name>.encoder.safetensors`` (vocabulary, golden descriptor, definition,
+calibration) that names a network file ``<network>.network.safetensors`` beside it or among the
+packaged ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame
+from core.errors import InvalidModel, UnknownEncoder
+from core.identity import canonical_json
+from core.network import NAME, load_network
+from core.verdict import Calibration
+from core.vocabulary import Vocabulary
+
+DEFAULT_ENCODER = "m-region-vlad"
+PACKAGED = Path(__file__).parent / "models"
+FORMAT = "placerec-encoder/1"
+ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
+
+
+class EncoderSummary(BaseModel):
+    """One installed encoder as a user sees it; ``damaged`` says why it cannot be used."""
+
+    name: str
+    identity: str
+    dimension: int
+    default: bool
+    source: Literal["packaged", "installed"]
+    network: str
+    definition: EncoderDefinition | None
+    calibration: Calibration | None
+    training: dict[str, Any]
+    damaged: str | None = None
+
+
+class _Header(BaseModel):
+    """The metadata of an encoder file."""
+
+    name: str
+    identity: str
+    network: str
+    origin: str
+    definition: EncoderDefinition
+    calibration: Calibration
+    training: dict[str, Any]
+    dimension: int
+
+
+def save_encoder(
+    folder: Path,
+    encoder: Encoder,
+    vocabulary: Vocabulary,
+    network: str,
+    training: dict[str, Any],
+) -> Path:
+    """Write ``<name>.encoder.safetensors``, whole or not at all.
+
+    Args:
+        network: name of the network file that the encoder uses.
+        training: how the vocabulary was made (images, features, seed …), for the reader.
+
+    Raises:
+        InvalidModel: the encoder's name cannot name a file.
+    """
+    if not re.match(NAME, encoder.name):
+        raise InvalidModel(f"{encoder.name!r} cannot name an encoder: it must match {NAME}.")
+    header = _Header(
+        name=encoder.name,
+        identity=encoder.identity,
+        network=network,
+        origin=vocabulary.origin,
+        definition=encoder.definition,
+        calibration=encoder.calibration,
+        training=training,
+        dimension=encoder.dimension,
+    )
+    golden = encoder.encode(canary_frame()).descriptor.astype(np.float16)
+    path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
+    partial = path.with_name(path.name + ".tmp")
+    save_file(
+        {"centers": vocabulary.centers, "golden": golden},
+        partial,
+        {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))},
+    )
+    partial.chmod(0o644)
+    os.replace(partial, path)
+    return path
+
+
+def _read_header(path: Path) -> _Header:
+    try:
+        with safe_open(path, "np") as file:
+            metadata = file.metadata() or {}
+        if metadata.get("format") != FORMAT:
+            raise InvalidModel(f"{path.name} is not a {FORMAT} file.")
+        header = _Header.model_validate(json.loads(metadata["header"]))
+    except (OSError, SafetensorError, KeyError, ValueError, ValidationError) as error:
+        raise InvalidModel(f"{path.name} is not a readable encoder file: {error}") from error
+    if path.name != header.name + ENCODER_SUFFIX:
+        raise InvalidModel(f"{path.name} holds the encoder {header.name!r}: a file is named as its encoder.")
+    return header
+
+
+def load_encoder(path: Path, network: Path) -> Encoder:
+    """Build the encoder of a file on the network of another.
+
+    Raises:
+        InvalidModel: a file is missing or damaged, or the parts do not give the identity that the
+            encoder was saved with.
+    """
+    header = _read_header(path)
+    try:
+        with safe_open(path, "np") as file:
+            centers, golden = file.get_tensor("centers"), file.get_tensor("golden")
+    except (OSError, SafetensorError) as error:
+        raise InvalidModel(f"{path.name} cannot be read: {error}") from error
+    vocabulary = Vocabulary(np.asarray(centers, np.float32), header.origin)
+    extractor = FeatureExtractor(load_network(network, header.definition.layers), header.definition)
+    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, golden)
+    if encoder.identity != header.identity:
+        raise InvalidModel(f"{path.name} says it is {header.identity}, its contents are {encoder.identity}.")
+    return encoder
+
+
+class EncoderCatalogue:
+    """Finds encoders by name or identity and loads each once; thread-safe.
+
+    Args:
+        models_dir: the user's directory, which need not exist; its encoders cannot take a packaged
+            name.
+    """
+
+    def __init__(self, models_dir: Path | None = None) -> None:
+        self._folders = [PACKAGED] + ([models_dir] if models_dir is not None else [])
+        self._loaded: dict[Path, Encoder] = {}
+        self._lock = threading.Lock()
+
+    def _files(self) -> dict[str, Path]:
+        found: dict[str, Path] = {}
+        for folder in self._folders:
+            for path in sorted(folder.glob(f"*{ENCODER_SUFFIX}")):
+                found.setdefault(path.name.removesuffix(ENCODER_SUFFIX), path)
+        return found
+
+    def network_file(self, name: str) -> Path:
+        """The file of a network.
+
+        Raises:
+            InvalidModel: there is none of that name.
+        """
+        for folder in self._folders:
+            path = folder / f"{name}{NETWORK_SUFFIX}"
+            if re.match(NAME, name) and path.is_file():
+                return path
+        raise InvalidModel(f"no network named {name!r} is installed; its file would be {name}{NETWORK_SUFFIX}.")
+
+    def describe(self) -> list[EncoderSummary]:
+        """All installed encoders by name, damaged ones too; no weights are read."""
+        return [self._summary(name, path) for name, path in self._files().items()]
+
+    def _summary(self, name: str, path: Path) -> EncoderSummary:
+        source: Literal["packaged", "installed"] = "packaged" if path.parent == PACKAGED else "installed"
+        common: dict[str, Any] = {"name": name, "source": source, "default": name == DEFAULT_ENCODER}
+        try:
+            header = _read_header(path)
+        except InvalidModel as error:
+            blank: dict[str, Any] = {
+                "identity": "",
+                "dimension": 0,
+                "network": "",
+                "definition": None,
+                "calibration": None,
+            }
+            return EncoderSummary(**common, **blank, training={}, damaged=str(error))
+        fields = header.model_dump(exclude={"origin", "name"})
+        return EncoderSummary(**common, **fields)
+
+    def resolve(self, name_or_identity: str) -> str:
+        """The full identity of an installed encoder.
+
+        Raises:
+            UnknownEncoder: none has this name or identity; the text says what to do.
+            InvalidModel: its file is damaged.
+        """
+        return _read_header(self._find(name_or_identity)).identity
+
+    def _find(self, name_or_identity: str) -> Path:
+        name, _, digest = name_or_identity.partition("@")
+        files = self._files()
+        if name not in files:
+            raise UnknownEncoder(f"no encoder {name[:80]!r} is installed; there are {', '.join(files) or 'none'}.")
+        if digest:
+            identity = _read_header(files[name]).identity
+            if identity != name_or_identity:
+                raise UnknownEncoder(
+                    f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
+                    "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."
+                )
+        return files[name]
+
+    def get(self, name_or_identity: str) -> Encoder:
+        """The encoder itself, loaded on first use.
+
+        Raises:
+            UnknownEncoder: none has this name or identity.
+            InvalidModel: its files are missing or damaged.
+        """
+        path = self._find(name_or_identity)
+        with self._lock:
+            if path not in self._loaded:
+                self._loaded[path] = load_encoder(path, self.network_file(_read_header(path).network))
+            return self._loaded[path]

@@ -1,0 +1,124 @@
+"""What a map remembers of a frame besides its descriptor: id, pose, time, sequence, metadata."""
+
+from __future__ import annotations
+
+import math
+import re
+from datetime import UTC, datetime
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from core.errors import InvalidIdentifier
+
+MAP_ID = r"[a-z0-9][a-z0-9._-]{0,63}"
+PLACE_ID = r"[A-Za-z0-9][A-Za-z0-9._~-]{0,127}"
+RESERVED_MAP_IDS = frozenset({"import"})
+EARTH_RADIUS = 6_371_008.8  # metres, mean
+
+Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
+
+
+def check_map_id(text: str) -> str:
+    """Return ``text`` if it can name a map.
+
+    Raises:
+        InvalidIdentifier: it cannot.
+    """
+    if not re.fullmatch(MAP_ID, text) or text in RESERVED_MAP_IDS:
+        raise InvalidIdentifier(f"{text[:80]!r} cannot name a map: it must match {MAP_ID} and not be 'import'.")
+    return text
+
+
+def check_place_id(text: str) -> str:
+    """Return ``text`` if it can name a place.
+
+    Raises:
+        InvalidIdentifier: it cannot.
+    """
+    if not re.fullmatch(PLACE_ID, text):
+        raise InvalidIdentifier(f"{text[:140]!r} cannot name a place: it must match {PLACE_ID}.")
+    return text
+
+
+class Pose(BaseModel):
+    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84).
+
+    ``heading`` is in degrees: counter-clockwise from +x beside x and y, clockwise from north beside
+    latitude and longitude.  It is kept within [0, 360).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    x: Coordinate | None = None
+    y: Coordinate | None = None
+    z: Coordinate | None = None
+    latitude: Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)] | None = None
+    longitude: Annotated[float, Field(ge=-180, le=180, allow_inf_nan=False)] | None = None
+    heading: Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False), AfterValidator(lambda a: a % 360)] | None = (
+        None
+    )
+
+    @model_validator(mode="after")
+    def _one_frame(self) -> Pose:
+        metric = (self.x is not None, self.y is not None)
+        geographic = (self.latitude is not None, self.longitude is not None)
+        if any(metric) != all(metric) or (self.z is not None and not all(metric)):
+            raise ValueError("a pose in metres needs x and y (z is optional)")
+        if any(geographic) != all(geographic):
+            raise ValueError("a pose in degrees needs latitude and longitude")
+        if all(metric) == all(geographic):
+            raise ValueError("a pose is either x, y[, z] or latitude, longitude")
+        return self
+
+    def position(self) -> NDArray[np.float64]:
+        """A 3-vector in metres: x, y, z (0 if absent), or the point on the sphere from its centre.
+
+        The straight distance between two positions of one kind is the distance of the frames
+        (chord for arc: under 1 mm of error in a kilometre).
+        """
+        if self.x is not None and self.y is not None:
+            return np.array([self.x, self.y, self.z or 0.0])
+        assert self.latitude is not None and self.longitude is not None
+        phi, theta = math.radians(self.latitude), math.radians(self.longitude)
+        unit = [math.cos(phi) * math.cos(theta), math.cos(phi) * math.sin(theta), math.sin(phi)]
+        return EARTH_RADIUS * np.array(unit)
+
+    def kind(self) -> Literal["metric", "geographic"]:
+        """Which of the two frames the pose is in."""
+        return "metric" if self.x is not None else "geographic"
+
+
+def _utc(moment: datetime) -> datetime:
+    """An instant in UTC; a time without a zone is taken as UTC."""
+    try:
+        return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+    except OverflowError:
+        raise ValueError("in UTC it is before the year 1 or after the year 9999") from None
+
+
+Timestamp = Annotated[datetime, AfterValidator(_utc)]
+Sequence = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f/]+$")]
+
+
+class PlaceFields(BaseModel):
+    """What a caller says about a frame; each may be left out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    pose: Pose | None = None
+    timestamp: Timestamp | None = None
+    sequence: Sequence | None = None
+    metadata: dict[str, Any] = Field(default_factory=dict)
+
+
+class Place(PlaceFields):
+    """One enrolled reference frame."""
+
+    id: str
+    regions: int = Field(ge=0, description="Regions of interest found in the frame.")
+    picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
+    created_at: Timestamp
+    updated_at: Timestamp

@@ -1,0 +1,35 @@
+"""The encoders that placerec knows by name, as definitions; their vocabularies are trained on these.
+
+The quantisation steps fit the packaged network, whose activations are of the order of one; a
+network with Caffe's scale (tens to hundreds) wants a step of 1.0.
+"""
+
+from __future__ import annotations
+
+from core.encoder import EncoderDefinition
+
+NETWORK = "placerec-hybrid"
+"""The packaged backbone."""
+
+PRESETS: dict[str, EncoderDefinition] = {
+    # Thesis, chapter 4: N = 300 regions of conv3 and of conv4, V = 128.
+    "m-region-vlad": EncoderDefinition(
+        layers=("conv3", "conv4"),
+        regions=300,
+        steps=(0.1, 0.1),
+        unit_features=True,
+        words=128,
+        gamma=0.5,
+        normalization="intra",
+    ),
+    # Thesis, chapter 3: N = 400 regions of conv3, V = 256.
+    "region-vlad": EncoderDefinition(
+        layers=("conv3",),
+        regions=400,
+        steps=(0.1,),
+        unit_features=True,
+        words=256,
+        gamma=0.5,
+        normalization="intra",
+    ),
+}

@@ -1,0 +1,156 @@
+"""Recognized, ambiguous or unknown: what the scores of one query against a map amount to.
+
+The raw score J / V does not travel between maps and conditions, so it is judged against the rest
+of the map.  The decision value says by how many standard deviations the best score stands out of
+the best of the scores of places that cannot be the one shown.  A map of a few places says little
+about those, so it is filled up with imagined places that score as unrelated frames did when the
+encoder was made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+Verdict = Literal["recognized", "ambiguous", "unknown"]
+
+NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
+
+FEWEST_PLACES = 16
+"""Maps with fewer places that are no match are filled up to this with imagined ones."""
+
+TOP_PLACES = 5
+"""The best score is held against the mean of so many of the best others."""
+
+
+class Calibration(BaseModel):
+    """When to believe a match; measured on frames held out of training.
+
+    ``threshold`` is on the decision value (standard deviations), ``margin`` on the difference of
+    two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
+    frames, in units of the score.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    source: str = Field(min_length=1, examples=["encoder-default"])
+    threshold: float = Field(allow_inf_nan=False)
+    margin: float = Field(ge=0, allow_inf_nan=False)
+    background_mean: float = Field(allow_inf_nan=False)
+    background_deviation: float = Field(gt=0, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """What counts as the same place: within ``radius`` metres, or ``frames`` frames of a sequence."""
+
+    radius: float
+    frames: int
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where n places are, one row each.
+
+    kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
+    position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
+    sequence: int32 [n], a code for the sequence's name; places without one share the code -1.
+    ordinal: int64 [n], order of enrolment within the sequence.
+    """
+
+    kind: NDArray[np.int8]
+    position: NDArray[np.float64]
+    sequence: NDArray[np.int32]
+    ordinal: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def take(self, rows: ArrayLike) -> Whereabouts:
+        """The places ``rows`` (integers or a mask) in that order."""
+        chosen = np.asarray(rows)
+        return Whereabouts(self.kind[chosen], self.position[chosen], self.sequence[chosen], self.ordinal[chosen])
+
+    def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
+        """Which of the places are the same place as ``row``, itself included; bool [n].
+
+        Two poses of one kind are compared by distance; otherwise the places must be of one
+        sequence, at most so many frames apart.
+        """
+        same_kind = (self.kind == self.kind[row]) & (self.kind != NO_POSE)
+        distance = np.sqrt(np.square(self.position - self.position[row]).sum(axis=1))
+        frames_apart = np.abs(self.ordinal - self.ordinal[row])
+        neighbours = (self.sequence == self.sequence[row]) & (frames_apart <= neighborhood.frames)
+        near = np.where(same_kind, distance <= neighborhood.radius, neighbours)
+        near[row] = True
+        return near
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A verdict and what it rests on; scores in the units of the encoder's score."""
+
+    verdict: Verdict
+    score: float | None
+    decision: float | None
+    margin: float | None
+    rival: int | None
+    """Position of the best rival in the ranking."""
+
+
+def standing_out(best: float, rest: NDArray[np.float32], calibration: Calibration) -> float:
+    """The decision value: (best - mean of the top of the rest) / standard deviation of the rest.
+
+    The best few of the rest grow with the number of places just as the best score of an unknown
+    place does, so the value means the same on a small map and on a large one.
+
+    Args:
+        best: the best score.
+        rest: float32 [n], n >= 0, best first: the scores of places that are not the best one's place.
+        calibration: says how the imagined places score.
+    """
+    scores = rest.astype(np.float64)
+    if len(scores) < FEWEST_PLACES:
+        missing = FEWEST_PLACES - len(scores)
+        quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / missing) for i in range(missing)])
+        imagined = calibration.background_mean + calibration.background_deviation * quantiles
+        scores = np.sort(np.concatenate([scores, imagined]))[::-1]
+    top = scores[:TOP_PLACES].mean()
+    # Equal scores throughout would make any difference infinite; the encoder's own spread bounds it.
+    spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
+    return float((best - top) / spread)
+
+
+def judge(
+    scores: NDArray[np.float32], whereabouts: Whereabouts, calibration: Calibration, neighborhood: Neighborhood
+) -> Judgement:
+    """The verdict on one query.
+
+    Args:
+        scores: float32 [n], best first: the query against every place of the map.
+        whereabouts: of the same n places in the same order.
+        calibration: thresholds of the map or of the encoder.
+        neighborhood: which places are no rivals of each other.
+
+    Returns:
+        ``unknown`` for an empty map and for a decision value under the threshold, ``ambiguous``
+        for a margin to the best rival under its limit, else ``recognized``.
+    """
+    if len(scores) == 0:
+        return Judgement("unknown", None, None, None, None)
+    best = float(scores[0])
+    others = np.flatnonzero(~whereabouts.near(0, neighborhood))
+    decision = standing_out(best, scores[others], calibration)
+    rival = int(others[0]) if len(others) else None
+    margin = None if rival is None else best - float(scores[rival])
+    verdict: Verdict = "recognized"
+    if decision < calibration.threshold:
+        verdict = "unknown"
+    elif margin is not None and margin < calibration.margin:
+        verdict = "ambiguous"
+    return Judgement(verdict, best, decision, margin, rival)

@@ -1,0 +1,115 @@
+"""The catalogue of installed encoders: found, loaded, refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from core.encoder import Encoder
+from core.encoders import DEFAULT_ENCODER, PACKAGED, EncoderCatalogue, save_encoder
+from core.errors import InvalidModel, UnknownEncoder
+from core.presets import NETWORK, PRESETS
+from core.vocabulary import Vocabulary
+
+
+@pytest.fixture(scope="module")
+def packaged() -> Encoder:
+    return EncoderCatalogue().get(DEFAULT_ENCODER)
+
+
+def install(folder: Path, packaged: Encoder, name: str) -> Path:
+    """A second encoder on the packaged network, with its words in another order."""
+    vocabulary = Vocabulary(packaged.centers[::-1].copy(), packaged.extractor.origin)
+    encoder = Encoder(name, packaged.extractor, packaged.definition, vocabulary, packaged.calibration)
+    return save_encoder(folder, encoder, vocabulary, NETWORK, {"images": 1})
+
+
+def test_the_packaged_encoders_are_the_presets() -> None:
+    summaries = {summary.name: summary for summary in EncoderCatalogue().describe()}
+    assert set(summaries) == set(PRESETS)
+    for name, definition in PRESETS.items():
+        assert summaries[name].definition == definition
+        assert summaries[name].damaged is None
+        assert summaries[name].default == (name == DEFAULT_ENCODER)
+    assert summaries[DEFAULT_ENCODER].dimension == 128 * 384
+
+
+def test_the_packaged_files_are_small() -> None:
+    assert sum(path.stat().st_size for path in PACKAGED.glob("*.safetensors")) < 10_000_000
+
+
+def test_names_and_identities_resolve(packaged: Encoder) -> None:
+    catalogue = EncoderCatalogue()
+    assert catalogue.resolve(DEFAULT_ENCODER) == packaged.identity == catalogue.resolve(packaged.identity)
+    assert catalogue.get(DEFAULT_ENCODER) is catalogue.get(packaged.identity)
+
+
+def test_an_unknown_name_lists_what_there_is() -> None:
+    with pytest.raises(UnknownEncoder, match="m-region-vlad"):
+        EncoderCatalogue().resolve("netvlad")
+
+
+def test_an_old_identity_is_refused_with_the_way_out() -> None:
+    with pytest.raises(UnknownEncoder, match="Re-encode"):
+        EncoderCatalogue().get("m-region-vlad@" + "0" * 64)
+
+
+def test_an_installed_encoder_round_trips(tmp_path: Path, packaged: Encoder) -> None:
+    install(tmp_path, packaged, "turned")
+    catalogue = EncoderCatalogue(tmp_path)
+    loaded = catalogue.get("turned")
+    assert loaded.identity == catalogue.resolve("turned")
+    np.testing.assert_array_equal(loaded.centers, packaged.centers[::-1])
+    loaded.check_golden()
+    assert [s.source for s in catalogue.describe() if s.name == "turned"] == ["installed"]
+
+
+def test_an_installed_encoder_cannot_take_a_packaged_name(tmp_path: Path, packaged: Encoder) -> None:
+    install(tmp_path, packaged, DEFAULT_ENCODER)
+    assert EncoderCatalogue(tmp_path).resolve(DEFAULT_ENCODER) == packaged.identity
+
+
+def test_a_damaged_file_is_named_and_harms_no_other(tmp_path: Path, packaged: Encoder) -> None:
+    path = install(tmp_path, packaged, "torn")
+    path.write_bytes(path.read_bytes()[:200])
+    catalogue = EncoderCatalogue(tmp_path)
+    damaged = {summary.name: summary.damaged for summary in catalogue.describe()}
+    assert "torn.encoder.safetensors" in (damaged["torn"] or "")
+    assert damaged[DEFAULT_ENCODER] is None
+    with pytest.raises(InvalidModel, match="torn"):
+        catalogue.get("torn")
+
+
+def test_changed_contents_do_not_keep_the_identity(tmp_path: Path, packaged: Encoder) -> None:
+    path = install(tmp_path, packaged, "forged")
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 0x40  # in the tensors: the words or the golden values
+    data[-150_000] ^= 0x40
+    path.write_bytes(data)
+    with pytest.raises(InvalidModel):
+        EncoderCatalogue(tmp_path).get("forged")
+
+
+def test_another_kind_of_safetensors_is_refused(tmp_path: Path) -> None:
+    save_file({"centers": np.zeros((2, 2), np.float32)}, tmp_path / "odd.encoder.safetensors")
+    with pytest.raises(InvalidModel, match="not a placerec-encoder"):
+        EncoderCatalogue(tmp_path).get("odd")
+
+
+def test_a_missing_network_names_its_file(tmp_path: Path, packaged: Encoder) -> None:
+    vocabulary = Vocabulary(packaged.centers, packaged.extractor.origin)
+    encoder = Encoder("far", packaged.extractor, packaged.definition, vocabulary, packaged.calibration)
+    save_encoder(tmp_path, encoder, vocabulary, "elsewhere", {})
+    with pytest.raises(InvalidModel, match=r"elsewhere\.network\.safetensors"):
+        EncoderCatalogue(tmp_path).get("far")
+
+
+def test_a_renamed_file_is_refused(tmp_path: Path, packaged: Encoder) -> None:
+    path = install(tmp_path, packaged, "first")
+    shutil.move(path, tmp_path / "second.encoder.safetensors")
+    with pytest.raises(InvalidModel, match="named as its encoder"):
+        EncoderCatalogue(tmp_path).get("second")
