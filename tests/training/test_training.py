@@ -1,0 +1,149 @@
+"""A tiny run of the whole training on pictures made here, and its pieces."""
+
+from __future__ import annotations
+
+import csv
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+
+from core.network import ShallowNetwork
+from training.distillation import cosine_loss, distill, learning_rate
+from training.disturbance import STEPS, disturb
+from training.photographs import DisturbedCrops, split_photographs
+from training.student import SCALE, Student
+from training.teacher import BLOCKS, Teacher
+
+
+@pytest.fixture(scope="module")
+def photographs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two sources of small pictures, and three day/night cameras."""
+    folder = tmp_path_factory.mktemp("photographs")
+    generator = np.random.default_rng(0)
+    names = [f"{source}/{n:03}.png" for source in ("roads", "rooms") for n in range(60)]
+    names += [f"day_night/{camera}/{light}_{n}.png" for camera in "abc" for light in ("day", "night") for n in range(2)]
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        coarse = generator.integers(0, 256, (9, 12, 3), np.uint8)
+        cv2.imwrite(str(path), cv2.resize(coarse, (96, 72), interpolation=cv2.INTER_CUBIC))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def teacher_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A MobileNetV1 of random values in the layout that is read."""
+    generator = np.random.default_rng(1)
+
+    def normal(*shape: int) -> NDArray[np.float32]:
+        values: NDArray[np.float32] = generator.standard_normal(shape, np.float32)
+        return values * np.float32(np.sqrt(2 / np.prod(shape[1:])))
+
+    arrays = {"conv1/W": normal(32, 3, 3, 3), "conv1/b": np.zeros(32, np.float32)}
+    inner = 32
+    for block, _ in BLOCKS:
+        outer = {"2_1": 64, "2_2": 128, "3_1": 128, "3_2": 256, "4_1": 256}.get(block, 512)
+        arrays |= {f"conv{block}_dw/W": normal(inner, 3, 3), f"conv{block}_dw/b": np.zeros(inner, np.float32)}
+        arrays |= {f"conv{block}_sep/W": normal(outer, inner, 1, 1), f"conv{block}_sep/b": np.zeros(outer, np.float32)}
+        inner = outer
+    path = tmp_path_factory.mktemp("teacher") / "teacher.npz"
+    np.savez(path, allow_pickle=False, **arrays)
+    return path
+
+
+def test_a_run_in_two_sittings_equals_one(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
+    whole = distill(photographs, teacher_weights, tmp_path / "one", crops=48, batch=8, workers=0)
+    distill(photographs, teacher_weights, tmp_path / "two", crops=48, batch=8, workers=0, stop_after=3)
+    resumed = distill(photographs, teacher_weights, tmp_path / "two", crops=48, batch=8, workers=0)
+    first, second = load_file(whole), load_file(resumed)
+    assert set(first) == {f"conv{n}.{kind}" for n in (1, 2, 3, 4) for kind in ("weight", "bias")}
+    for name, tensor in first.items():
+        torch.testing.assert_close(tensor, second[name], rtol=1e-3, atol=1e-4)
+    rows = list(csv.DictReader((tmp_path / "two" / "log.csv").open()))
+    assert [int(row["crops"]) for row in rows] == [24, 48]
+    assert all(0 < float(row["held_out_loss"]) < 4 for row in rows)
+
+
+def test_the_loss_falls(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
+    distill(photographs, teacher_weights, tmp_path, crops=160, batch=8, workers=0, checkpoint_every=10)
+    losses = [float(row["loss"]) for row in csv.DictReader((tmp_path / "log.csv").open())]
+    assert losses[-1] < losses[0] - 0.1
+
+
+def test_folding_keeps_the_features() -> None:
+    torch.manual_seed(0)
+    student = Student()
+    student.train()
+    with torch.no_grad():
+        for _ in range(3):  # moves the running statistics away from their start
+            student.features(torch.rand(2, 3, 227, 227) * 255)
+    student.eval()
+    network = ShallowNetwork(student.definition, ("conv3", "conv4"))
+    network.load_weights(student.folded_weights())
+    pixels = torch.rand(1, 3, 227, 227) * 255
+    with torch.no_grad():
+        for folded, original in zip(network((pixels - student.mean) * SCALE), student.features(pixels), strict=True):
+            torch.testing.assert_close(folded, original, rtol=1e-3, atol=1e-4)
+
+
+def test_the_teacher_is_aligned_with_the_student(teacher_weights: Path) -> None:
+    """A bright spot excites the same cell of both grids: the teacher's answer peaks where the spot is."""
+    teacher = Teacher(teacher_weights)
+    pixels = torch.zeros(1, 3, 227, 227)
+    flat = teacher(pixels)[0]
+    pixels[:, :, 17 + 16 * 4 - 4 : 17 + 16 * 4 + 5, 17 + 16 * 9 - 4 : 17 + 16 * 9 + 5] = 255
+    change = (teacher(pixels)[0] - flat).abs().sum(1)[0]
+    assert change.shape == (13, 13)
+    assert divmod(int(change.argmax()), 13) == (4, 9)
+
+
+def test_the_split_keeps_whole_cameras_out_and_never_overlaps(photographs: Path) -> None:
+    split = split_photographs(photographs)
+    assert not set(split.train) & set(split.held_out)
+    cameras = {path.parent.name for path in split.held_out if "day_night" in path.parts}
+    assert cameras == {"a"}
+    assert any("day_night" not in path.parts for path in split.held_out)
+
+
+def test_a_crop_depends_on_seed_and_number_alone(photographs: Path) -> None:
+    paths = split_photographs(photographs).train
+    early = DisturbedCrops(paths, photographs, 64, seed=3, start=0, stop=20)
+    late = DisturbedCrops(paths, photographs, 64, seed=3, start=10, stop=20)
+    for a, b in zip(early[15], late[5], strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(early[15][0], early[16][0])
+
+
+@pytest.mark.parametrize("step", [step for _, step in STEPS], ids=lambda step: step.__name__)
+def test_each_disturbance_changes_light_and_not_shape(step) -> None:  # type: ignore[no-untyped-def]
+    image = np.random.default_rng(0).random((61, 83, 3)).astype(np.float32)
+    made = step(image.copy(), np.random.default_rng(4))
+    assert made.shape == image.shape
+    assert np.isfinite(made).all()
+    assert not np.allclose(made, image, atol=1e-4)
+
+
+def test_disturbing_is_reproducible() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
+    first, again = (disturb(pixels, np.random.default_rng(7)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert first.dtype == np.uint8
+
+
+def test_the_learning_rate_rises_then_falls() -> None:
+    rates = [learning_rate(step, 1000, 2e-3) for step in range(1000)]
+    assert rates[0] < rates[19] == pytest.approx(2e-3)
+    assert rates[-1] < 3e-5
+    assert all(a >= b for a, b in pairwise(rates[20:]))
+
+
+def test_cosine_loss_is_zero_for_parallel_and_two_for_opposite_maps() -> None:
+    maps = torch.rand(2, 8, 3, 3) + 0.1
+    assert cosine_loss(maps * 5, maps).item() == pytest.approx(0, abs=1e-6)
+    assert cosine_loss(-maps, maps).item() == pytest.approx(2, abs=1e-6)

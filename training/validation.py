@@ -1,0 +1,120 @@
+"""What encoders are chosen by: three tasks on photographs kept out of training.
+
+* ``lip6``: a street walked twice (eval/lip6_outdoor), recall@1 and AUC-PR by its own truth.
+* ``webcams``: fixed cameras over months (eval/webcams).  Each daytime picture in turn is its
+  camera's one reference among 500 frames of lip6; every other picture of the cameras is a query.
+* ``night``: cameras of train/day_night kept out of training.  One day picture of each camera and
+  the 500 distractors are references; queries are the night pictures, shifted sideways by 10–20 %.
+
+The corridor traverse is reported elsewhere and nothing is chosen by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.preprocessing import Pixels
+from training.photographs import DAY_NIGHT, find_photographs, split_photographs
+
+Array = NDArray[np.float32]
+
+DISTRACTORS = 500
+DAYLIGHT = 70.0
+"""Mean grey value above which a webcam picture counts as taken by day."""
+MIXED_CAMERAS = {"640x469", "640x471"}
+"""Folders of day_night that hold two scenes each."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """Queries against references; truth[q, r] is true where r shows the place of q."""
+
+    queries: list[Pixels]
+    references: list[Pixels]
+    truth: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Pictures of fixed cameras, which of them are references in turn, and unrelated distractors."""
+
+    pictures: list[Pixels]
+    camera: NDArray[np.int64]
+    reference: NDArray[np.bool_]
+    query: NDArray[np.bool_]
+    distractors: list[Pixels]
+
+
+def read(path: Path) -> Pixels:
+    """One picture, H x W x 3 BGR.
+
+    Raises:
+        ValueError: it cannot be decoded.
+    """
+    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise ValueError(f"{path} cannot be decoded")
+    return np.asarray(pixels, np.uint8)
+
+
+def walk(folder: Path, queries: str, references: str) -> Walk:
+    """A traverse pair with a ``ground_truth.csv`` of (query, reference) indices in order of name."""
+    shown = [[read(path) for path in find_photographs(folder / part)] for part in (queries, references)]
+    truth = np.zeros((len(shown[0]), len(shown[1])), np.bool_)
+    rows = np.loadtxt(folder / "ground_truth.csv", np.int64, delimiter=",", skiprows=1)
+    truth[rows[:, 0], rows[:, 1]] = True
+    return Walk(shown[0], shown[1], truth)
+
+
+def webcams(folder: Path, distractors: list[Pixels]) -> Cameras:
+    """The fixed cameras of eval/webcams: every daytime picture is a reference in its turn."""
+    paths = find_photographs(folder)
+    pictures = [read(path) for path in paths]
+    names = sorted({path.parent.name for path in paths})
+    camera = np.array([names.index(path.parent.name) for path in paths])
+    day = np.array([picture.mean() > DAYLIGHT for picture in pictures])
+    return Cameras(pictures, camera, day, np.ones(len(paths), np.bool_), distractors)
+
+
+def shifted_night(train: Path, distractors: list[Pixels], seed: int = 0) -> Cameras:
+    """The held-out day/night cameras: day pictures whole or cut on one side, nights cut on the other."""
+    generator = np.random.default_rng(seed)
+    held_out = [path for path in split_photographs(train).held_out if path.relative_to(train).parts[0] == DAY_NIGHT]
+    paths = [path for path in held_out if path.parent.name not in MIXED_CAMERAS]
+    names = sorted({path.parent.name for path in paths})
+    pictures = []
+    for path in paths:
+        picture = read(path)
+        cut = int(picture.shape[1] * generator.uniform(0.1, 0.2))
+        left = generator.random() < 0.5
+        night = path.name.startswith("night")
+        pictures.append((picture[:, cut:] if left else picture[:, :-cut]) if night else picture)
+    camera = np.array([names.index(path.parent.name) for path in paths])
+    day = np.array([path.name.startswith("day") for path in paths])
+    return Cameras(pictures, camera, day, ~day, distractors)
+
+
+def camera_recall(task: Cameras, pictures: Array, distractors: Array) -> float:
+    """Mean recall@1 over references in turn and queries; descriptors float32 [n, D] and [m, D].
+
+    In each turn every camera has one reference: the one in turn for its own camera; a query of
+    camera c is right if its camera's reference beats all distractors and the other cameras'
+    references (each other camera shows its reference of the same rank).
+    """
+    among = pictures @ pictures.T
+    best_distractor = (pictures @ distractors.T).max(axis=1)
+    cameras = np.unique(task.camera)
+    ranks = {c: np.flatnonzero((task.camera == c) & task.reference) for c in cameras}
+    means = []
+    for c in cameras:
+        for rank, reference in enumerate(ranks[c]):
+            asked = np.flatnonzero((task.camera == c) & task.query & (np.arange(len(pictures)) != reference))
+            rivals = [ranks[o][rank % len(ranks[o])] for o in cameras if o != c and len(ranks[o])]
+            beaten = np.maximum(best_distractor[asked], among[np.ix_(asked, rivals)].max(axis=1, initial=-np.inf))
+            means.append(float((among[asked, reference] > beaten).mean()))
+    return float(np.mean(means))
