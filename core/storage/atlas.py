@@ -1,0 +1,279 @@
+"""The data directory: all maps, each in a folder of its own, and the lock that makes them ours.
+
+LOCK                       held for as long as the atlas is open
+FORMAT                     the version of this arrangement
+maps/<id>/map.sqlite       record, places, sequences, pictures, and which rows count
+maps/<id>/descriptors-….seg, index-….faiss
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import shutil
+import threading
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.places import check_map_id
+from core.storage.cursors import Listing, decode_name, encode_cursor
+from core.storage.descriptors import ROWS_PER_SEGMENT, Layout
+from core.storage.disk import Damage, FolderLock, refusals, sync_file, sync_folder, write_file
+from core.storage.map import Map
+from core.storage.opening import create_folder, read_record
+from core.storage.records import MapRecord, MapSettings, VerifyReport
+from core.storage.verification import inspect_folder
+
+log = logging.getLogger(__name__)
+
+FORMAT = "placerec data 1\n"
+_MAPS = "maps"
+# No map id begins with a dot, so these can never be taken for maps.
+_HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"
+
+
+class Atlas:
+    """All maps.  Every method may be called from any thread; one process has the directory at a time."""
+
+    def __init__(self, directory: Path, rows_per_segment: int = ROWS_PER_SEGMENT) -> None:
+        """Take the directory, make it if need be, and read the record of every map.
+
+        Args:
+            rows_per_segment: of the maps that will be made; those there are keep theirs.
+
+        Raises:
+            DataDirectoryLocked: another process has it.
+            DataDirectoryTooNew: a later version of placerec wrote it, or one of its maps.
+            StorageFull, StorageFailure: the disk refuses.
+        """
+        self._directory = directory
+        self._folder = directory / _MAPS
+        self._rows_per_segment = rows_per_segment
+        self._making = threading.Lock()  # held by the one that makes or deletes a map
+        self._maps: dict[str, Map] = {}
+        # Maps that could not be read at the start, and why: their files are damaged, or the disk refused.
+        self._damaged: dict[str, str] = {}
+        self._refused: dict[str, str] = {}
+        self._closed = False
+        with refusals(f"open the data directory {directory}"):
+            _make_durably(directory)
+            self._lock = FolderLock(directory / "LOCK")
+            try:
+                self._check_format()
+                self._folder.mkdir(exist_ok=True)
+                sync_folder(directory)
+                self._scan()
+            except BaseException:
+                self._lock.release()
+                raise
+
+    def _check_format(self) -> None:
+        path = self._directory / "FORMAT"
+        try:
+            found = path.read_text(errors="replace")
+        except FileNotFoundError:
+            write_file(path, FORMAT.encode())
+            return
+        if found == FORMAT:
+            return
+        if found.startswith("placerec data "):
+            raise DataDirectoryTooNew(
+                f"{self._directory} was written by a later version of placerec ({found.strip()})."
+            )
+        raise StorageFailure(f"{path} is not placerec's: is this the right directory?")
+
+    def _scan(self) -> None:
+        for folder in sorted(self._folder.iterdir()):
+            if folder.name.startswith((_HALF_MADE, _HALF_REMOVED)):
+                log.info("Removing %s, left by a crash.", folder.name)
+                shutil.rmtree(folder, ignore_errors=True)
+            elif folder.is_dir() and not folder.name.startswith("."):
+                self._adopt(folder)
+
+    def _adopt(self, folder: Path) -> None:
+        self._refused.pop(folder.name, None)
+        try:
+            with refusals(f"open map {folder.name!r}"):
+                self._maps[folder.name] = Map(folder, *read_record(folder))
+        except Damage as damage:
+            log.error("Map %s is quarantined: %s", folder.name, damage)
+            self._damaged[folder.name] = str(damage)
+        except (StorageFull, StorageFailure) as refusal:
+            # The others serve; this one is tried again when it is asked for.
+            log.error("Map %s cannot be opened: %s", folder.name, refusal)
+            self._refused[folder.name] = str(refusal)
+
+    def create(self, map_id: str, encoder_identity: str, dimension: int, settings: MapSettings | None = None) -> Map:
+        """Make an empty map, bound to an encoder for life; it is durable when this returns.
+
+        Raises:
+            InvalidIdentifier: the id does not have the form of one.
+            MapExists: it is taken, be it by a damaged map.
+            StorageFull, StorageFailure.
+        """
+        check_map_id(map_id)
+        Layout(dimension, encoder_identity, self._rows_per_segment)  # refuses an identity that has no room
+        now = datetime.now(UTC)
+        record = MapRecord(
+            id=map_id,
+            encoder=encoder_identity,
+            dimension=dimension,
+            revision=1,
+            created_at=now,
+            updated_at=now,
+            **(settings or MapSettings()).model_dump(),
+        )
+        with self._making, refusals(f"create map {map_id!r}"):
+            self._expect_open()
+            folder = self._folder / map_id
+            if map_id in self._maps or folder.exists():
+                raise MapExists(f"There is a map {map_id!r} already.")
+            unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
+            try:
+                create_folder(unfinished, record, self._rows_per_segment)
+                os.rename(unfinished, folder)
+                sync_folder(self._folder)
+            except BaseException:
+                shutil.rmtree(unfinished, ignore_errors=True)
+                shutil.rmtree(folder, ignore_errors=True)
+                raise
+            made = Map(folder, record)
+            self._maps[map_id] = made
+        return made
+
+    def get(self, map_id: str) -> Map:
+        """A map, ready to serve; its first use reads it from disk.
+
+        Raises:
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+        found = self.find(map_id)
+        found.open()
+        return found
+
+    def find(self, map_id: str) -> Map:
+        """A map as it is listed: its record and the number of its places, for which it is not read from disk.
+
+        Raises:
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+        self._expect_open()
+        if map_id in self._refused:
+            with self._making:
+                if map_id in self._refused:
+                    self._adopt(self._folder / map_id)
+        found = self._maps.get(map_id)
+        if found is None:
+            raise self._absent(map_id)
+        found.check_serving()
+        return found
+
+    def _absent(self, map_id: str) -> UnknownMap | MapQuarantined | StorageFailure:
+        if reason := self._refused.get(map_id):
+            return StorageFailure(reason)
+        if reason := self._damaged.get(map_id):
+            return MapQuarantined(f"Map {map_id!r} is damaged and out of service: {reason}.")
+        return UnknownMap(f"There is no map {map_id[:80]!r}.")
+
+    def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
+        """A page of maps by id, quarantined ones left out, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
+        if limit < 1:
+            raise ValueError("a page has at least one entry")
+        listing: Listing = ["maps"]
+        after = decode_name(listing, cursor)
+        maps = {map_id: found for map_id, found in self._maps.copy().items() if found.damage is None}
+        page = sorted(map_id for map_id in maps if map_id > after)
+        more = encode_cursor(listing, page[limit - 1]) if len(page) > limit else None
+        return [maps[map_id].record for map_id in page[:limit]], more
+
+    def quarantined(self) -> dict[str, str]:
+        """The maps that are out of service, and why."""
+        in_use = {map_id: found.damage for map_id, found in self._maps.copy().items()}
+        found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
+        return {**self._damaged, **self._refused, **found_later}
+
+    def verify(self, map_id: str) -> VerifyReport:
+        """Read all of a map again, be it in service or quarantined, and say what is damaged.
+
+        Raises:
+            UnknownMap, StorageFailure.
+        """
+        with suppress(MapQuarantined):
+            return self.get(map_id).verify()
+        report = inspect_folder(self._folder / map_id)
+        reason = f"out of service: {self.quarantined().get(map_id)}"
+        return report.model_copy(update={"ok": False, "problems": [reason, *report.problems]})
+
+    def delete(self, map_id: str) -> None:
+        """Forget a map, a quarantined one too; nothing of it comes back when this has returned.
+
+        Raises:
+            UnknownMap, StorageFull, StorageFailure.
+        """
+        with self._making, refusals(f"delete map {map_id!r}"):
+            self._expect_open()
+            found = self._maps.get(map_id)
+            if found is None and map_id not in self.quarantined():
+                raise self._absent(map_id)
+            folder = self._folder / map_id
+            removed = self._folder / f"{_HALF_REMOVED}{map_id}-{secrets.token_hex(4)}"
+            if found is not None:
+                found.close(deleted=True)
+            try:
+                os.rename(folder, removed)
+            except FileNotFoundError:
+                log.warning("The folder of map %s was gone already.", map_id)
+            except OSError:
+                if found is not None:
+                    self._maps[map_id] = Map(folder, found.record, found.count_places())
+                raise
+            self._maps.pop(map_id, None)
+            self._damaged.pop(map_id, None)
+            self._refused.pop(map_id, None)
+            sync_folder(self._folder)
+        # What cannot be removed now is removed at the next start.
+        shutil.rmtree(removed, ignore_errors=True)
+
+    def check_writable(self) -> None:
+        """Write, sync and remove a small file, as the maps will have to.
+
+        Raises:
+            StorageFull, StorageFailure.
+        """
+        self._expect_open()
+        probe = self._directory / f".probe-{secrets.token_hex(4)}"
+        with refusals(f"write to {self._directory}"):
+            try:
+                probe.write_bytes(b"\x00" * 4096)
+                sync_file(probe)
+                sync_folder(self._directory)
+            finally:
+                with suppress(OSError):
+                    probe.unlink()
+
+    def close(self) -> None:
+        """Let what is under way end, close all maps, and give the directory back."""
+        with self._making:
+            self._closed = True
+            for found in self._maps.values():
+                found.close()
+            self._lock.release()
+
+    def _expect_open(self) -> None:
+        if self._closed:
+            raise StorageFailure("The data directory is closed.")
+
+
+def _make_durably(directory: Path) -> None:
+    """Make a folder and those above it, as far as they are missing, and sync every name made."""
+    if not directory.is_dir():
+        _make_durably(directory.absolute().parent)
+        directory.mkdir(exist_ok=True)
+        sync_folder(directory.absolute().parent)

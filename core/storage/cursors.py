@@ -1,0 +1,53 @@
+"""Opaque pagination cursors: where a listing goes on, and which listing it was."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+
+from core.errors import InvalidCursor
+
+Listing = list[str | None]
+"""What is listed, such as ``["places", "lab", "monday"]``; a cursor of another listing is refused."""
+
+
+def encode_cursor(listing: Listing, after: str | int) -> str:
+    """A cursor that continues ``listing`` behind the entry whose key is ``after``."""
+    text = json.dumps({"listing": listing, "after": after}, separators=(",", ":"))
+    return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
+
+
+def _decode(listing: Listing, cursor: str) -> object:
+    try:
+        padded = cursor.encode("ascii") + b"=" * (-len(cursor) % 4)
+        content = json.loads(base64.b64decode(padded, altchars=b"-_", validate=True))
+    except (ValueError, binascii.Error, RecursionError) as error:
+        raise InvalidCursor("The cursor was not made by this service.") from error
+    if not isinstance(content, dict) or set(content) != {"listing", "after"} or content["listing"] != listing:
+        raise InvalidCursor("The cursor belongs to another listing.")
+    return content["after"]
+
+
+def decode_number(listing: Listing, cursor: str | None) -> int:
+    """The number behind which to go on; -1 without a cursor, which is before all.
+
+    Raises:
+        InvalidCursor: the text is no cursor, or one of another listing.
+    """
+    after = -1 if cursor is None else _decode(listing, cursor)
+    if not isinstance(after, int) or isinstance(after, bool) or not -1 <= after < 2**63:
+        raise InvalidCursor("The cursor was not made by this listing.")
+    return after
+
+
+def decode_name(listing: Listing, cursor: str | None) -> str:
+    """The name behind which to go on; empty without a cursor, which is before all.
+
+    Raises:
+        InvalidCursor: the text is no cursor, or one of another listing.
+    """
+    after = "" if cursor is None else _decode(listing, cursor)
+    if not isinstance(after, str) or any("\ud800" <= letter <= "\udfff" for letter in after):
+        raise InvalidCursor("The cursor was not made by this listing.")
+    return after

@@ -1,0 +1,373 @@
+"""One map: its places on disk and its snapshot in memory, kept in step."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import sqlite3
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from core.errors import (
+    MapQuarantined,
+    NoThumbnail,
+    PlacerecError,
+    RevisionMismatch,
+    StorageFailure,
+    UnknownMap,
+    UnknownSequence,
+)
+from core.images import Limits, decode, encode_thumbnail
+from core.places import Place, PlaceFields
+from core.storage import descriptors, ledger
+from core.storage.caches import cache_name, write_cache
+from core.storage.cursors import Listing, decode_name, decode_number, encode_cursor
+from core.storage.database import DatabaseClosed
+from core.storage.disk import Damage, primary_code, refusals
+from core.storage.opening import OpenMap, named_segments, open_map
+from core.storage.patches import patched_fields, patched_record
+from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
+from core.storage.snapshot import Snapshot
+from core.storage.verification import inspect
+from core.storage.writing import Write, check_enrolment
+
+log = logging.getLogger(__name__)
+
+
+class Map:
+    """The places of one environment.  Every method may be called from any thread.
+
+    One thread writes at a time.  A write returns when it is synced, and every snapshot taken from
+    then on shows it; reads and searches never wait for it.
+
+    Any method may raise MapQuarantined (the map turns out to be damaged), StorageFailure (the disk
+    refuses) and UnknownMap (it was deleted meanwhile); those that write also StorageFull.  A write
+    that raises has changed nothing.
+    """
+
+    def __init__(self, folder: Path, record: MapRecord, places: int = 0) -> None:
+        """The map in ``folder``, of which record and number of places are known; the rest is read on first use."""
+        self._folder = folder
+        self._record = record
+        self._places = places
+        self._lock = threading.RLock()  # held by the one that writes, opens or closes
+        self._opened: OpenMap | None = None
+        self._snapshot: Snapshot | None = None
+        self._damage: str | None = None
+        self._end: PlacerecError | None = None
+        self._rows_in_doubt = False
+        self._log_in_doubt = False
+
+    # Opening and closing
+
+    @property
+    def record(self) -> MapRecord:
+        """As of the last edit."""
+        return self._record
+
+    @property
+    def damage(self) -> str | None:
+        """Why the map is quarantined; None while it serves."""
+        return self._damage
+
+    def check_serving(self) -> None:
+        """Raise MapQuarantined if the map is damaged, as far as is known."""
+        if self._damage is not None:
+            raise self._quarantined()
+
+    def open(self) -> None:
+        """Read the map from disk, unless that was done already."""
+        self._expect_open()
+
+    def close(self, deleted: bool = False) -> None:
+        """Let the reads and the write under way end, and refuse further ones."""
+        with self._lock:
+            name = self._folder.name
+            if self._end is None:
+                self._end = (
+                    UnknownMap(f"There is no map {name!r}.") if deleted else StorageFailure(f"Map {name!r} is closed.")
+                )
+            opened, self._opened, self._snapshot = self._opened, None, None
+            if opened is not None:
+                opened.database.close()
+
+    def _expect_open(self) -> OpenMap:
+        if (opened := self._opened) is not None:
+            return opened
+        with self._lock:
+            if self._end is not None:
+                raise type(self._end)(*self._end.args)
+            if self._damage is not None:
+                raise self._quarantined()
+            if self._opened is None:
+                with self._guarded("open"):
+                    self._opened = open_map(self._folder)
+                    self._record, self._snapshot = self._opened.record, self._opened.snapshot
+            return self._opened
+
+    def _quarantined(self) -> MapQuarantined:
+        return MapQuarantined(f"Map {self._folder.name!r} is damaged and out of service: {self._damage}.")
+
+    @contextmanager
+    def _guarded(self, action: str) -> Iterator[None]:
+        """Name the refusals of the disk; take a map that is damaged out of service."""
+        try:
+            with refusals(f"{action} map {self._folder.name!r}"):
+                yield
+        except Damage as damage:
+            log.error("Map %s is quarantined: %s", self._folder.name, damage)
+            self._damage = str(damage)
+            with self._lock:
+                opened, self._opened, self._snapshot = self._opened, None, None
+                if opened is not None:
+                    opened.database.close()
+            raise self._quarantined() from damage
+
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        with self._guarded("read"):
+            try:
+                with self._expect_open().database.reading() as connection:
+                    yield connection
+                return
+            except DatabaseClosed:
+                pass
+        self._expect_open()  # says why
+        raise StorageFailure(f"Map {self._folder.name!r} was closed.")
+
+    # Writing
+
+    @contextmanager
+    def _writing(self) -> Iterator[Write]:
+        with self._lock:
+            opened, before = self._expect_open(), self.snapshot()
+            with self._guarded("write to"):
+                self._resolve_doubts(opened, before)
+                write = None
+                try:
+                    with opened.database.transaction() as connection:
+                        write = Write(self._folder, opened, self._record, before, connection)
+                        yield write
+                        after = write.finish()
+                except BaseException as error:
+                    if write is not None and write.appending:
+                        self._doubt(error, opened, before)
+                    raise
+            self._snapshot, self._record = after, write.record
+            for number, checksum in write.filled.items():
+                write_cache(self._folder / cache_name(number), after.segments[number].index, checksum)
+
+    def _doubt(self, error: BaseException, opened: OpenMap, before: Snapshot) -> None:
+        """After a failure: what stands behind the rows that are named, in the segment files and in SQLite's log?
+
+        A COMMIT that found no room wrote no end of the transaction; after any other failure of
+        SQLite the log must be emptied first, or a crash could bring that transaction to life.
+        """
+        self._rows_in_doubt = True
+        found_no_room = isinstance(error, sqlite3.Error) and primary_code(error) == sqlite3.SQLITE_FULL
+        self._log_in_doubt = not (found_no_room or isinstance(error, OSError))
+        try:
+            self._resolve_doubts(opened, before)
+        except (OSError, sqlite3.Error, Damage) as further:
+            log.warning("Map %s takes no writes until its files are in order again: %s", self._folder.name, further)
+
+    def _resolve_doubts(self, opened: OpenMap, before: Snapshot) -> None:
+        """Bring the files back to what was acknowledged last; no write is begun until this succeeds."""
+        if self._log_in_doubt:
+            opened.database.settle()
+            self._log_in_doubt = False
+        if self._rows_in_doubt:
+            descriptors.rewind(self._folder, opened.layout, before.rows)
+            # The failed sync may have lost a block that holds the end of the last good row, too.
+            with opened.database.reading() as connection:
+                named = named_segments(connection, opened.layout)
+            if sum(segment.rows for segment in named) != before.rows:
+                raise Damage("map.sqlite names other rows than were acknowledged")
+            for last in named[-1:]:
+                number, rows, checksum = last.number, last.rows, last.checksum
+                for _ in descriptors.read_checked(self._folder, opened.layout, number, rows, checksum):
+                    pass
+            self._rows_in_doubt = False
+
+    def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
+        """Change settings (those of MapSettings) or ``calibration`` (None: back to the encoder's).
+
+        ``keep`` applies to frames enrolled from then on; pictures kept already stay as they are.
+        The revision grows by one, unless nothing changes.
+
+        Raises:
+            InvalidField: an unknown or fixed field, or a value that it cannot have.
+            RevisionMismatch: the record is not at ``expected_revision``.
+        """
+        with self._writing() as write:
+            if expected_revision is not None and expected_revision != write.record.revision:
+                raise RevisionMismatch(f"The map is at revision {write.record.revision}, not {expected_revision}.")
+            record = patched_record(write.record, changes)
+            if record != write.record:
+                write.edit(record)
+        return write.record
+
+    def enrol(self, items: Sequence[Enrolment]) -> list[tuple[Place, Change]]:
+        """Remember frames, all of them or, if this raises, none; one sync and one COMMIT for all.
+
+        An id that exists keeps its place and creation time: with the same digest only its fields are
+        applied (``unchanged``, ``updated``), with another its frame is ``replaced``.  An id that
+        occurs twice is taken in order.
+
+        Raises:
+            InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
+            NoRegions: a descriptor is all zero.
+            ValueError: a descriptor or digest of the wrong kind.
+        """
+        for item in items:
+            check_enrolment(item, self._record.dimension)
+        if not items:
+            return []
+        with self._writing() as write:
+            return [write.enrol(item) for item in items]
+
+    def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
+        """Replace all fields of a place; its frame stays.
+
+        Raises:
+            UnknownPlace, InvalidField.
+        """
+        with self._writing() as write:
+            return write.set_fields(ledger.expect(write.connection, place_id), fields)
+
+    def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
+        """Apply a merge patch (RFC 7396) to pose, timestamp, sequence and metadata.
+
+        Raises:
+            UnknownPlace, InvalidField.
+        """
+        with self._writing() as write:
+            stored = ledger.expect(write.connection, place_id)
+            return write.set_fields(stored, patched_fields(stored.place, changes))[0]
+
+    def forget(self, place_id: str) -> None:
+        """Delete a place.
+
+        Raises:
+            UnknownPlace.
+        """
+        with self._writing() as write:
+            write.forget(ledger.expect(write.connection, place_id))
+
+    def forget_sequence(self, name: str) -> int:
+        """Delete all places of a sequence; returns how many.
+
+        Raises:
+            UnknownSequence: there is none.
+        """
+        with self._writing() as write:
+            count = write.forget_sequence(name)
+            if not count:
+                raise UnknownSequence(f"The map has no sequence {name[:128]!r}.")
+        return count
+
+    # Reading
+
+    def snapshot(self) -> Snapshot:
+        """All places at this moment, to be searched; later writes do not change it."""
+        while (snapshot := self._snapshot) is None:
+            self._expect_open()
+        return snapshot
+
+    def count_places(self) -> int:
+        """How many places there are; the map is not read from disk for it."""
+        snapshot = self._snapshot
+        return self._places if snapshot is None else len(snapshot)
+
+    def digest(self, place_id: str) -> bytes | None:
+        """SHA-256 of the image of a place; None if there is no such place."""
+        with self._reading() as connection:
+            stored = ledger.find(connection, place_id)
+        return None if stored is None else stored.digest
+
+    def place(self, place_id: str) -> Place:
+        """One place.
+
+        Raises:
+            UnknownPlace.
+        """
+        with self._reading() as connection:
+            return ledger.expect(connection, place_id).place
+
+    def places(self, cursor: str | None, limit: int, sequence: str | None = None) -> tuple[list[Place], str | None]:
+        """A page of places in the order of their enrolment, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
+        listing: Listing = ["places", self._folder.name, sequence]
+        after = decode_number(listing, cursor)
+        with self._reading() as connection:
+            found = ledger.places_after(connection, after, _one_more(limit), sequence)
+        more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None
+        return [stored.place for stored in found[:limit]], more
+
+    def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
+        """A page of sequences by name, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
+        listing: Listing = ["sequences", self._folder.name]
+        after = decode_name(listing, cursor)
+        with self._reading() as connection:
+            found = ledger.sequences_after(connection, after, _one_more(limit))
+        more = encode_cursor(listing, found[limit - 1].name) if len(found) > limit else None
+        return found[:limit], more
+
+    def places_at(self, rows: Sequence[int]) -> list[Place | None]:
+        """The places of rows that a search returned; None for one deleted or given another frame since."""
+        with self._reading() as connection:
+            found = ledger.places_of_rows(connection, [int(row) for row in rows])
+        return [found.get(int(row)) for row in rows]
+
+    def thumbnail(self, place_id: str) -> bytes:
+        """A small JPEG of a place.
+
+        Raises:
+            UnknownPlace, NoThumbnail.
+        """
+        with self._reading() as connection:
+            stored = ledger.expect(connection, place_id)
+            kept = ledger.picture(connection, stored.number)
+        if kept is None:
+            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+        content, digest = kept
+        if hashlib.sha256(content).digest() != digest:
+            raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
+        if stored.place.picture == "thumbnail":
+            return content
+        # It was accepted when it was enrolled; today's limits are not its limits.
+        return encode_thumbnail(decode(content, Limits(max_bytes=len(content), max_pixels=1 << 40, min_side=1)))
+
+    def verify(self) -> VerifyReport:
+        """Read all of the map again and check it; writes and searches go on meanwhile.
+
+        The report is of the moment of the call.  Damage is reported, not quarantined: what is
+        served is in memory and passed its checks when it was read.
+        """
+        with ExitStack() as stack:
+            with self._lock:
+                snapshot = self.snapshot()
+                connection = stack.enter_context(self._reading())
+                connection.execute("BEGIN")
+                connection.execute("SELECT id FROM map").fetchall()  # this is when the transaction begins to see
+            try:
+                return inspect(self._folder, connection, snapshot)
+            finally:
+                connection.execute("ROLLBACK")
+
+
+def _one_more(limit: int) -> int:
+    """To ask for one more than a page tells whether there is a next one."""
+    if limit < 1:
+        raise ValueError("a page has at least one entry")
+    return limit + 1

@@ -1,0 +1,90 @@
+"""What goes into a map and what comes out of it, as plain typed values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.places import PlaceFields, Timestamp
+from core.verdict import Calibration
+
+Change = Literal["created", "unchanged", "updated", "replaced"]
+Keep = Literal["none", "thumbnail", "image"]
+
+
+class MapSettings(BaseModel):
+    """What the owner of a map may choose, when it is made and later."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    description: str = Field(default="", max_length=2000)
+    keep: Keep = Field(
+        default="thumbnail",
+        description="What is kept of each frame. A change applies to frames enrolled from then on.",
+    )
+    same_place_radius: float = Field(
+        default=5.0, ge=0, allow_inf_nan=False, description="Places within so many metres are the same place."
+    )
+    same_place_frames: Annotated[int, Field(ge=0, le=2**31)] = Field(
+        default=3, description="Without poses: places so many frames apart in their sequence are the same place."
+    )
+
+
+class MapRecord(MapSettings):
+    """A map as it is listed: its settings, what it is bound to, and its history in brief."""
+
+    id: str
+    encoder: str = Field(description="Identity of the one encoder whose descriptors the map holds.")
+    dimension: int = Field(gt=0, description="Values of one descriptor.")
+    calibration: Calibration | None = Field(default=None, description="The map's own; none: that of its encoder.")
+    revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
+    created_at: Timestamp
+    updated_at: Timestamp
+
+    def settings(self) -> MapSettings:
+        """The part that its owner chose."""
+        return MapSettings.model_validate(self.model_dump(include=set(MapSettings.model_fields)))
+
+
+class SequenceSummary(BaseModel):
+    """One traverse of a map; the times are those of its first and last frames that have one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    places: int = Field(ge=1)
+    first_at: Timestamp | None
+    last_at: Timestamp | None
+
+
+@dataclass(frozen=True, eq=False)
+class Enrolment:
+    """One frame to be remembered.
+
+    descriptor: float32 [D] of the map's encoder.
+    digest: SHA-256 of the image's bytes, 32 bytes.
+    thumbnail, image: JPEG made from the frame, and the bytes as received; the map keeps what it is set to keep.
+    """
+
+    id: str
+    fields: PlaceFields
+    descriptor: NDArray[np.float32]
+    regions: int
+    digest: bytes
+    thumbnail: bytes | None = None
+    image: bytes | None = None
+
+
+class VerifyReport(BaseModel):
+    """What a full reading of a map found."""
+
+    ok: bool = Field(description="Nothing of the map is damaged; a cache may still have to be rebuilt.")
+    places: int = Field(ge=0)
+    rows: int = Field(ge=0, description="Descriptors stored, those of forgotten places included.")
+    checked_bytes: int = Field(ge=0, description="Bytes of descriptors, pictures and caches that were read again.")
+    problems: list[str] = Field(description="Each names a file and what is damaged in it.")
+    stale_caches: list[str] = Field(description="Index files that are missing or damaged; rebuilt at the next start.")

@@ -1,0 +1,139 @@
+"""The tables of ``map.sqlite`` and how older files become newer ones.
+
+A file carries our application id and, as ``user_version``, the number of migrations it has had.
+Every migration is a list of statements; all that a file lacks are applied in one transaction.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+
+from core.errors import DataDirectoryTooNew
+from core.storage.disk import Damage
+
+APPLICATION_ID = 0x504C5243  # "PLRC"
+
+Migration = Sequence[str]
+
+NO_SEQUENCE = -1
+"""Code of the places that belong to no sequence."""
+
+_FIRST: Migration = (
+    """CREATE TABLE map (
+        only INTEGER PRIMARY KEY CHECK (only = 1),
+        id TEXT NOT NULL,
+        encoder TEXT NOT NULL,
+        dimension INTEGER NOT NULL CHECK (dimension > 0),
+        rows_per_segment INTEGER NOT NULL CHECK (rows_per_segment > 0),
+        description TEXT NOT NULL,
+        keep TEXT NOT NULL,
+        same_place_radius REAL NOT NULL,
+        same_place_frames INTEGER NOT NULL,
+        calibration TEXT,
+        revision INTEGER NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    # Codes are never used again, so that an old snapshot cannot confuse two sequences.
+    """CREATE TABLE sequences (
+        code INTEGER PRIMARY KEY AUTOINCREMENT,
+        name TEXT UNIQUE,
+        next_ordinal INTEGER NOT NULL
+    ) STRICT""",
+    f"INSERT INTO sequences VALUES ({NO_SEQUENCE}, NULL, 0)",
+    # What is named of each segment file: so many rows, whose checksums have this checksum.
+    """CREATE TABLE segments (
+        number INTEGER PRIMARY KEY,
+        rows INTEGER NOT NULL CHECK (rows > 0),
+        checksum INTEGER NOT NULL
+    ) STRICT""",
+    """CREATE TABLE places (
+        number INTEGER PRIMARY KEY AUTOINCREMENT,
+        id TEXT NOT NULL UNIQUE,
+        row INTEGER NOT NULL UNIQUE CHECK (row >= 0),
+        checksum INTEGER NOT NULL,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        regions INTEGER NOT NULL CHECK (regions >= 0),
+        picture TEXT NOT NULL CHECK (picture IN ('none', 'thumbnail', 'image')),
+        x REAL, y REAL, z REAL, latitude REAL, longitude REAL, heading REAL,
+        timestamp TEXT,
+        sequence INTEGER NOT NULL REFERENCES sequences (code),
+        ordinal INTEGER NOT NULL,
+        metadata TEXT NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    "CREATE INDEX places_of_sequence ON places (sequence, number)",
+    # Apart from the places, so that a listing does not read past the pictures.
+    """CREATE TABLE pictures (
+        place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        bytes BLOB NOT NULL
+    ) STRICT""",
+)
+
+MIGRATIONS: Sequence[Migration] = (_FIRST,)
+
+
+def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
+    """The columns of each of the file's own tables."""
+    tables = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
+    return {
+        name: {column for (column,) in connection.execute("SELECT name FROM pragma_table_info(?)", (name,))}
+        for (name,) in tables.fetchall()
+    }
+
+
+def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS, create: bool = False) -> int:
+    """Bring a file, an empty one only with ``create``, to the last of ``migrations``; all at once or not at all.
+
+    Returns:
+        How many were applied.
+
+    Raises:
+        DataDirectoryTooNew: a later version of placerec wrote the file.
+        Damage: it is a database, but not one of ours.
+        sqlite3.Error: a statement failed; the file is as it was.
+    """
+    version: int = connection.execute("PRAGMA user_version").fetchone()[0]
+    (owner,) = connection.execute("PRAGMA application_id").fetchone()
+    is_empty = (version, owner) == (0, 0) and not _columns(connection)
+    if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
+        raise Damage("map.sqlite is not one of placerec's databases")
+    if version > len(migrations):
+        raise DataDirectoryTooNew(
+            f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
+        )
+    if version < len(migrations):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            for migration in migrations[version:]:
+                for statement in migration:
+                    connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {len(migrations)}")
+            connection.execute("COMMIT")
+        except BaseException:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+    return len(migrations) - version
+
+
+def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS) -> None:
+    """Compare a file's tables and columns with those that ``migrations`` make.
+
+    Raises:
+        Damage: something is missing.
+    """
+    wanted = sqlite3.connect(":memory:", isolation_level=None)
+    try:
+        migrate(wanted, migrations, create=True)
+        expected = _columns(wanted)
+    finally:
+        wanted.close()
+    found = _columns(connection)
+    for table, columns in expected.items():
+        if missing := columns - found.get(table, set()):
+            raise Damage(f"map.sqlite lacks {', '.join(sorted(missing))} of its table {table!r}")

@@ -1,0 +1,148 @@
+"""One write to a map: what it changes in SQLite, in the segment files and in the snapshot."""
+
+from __future__ import annotations
+
+import sqlite3
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import NoRegions
+from core.places import Place, PlaceFields, check_place_id
+from core.storage import descriptors, ledger
+from core.storage.ledger import StoredPlace
+from core.storage.opening import OpenMap, spot_of
+from core.storage.records import Change, Enrolment, MapRecord
+from core.storage.snapshot import Snapshot, Spot
+
+
+def check_enrolment(item: Enrolment, dimension: int) -> None:
+    """Refuse what a map cannot hold before anything is written.
+
+    Raises:
+        InvalidIdentifier: the id does not have the form of one.
+        NoRegions: the descriptor is all zero.
+        ValueError: a descriptor or digest of the wrong kind, which is the caller's mistake.
+    """
+    check_place_id(item.id)
+    descriptor = item.descriptor
+    if descriptor.dtype != np.float32 or descriptor.shape != (dimension,):
+        raise ValueError(f"a descriptor of this map is float32 [{dimension}]")
+    with np.errstate(over="ignore"):
+        squares = float(np.dot(descriptor, descriptor))
+    if not np.isfinite(squares):
+        raise ValueError("a descriptor is finite")
+    if squares == 0:
+        raise NoRegions(f"The frame for place {item.id!r} has no region of interest, so it cannot be enrolled.")
+    if len(item.digest) != 32:
+        raise ValueError("a digest is the 32 bytes of SHA-256")
+    if item.regions < 0:
+        raise ValueError("a frame cannot have fewer than no regions")
+
+
+def _spot(stored: StoredPlace) -> Spot:
+    return spot_of(stored.place.pose, stored.sequence, stored.ordinal)
+
+
+class Write:
+    """Collects changes within a transaction of the map's one writer.
+
+    ``finish`` makes the descriptors durable, which must come before the COMMIT that names them.
+    """
+
+    def __init__(
+        self, folder: Path, opened: OpenMap, record: MapRecord, snapshot: Snapshot, connection: sqlite3.Connection
+    ):
+        self.record = record
+        self.connection = connection
+        self.appending = False
+        """From here on there may be rows in the segment files that nothing names."""
+        self.filled: dict[int, int] = {}
+        """The segments that became full, and their checksums."""
+        self._folder = folder
+        self._layout = opened.layout
+        self._snapshot = snapshot
+        self._born: list[NDArray[np.float32]] = []
+        self._spots: list[Spot] = []
+        self._moved: dict[int, Spot] = {}
+        self._dead: list[int] = []
+        self._now = datetime.now(UTC)
+
+    def enrol(self, item: Enrolment) -> tuple[Place, Change]:
+        """Create a place, replace its frame, or give it other fields if the frame is the same."""
+        stored = ledger.find(self.connection, item.id)
+        if stored is not None and stored.digest == item.digest:
+            return self.set_fields(stored, item.fields)
+        row = self._snapshot.rows + len(self._born)
+        checksum = descriptors.row_checksum(item.descriptor, row)
+        keep = self.record.keep
+        if stored is None:
+            now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
+        else:
+            ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
+            now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
+            self._bury(stored.row)
+        self._born.append(item.descriptor)
+        self._spots.append(_spot(now_stored))
+        return now_stored.place, "created" if stored is None else "replaced"
+
+    def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
+        """Other fields for the same frame."""
+        if ledger.same_fields(stored.place, fields):
+            return stored.place, "unchanged"
+        now_stored = ledger.set_fields(self.connection, stored, fields, self._now)
+        self._moved[stored.row] = _spot(now_stored)
+        return now_stored.place, "updated"
+
+    def forget(self, stored: StoredPlace) -> None:
+        """Delete a place."""
+        ledger.delete(self.connection, stored)
+        self._bury(stored.row)
+
+    def forget_sequence(self, name: str) -> int:
+        """Delete the places of a sequence; returns how many there were."""
+        rows = ledger.rows_of_sequence(self.connection, name)
+        if rows:
+            ledger.delete_sequence(self.connection, name)
+            for row in rows:
+                self._bury(row)
+        return len(rows)
+
+    def edit(self, record: MapRecord) -> None:
+        """Put another record in the place of the map's, under the next revision."""
+        changed = {"revision": self.record.revision + 1, "updated_at": self._now}
+        self.record = record.model_copy(update=changed)
+        ledger.update_record(self.connection, self.record)
+
+    def _bury(self, row: int) -> None:
+        self._dead.append(row)
+        self._moved.pop(row, None)
+
+    def finish(self) -> Snapshot:
+        """Append and sync the descriptors, and name them; returns what is to be searched after the COMMIT.
+
+        Raises:
+            OSError, sqlite3.Error: the disk refuses.
+        """
+        before = self._snapshot
+        if self._born:
+            self.appending = True
+            checksums = descriptors.append(self._folder, self._layout, before.rows, self._born)
+            self._name_rows(before.rows, checksums)
+        after = before.appended(self._born, self._spots) if self._born else before
+        after = after.moved(self._moved) if self._moved else after
+        return after.without(self._dead) if self._dead else after
+
+    def _name_rows(self, first_row: int, checksums: list[int]) -> None:
+        done = 0
+        while done < len(checksums):
+            number, offset = divmod(first_row + done, self._layout.rows_per_segment)
+            part = checksums[done : done + self._layout.rows_per_segment - offset]
+            named = self.connection.execute("SELECT checksum FROM segments WHERE number = ?", (number,)).fetchone()
+            checksum = descriptors.chain(part, named[0] if named else 0)
+            ledger.name_rows(self.connection, number, offset + len(part), checksum)
+            if offset + len(part) == self._layout.rows_per_segment:
+                self.filled[number] = checksum
+            done += len(part)

@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from core.storage import Atlas, Map, MapSettings
+from tests.core.storage.frames import DIMENSION, ENCODER
+
+ROWS = 4
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def atlas(directory: Path) -> Iterator[Atlas]:
+    """With segments of four rows, so that a few places fill some."""
+    atlas = Atlas(directory, rows_per_segment=ROWS)
+    yield atlas
+    atlas.close()
+
+
+@pytest.fixture
+def lab(atlas: Atlas) -> Map:
+    return atlas.create("lab", ENCODER, DIMENSION, MapSettings())

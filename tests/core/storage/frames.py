@@ -1,0 +1,44 @@
+"""Made-up frames whose descriptors follow from their names, so that any process can make them again."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.places import PlaceFields, Pose
+from core.storage import Enrolment
+
+ENCODER = "made-up@" + "0" * 64
+DIMENSION = 16
+
+
+def descriptor_of(name: str, dimension: int = DIMENSION) -> NDArray[np.float32]:
+    """A unit vector, float32 [dimension]."""
+    seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
+    vector = np.random.default_rng(seed).standard_normal(dimension, dtype=np.float32)
+    return np.asarray(vector / np.linalg.norm(vector), dtype=np.float32)
+
+
+def digest_of(name: str) -> bytes:
+    """SHA-256 of the image's bytes, for which the name stands."""
+    return hashlib.sha256(f"image of {name}".encode()).digest()
+
+
+def frame(
+    place_id: str, picture: str | None = None, *, dimension: int = DIMENSION, x: float | None = None, **fields: Any
+) -> Enrolment:
+    """An enrolment of ``place_id`` that shows ``picture`` (by default the place's own)."""
+    shown = picture or place_id
+    pose = None if x is None else Pose(x=x, y=0.0)
+    return Enrolment(
+        id=place_id,
+        fields=PlaceFields(pose=pose, **fields),
+        descriptor=descriptor_of(shown, dimension),
+        regions=len(shown),
+        digest=digest_of(shown),
+        thumbnail=f"thumbnail of {shown}".encode(),
+        image=f"image of {shown}".encode(),
+    )

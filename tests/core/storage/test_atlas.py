@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from core.errors import (
+    DataDirectoryLocked,
+    DataDirectoryTooNew,
+    InvalidCursor,
+    InvalidIdentifier,
+    MapExists,
+    MapQuarantined,
+    StorageFailure,
+    UnknownMap,
+)
+from core.storage import Atlas, Map, MapSettings
+from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+
+REPOSITORY = Path(__file__).parents[3]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(os.listdir(folder))
+
+
+def test_the_directory_is_made_with_all_above_it(tmp_path: Path) -> None:
+    directory = tmp_path / "a" / "b" / "data"
+    atlas = Atlas(directory)
+    assert names(directory) == ["FORMAT", "LOCK", "maps"]
+    assert atlas.records(None, 10) == ([], None)
+    atlas.close()
+    atlas.close()
+
+
+def test_a_map_is_made_whole(atlas: Atlas, directory: Path) -> None:
+    settings = MapSettings(description="the lab", keep="none", same_place_radius=2.5, same_place_frames=0)
+    lab = atlas.create("lab", ENCODER, DIMENSION, settings)
+    assert atlas.get("lab") is lab
+    assert lab.record.settings() == settings
+    assert (lab.record.id, lab.record.encoder, lab.record.dimension) == ("lab", ENCODER, DIMENSION)
+    assert names(directory / "maps") == ["lab"]
+    assert lab.verify().ok
+    with pytest.raises(MapExists):
+        atlas.create("lab", ENCODER, DIMENSION)
+
+
+@pytest.mark.parametrize("name", ["import", "Lab", "", "../lab", ".making-x", "a/b", "x" * 65])
+def test_what_cannot_name_a_map(atlas: Atlas, directory: Path, name: str) -> None:
+    with pytest.raises(InvalidIdentifier):
+        atlas.create(name, ENCODER, DIMENSION)
+    assert names(directory / "maps") == []
+    for call in (atlas.get, atlas.delete, atlas.verify):
+        with pytest.raises(UnknownMap):
+            call(name)
+
+
+def test_maps_are_listed_page_by_page(atlas: Atlas) -> None:
+    for name in ("b", "a", "d", "c"):
+        atlas.create(name, ENCODER, DIMENSION)
+    first, cursor = atlas.records(None, 3)
+    assert [record.id for record in first] == ["a", "b", "c"]
+    second, last = atlas.records(cursor, 3)
+    assert ([record.id for record in second], last) == (["d"], None)
+    with pytest.raises(InvalidCursor):
+        atlas.records("nonsense", 3)
+    with pytest.raises(ValueError, match="at least one"):
+        atlas.records(None, 0)
+
+
+def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Atlas, directory: Path) -> None:
+    atlas.create("lab", ENCODER, DIMENSION).enrol([frame("p")])
+    atlas.delete("lab")
+    assert names(directory / "maps") == []
+    for call in (atlas.get, atlas.delete):
+        with pytest.raises(UnknownMap):
+            call("lab")
+    again = atlas.create("lab", ENCODER, DIMENSION + 1)
+    again.enrol([frame("q", dimension=DIMENSION + 1)])
+    assert (again.count_places(), again.verify().ok) == (1, True)
+
+
+def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path) -> None:
+    with_places = Atlas(directory, rows_per_segment=4)
+    for name in ("hall", "lab"):
+        with_places.create(name, ENCODER, DIMENSION).enrol([frame(f"{name}{i}") for i in range(6)])
+    with_places.close()
+    atlas = Atlas(directory, rows_per_segment=100)  # the maps there are keep theirs
+    assert [record.id for record in atlas.records(None, 10)[0]] == ["hall", "lab"]
+    assert all(found._opened is None for found in atlas._maps.values())
+    assert (atlas.find("hall").record.id, atlas.find("hall").count_places()) == ("hall", 6)
+    lab = atlas.get("lab")
+    assert atlas._maps["hall"]._opened is None
+    assert lab.count_places() == 6
+    lab.enrol([frame(f"more{i}") for i in range(6)])
+    assert [len(segment) for segment in lab.snapshot().segments] == [4, 4, 4]
+    assert atlas.get("hall").verify().ok
+    atlas.close()
+
+
+def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
+    atlas = Atlas(directory)
+    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.close()
+    maps = directory / "maps"
+    shutil.copytree(maps / "lab", maps / ".making-hall-0123")
+    shutil.copytree(maps / "lab", maps / ".removing-lab-4567")
+    (maps / "lab" / "index-000001.faiss.tmp").write_bytes(b"half")
+    (maps / "README").write_text("somebody's note")
+    atlas = Atlas(directory)
+    assert names(maps) == ["README", "lab"]
+    assert [record.id for record in atlas.records(None, 10)[0]] == ["lab"]
+    atlas.get("lab").enrol([frame("p")])
+    assert not list((maps / "lab").glob("*.tmp"))
+    atlas.close()
+
+
+def test_one_process_at_a_time(directory: Path) -> None:
+    command = [sys.executable, "-m", "tests.core.storage.worker", "hold", str(directory)]
+    with subprocess.Popen(command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"ack holding\n"
+        with pytest.raises(DataDirectoryLocked, match="Another process"):
+            Atlas(directory)
+        other.kill()  # even a process that is killed lets go
+    Atlas(directory).close()
+
+
+def test_a_second_atlas_in_this_process_is_refused_too(atlas: Atlas, directory: Path) -> None:
+    with pytest.raises(DataDirectoryLocked):
+        Atlas(directory)
+
+
+def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
+    atlas = Atlas(directory)
+    lab = atlas.create("lab", ENCODER, DIMENSION)
+    atlas.close()
+    for call in (lambda: atlas.get("lab"), lambda: atlas.create("x", ENCODER, DIMENSION), atlas.check_writable):
+        with pytest.raises(StorageFailure, match="closed"):
+            call()
+    with pytest.raises(StorageFailure, match="closed"):
+        lab.enrol([frame("p")])
+    assert names(directory / "maps" / "lab") == ["map.sqlite"]
+
+
+def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
+    Atlas(directory).close()
+    (directory / "FORMAT").write_text("placerec data 2\n")
+    with pytest.raises(DataDirectoryTooNew):
+        Atlas(directory)
+    (directory / "FORMAT").write_text("something else")
+    with pytest.raises(StorageFailure, match="right directory"):
+        Atlas(directory)
+    (directory / "FORMAT").unlink()
+    atlas = Atlas(directory)
+    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.close()
+    edit(directory, "PRAGMA user_version = 99")
+    with pytest.raises(DataDirectoryTooNew, match="schema 99"):
+        Atlas(directory)
+    edit(directory, "PRAGMA user_version = 1")
+    Atlas(directory).close()  # and it let go of the lock each time
+
+
+def test_the_disk_can_be_written_or_not(atlas: Atlas, directory: Path) -> None:
+    before = names(directory)
+    atlas.check_writable()
+    assert names(directory) == before
+    shutil.rmtree(directory)
+    with pytest.raises(StorageFailure):
+        atlas.check_writable()
+
+
+def edit(directory: Path, *statements: str) -> None:
+    connection = sqlite3.connect(directory / "maps" / "lab" / "map.sqlite", isolation_level=None)
+    for statement in statements:
+        connection.execute(statement)
+    connection.close()
+
+
+def garbage(folder: Path) -> None:
+    (folder / "map.sqlite").write_bytes(os.urandom(20_000))
+
+
+def empty(folder: Path) -> None:
+    (folder / "map.sqlite").write_bytes(b"")
+
+
+def missing(folder: Path) -> None:
+    (folder / "map.sqlite").unlink()
+
+
+def cut(folder: Path) -> None:
+    os.truncate(folder / "map.sqlite", 5000)
+
+
+def without_a_record(folder: Path) -> None:
+    edit(folder.parents[1], "DELETE FROM map")
+
+
+def with_a_senseless_record(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE map SET keep = 'everything'")
+
+
+def without_a_table(folder: Path) -> None:
+    edit(folder.parents[1], "DROP TABLE pictures")
+
+
+def of_another_name(folder: Path) -> None:
+    edit(folder.parents[1], "UPDATE map SET id = 'kitchen'")
+
+
+def somebody_elses(folder: Path) -> None:
+    edit(folder.parents[1], "PRAGMA application_id = 1")
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        garbage,
+        empty,
+        missing,
+        cut,
+        without_a_record,
+        with_a_senseless_record,
+        without_a_table,
+        of_another_name,
+        somebody_elses,
+    ],
+    ids=lambda spoil: spoil.__name__,
+)
+def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
+    directory: Path, spoil: Callable[[Path], None]
+) -> None:
+    atlas = Atlas(directory, rows_per_segment=4)
+    for name in ("hall", "lab"):
+        atlas.create(name, ENCODER, DIMENSION).enrol([frame(f"{name}{i}") for i in range(6)])
+    atlas.close()
+    spoil(directory / "maps" / "lab")
+    atlas = Atlas(directory)
+    try:
+        with pytest.raises(MapQuarantined, match="damaged and out of service"):
+            atlas.get("lab")
+        assert list(atlas.quarantined()) == ["lab"]
+        assert atlas.quarantined()["lab"]
+        assert [record.id for record in atlas.records(None, 10)[0]] == ["hall"]
+        assert atlas.get("hall").snapshot().search(descriptor_of("hall3"))[0][0] == 3
+        with pytest.raises(MapExists):
+            atlas.create("lab", ENCODER, DIMENSION)
+        report = atlas.verify("lab")
+        assert not report.ok
+        assert report.problems[0] == f"out of service: {atlas.quarantined()['lab']}"
+        atlas.delete("lab")
+        assert atlas.quarantined() == {}
+        assert atlas.create("lab", ENCODER, DIMENSION).count_places() == 0
+    finally:
+        atlas.close()
+
+
+def test_a_database_damaged_in_use_takes_its_map_out_of_service(atlas: Atlas, lab: Map, directory: Path) -> None:
+    lab.enrol([frame(f"p{i}", metadata={"text": "x" * 3000}) for i in range(200)])
+    opened = lab._opened
+    assert opened is not None
+    opened.database.settle()
+    with (directory / "maps" / "lab" / "map.sqlite").open("r+b") as file:
+        file.seek(4096)
+        file.write(os.urandom(400_000))
+    with pytest.raises(MapQuarantined):
+        for i in range(200):
+            lab.place(f"p{i}")
+    assert list(atlas.quarantined()) == ["lab"]
+    for call in (lab.snapshot, lambda: lab.enrol([frame("q")]), lambda: atlas.get("lab")):
+        with pytest.raises(MapQuarantined):
+            call()
+    assert not atlas.verify("lab").ok
+    atlas.delete("lab")
+    assert names(directory / "maps") == []

@@ -1,0 +1,172 @@
+"""Many threads at once: writers, searchers, readers, and one that deletes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from core.errors import MapExists, StorageFailure, UnknownMap, UnknownPlace
+from core.storage import Atlas, Map
+from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+
+
+def run_together(*works: Callable[[], None]) -> None:
+    with ThreadPoolExecutor(len(works)) as pool:
+        for future in [pool.submit(work) for work in works]:
+            future.result()
+
+
+def test_writers_and_searchers(lab: Map) -> None:
+    """What a writer was told is seen at once by whoever looks next; nobody sees half a write."""
+    writing = threading.Event()
+    writers, each = 4, 15
+    left = [writers]
+    guard = threading.Lock()
+
+    def write(writer: int) -> Callable[[], None]:
+        def work() -> None:
+            for i in range(each):
+                names = [f"w{writer}-{i}", f"w{writer}-{i}-twin"]
+                lab.enrol([frame(name, sequence=f"s{writer}") for name in names])
+                snapshot = lab.snapshot()
+                for name in names:
+                    rows, products = snapshot.search(descriptor_of(name))
+                    assert products[0] > 0.999
+                    (found,) = lab.places_at(rows[:1].tolist())
+                    assert found is not None
+                    assert found.id == name
+                if i % 3 == 0:
+                    lab.patch(names[0], {"metadata": {"i": i}})
+                    assert lab.place(names[0]).metadata == {"i": i}
+                if i % 4 == 0:
+                    lab.forget(names[1])
+                    assert lab.snapshot().search(descriptor_of(names[1]))[1][0] < 0.999
+            with guard:
+                left[0] -= 1
+                if not left[0]:
+                    writing.set()
+
+        return work
+
+    def search() -> None:
+        before = 0
+        while not writing.is_set():
+            snapshot = lab.snapshot()
+            assert snapshot.rows % 2 == 0  # twins come together
+            assert snapshot.rows >= before
+            before = snapshot.rows
+            rows, products = snapshot.search(descriptor_of("w0-0"))
+            assert len(rows) == len(products) == len(snapshot)
+            assert len(snapshot.whereabouts) == snapshot.rows
+
+    def read() -> None:
+        while not writing.is_set():
+            places, cursor = lab.places(None, 7)
+            assert len(places) == 7 or cursor is None
+            for summary in lab.sequences(None, 10)[0]:
+                assert summary.name.startswith("s")
+
+    def verify() -> None:
+        while not writing.is_set():
+            report = lab.verify()
+            assert report.problems == []
+
+    run_together(*[write(writer) for writer in range(writers)], search, search, read, read, verify)
+    assert lab.count_places() == writers * (2 * each - len(range(0, each, 4)))
+    assert lab.verify().ok
+
+
+def test_a_map_is_deleted_under_its_users(atlas: Atlas, directory: Path) -> None:
+    for _ in range(5):
+        lab = atlas.create("lab", ENCODER, DIMENSION)
+        lab.enrol([frame("p")])
+        started = threading.Barrier(4)
+
+        def use(lab: Map = lab, started: threading.Barrier = started) -> None:
+            started.wait()
+            try:
+                for i in range(10_000):
+                    lab.enrol([frame(f"q{i % 50}", f"picture {i}")])
+                    assert lab.place("p").id == "p"
+                    lab.snapshot().search(descriptor_of("p"))
+            except UnknownMap:
+                return
+            raise AssertionError
+
+        def delete(started: threading.Barrier = started) -> None:
+            started.wait()
+            atlas.delete("lab")
+
+        run_together(use, use, use, delete)
+        assert list((directory / "maps").iterdir()) == []
+
+
+def test_one_of_many_makes_a_map(atlas: Atlas) -> None:
+    made: list[Map] = []
+
+    def make() -> None:
+        try:
+            made.append(atlas.create("lab", ENCODER, DIMENSION))
+        except MapExists:
+            assert atlas.get("lab").record.id == "lab"
+
+    run_together(*[make] * 8)
+    assert len(made) == 1
+
+
+def test_a_map_is_opened_once_by_many(directory: Path) -> None:
+    atlas = Atlas(directory, rows_per_segment=4)
+    atlas.create("lab", ENCODER, DIMENSION).enrol([frame(f"p{i}") for i in range(9)])
+    atlas.close()
+    atlas = Atlas(directory)
+    seen: list[object] = []
+
+    def use() -> None:
+        lab = atlas.get("lab")
+        seen.append(lab.snapshot())
+        assert lab.place("p3").id == "p3"
+
+    run_together(*[use] * 8)
+    assert all(snapshot is seen[0] for snapshot in seen)
+    atlas.close()
+
+
+def test_closing_under_load(directory: Path) -> None:
+    atlas = Atlas(directory, rows_per_segment=4)
+    lab = atlas.create("lab", ENCODER, DIMENSION)
+    taken: list[str] = []
+    started = threading.Barrier(3)
+
+    def write() -> None:
+        started.wait()
+        try:
+            for i in range(10_000):
+                lab.enrol([frame(f"p{i}")])
+                taken.append(f"p{i}")
+        except StorageFailure:
+            return
+        raise AssertionError
+
+    def read() -> None:
+        started.wait()
+        try:
+            while True:
+                try:
+                    lab.place("p0")
+                except UnknownPlace:
+                    continue
+        except StorageFailure:
+            return
+
+    def close() -> None:
+        started.wait()
+        while len(taken) < 5:
+            pass
+        atlas.close()
+
+    run_together(write, read, close)
+    atlas = Atlas(directory)
+    assert [place.id for place in atlas.get("lab").places(None, 10_000)[0]] == taken
+    atlas.close()

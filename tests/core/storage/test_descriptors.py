@@ -1,0 +1,160 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.storage.descriptors import (
+    HEADER_BYTES,
+    Layout,
+    append,
+    chain,
+    map_records,
+    read_checked,
+    read_records,
+    rewind,
+    row_checksum,
+    segment_name,
+)
+from core.storage.disk import Damage
+from tests.core.storage.frames import descriptor_of
+
+LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)
+RECORD_BYTES = 8 * 4 + 16
+
+
+def rows(count: int, start: int = 0) -> list[NDArray[np.float32]]:
+    return [descriptor_of(f"row {start + i}", LAYOUT.dimension) for i in range(count)]
+
+
+def stored(folder: Path, number: int, count: int, checksum: int) -> NDArray[np.float32]:
+    return np.concatenate([part["descriptor"] for part in read_checked(folder, LAYOUT, number, count, checksum)])
+
+
+def flip(path: Path, offset: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[offset] ^= 1
+    path.write_bytes(content)
+
+
+def test_what_was_appended_is_read_over_several_segments(tmp_path: Path) -> None:
+    checksums = append(tmp_path, LAYOUT, 0, rows(3)) + append(tmp_path, LAYOUT, 3, rows(7, 3))
+    assert len(checksums) == 10
+    assert sorted(os.listdir(tmp_path)) == [segment_name(number) for number in range(3)]
+    for number, count in ((0, 4), (1, 4), (2, 2)):
+        part = checksums[4 * number : 4 * number + count]
+        np.testing.assert_array_equal(stored(tmp_path, number, count, chain(part)), rows(count, 4 * number))
+    assert (tmp_path / segment_name(2)).stat().st_size == HEADER_BYTES + 2 * RECORD_BYTES
+
+
+def test_the_checksum_of_a_segment_can_be_continued() -> None:
+    assert chain([1, 2, 3]) == chain([3], chain([1, 2]))
+    assert chain([1, 2]) != chain([2, 1])
+    assert row_checksum(rows(1)[0], 0) != row_checksum(rows(1)[0], 1)
+
+
+def test_records_can_be_mapped_into_memory(tmp_path: Path) -> None:
+    append(tmp_path, LAYOUT, 0, rows(4))
+    mapped = map_records(tmp_path, LAYOUT, 0, 4)
+    assert mapped["row"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_array_equal(mapped["descriptor"], rows(4))
+    assert not mapped.flags.writeable
+    assert mapped.dtype.itemsize == RECORD_BYTES
+
+
+def test_only_the_rows_asked_for_count(tmp_path: Path) -> None:
+    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    with (tmp_path / segment_name(0)).open("ab") as file:
+        file.write(b"half a record")
+    assert len(stored(tmp_path, 0, 3, chain(checksums))) == 3
+
+
+def test_rows_behind_are_overwritten(tmp_path: Path) -> None:
+    first = append(tmp_path, LAYOUT, 0, rows(3))
+    second = append(tmp_path, LAYOUT, 2, rows(1, 77))
+    found = stored(tmp_path, 0, 3, chain([*first[:2], *second]))
+    np.testing.assert_array_equal(found[2], descriptor_of("row 77", LAYOUT.dimension))
+
+
+@pytest.mark.parametrize(("kept", "files", "size"), [(0, 0, 0), (2, 1, 2), (4, 1, 4), (5, 2, 1), (9, 3, 1), (10, 3, 2)])
+def test_rewinding_cuts_and_removes(tmp_path: Path, kept: int, files: int, size: int) -> None:
+    append(tmp_path, LAYOUT, 0, rows(10))
+    (tmp_path / "map.sqlite").touch()
+    rewind(tmp_path, LAYOUT, kept)
+    left = sorted(tmp_path.glob("*.seg"))
+    assert len(left) == files
+    if left:
+        assert left[-1].stat().st_size == HEADER_BYTES + size * RECORD_BYTES
+    assert (tmp_path / "map.sqlite").exists()
+
+
+@pytest.mark.parametrize("offset", [0, 8, 12, 31, 60, HEADER_BYTES - 1])
+def test_a_damaged_header_is_found(tmp_path: Path, offset: int) -> None:
+    checksums = append(tmp_path, LAYOUT, 0, rows(2))
+    flip(tmp_path / segment_name(0), offset)
+    with pytest.raises(Damage, match=r"descriptors-000001\.seg: the header"):
+        stored(tmp_path, 0, 2, chain(checksums))
+
+
+@pytest.mark.parametrize("offset", range(RECORD_BYTES - 4))
+def test_every_flipped_bit_of_a_record_is_found(tmp_path: Path, offset: int) -> None:
+    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    flip(tmp_path / segment_name(0), HEADER_BYTES + RECORD_BYTES + offset)
+    with pytest.raises(Damage, match="row 1 does not match"):
+        stored(tmp_path, 0, 3, chain(checksums))
+
+
+def test_records_that_changed_places_are_found(tmp_path: Path) -> None:
+    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    path = tmp_path / segment_name(0)
+    content = path.read_bytes()
+    a, b = (content[HEADER_BYTES + i * RECORD_BYTES : HEADER_BYTES + (i + 1) * RECORD_BYTES] for i in (0, 1))
+    path.write_bytes(content[:HEADER_BYTES] + b + a + content[HEADER_BYTES + 2 * RECORD_BYTES :])
+    with pytest.raises(Damage, match="row 0"):
+        stored(tmp_path, 0, 3, chain(checksums))
+
+
+def test_good_records_that_are_not_the_named_ones_are_found(tmp_path: Path) -> None:
+    append(tmp_path, LAYOUT, 0, rows(3, 50))
+    checksum = chain([row_checksum(descriptor, i) for i, descriptor in enumerate(rows(3))])
+    with pytest.raises(Damage, match="not those that map"):
+        stored(tmp_path, 0, 3, checksum)
+
+
+def test_a_file_that_is_missing_or_short(tmp_path: Path) -> None:
+    with pytest.raises(Damage, match="missing"):
+        stored(tmp_path, 0, 1, 0)
+    append(tmp_path, LAYOUT, 0, rows(3))
+    path = tmp_path / segment_name(0)
+    os.truncate(path, path.stat().st_size - 1)
+    with pytest.raises(Damage, match="ends after 2 of 3 rows"):
+        stored(tmp_path, 0, 3, 0)
+    os.truncate(path, 100)
+    with pytest.raises(Damage, match="within its header"):
+        stored(tmp_path, 0, 3, 0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Layout(dimension=9, identity="encoder@1", rows_per_segment=4),
+        Layout(dimension=8, identity="encoder@2", rows_per_segment=4),
+        Layout(dimension=8, identity="encoder@1", rows_per_segment=5),
+    ],
+)
+def test_a_segment_of_another_map_is_refused(tmp_path: Path, other: Layout) -> None:
+    append(tmp_path, LAYOUT, 0, rows(4))
+    with pytest.raises(Damage, match="another map, encoder, segment or version"):
+        list(read_records(tmp_path, other, 0, 1))
+    (tmp_path / segment_name(0)).rename(tmp_path / segment_name(1))
+    with pytest.raises(Damage, match="another"):
+        list(read_records(tmp_path, LAYOUT, 1, 1))
+
+
+def test_an_identity_has_its_limit() -> None:
+    Layout(dimension=8, identity="x" * 1024, rows_per_segment=4).header(0)
+    with pytest.raises(ValueError, match="1024"):
+        Layout(dimension=8, identity="x" * 1025, rows_per_segment=4)

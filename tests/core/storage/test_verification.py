@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+
+from core.storage import Atlas, Map, MapSettings
+from core.storage.descriptors import HEADER_BYTES
+from core.storage.snapshot import vectors
+from tests.core.storage.frames import DIMENSION, ENCODER, frame
+from tests.core.storage.test_opening import flip
+
+RECORD_BYTES = DIMENSION * 4 + 16
+
+
+@pytest.fixture
+def hall(atlas: Atlas) -> Map:
+    """Ten places, one of them forgotten, in segments of four rows; images are kept."""
+    hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="image"))
+    images = [f"image {i}".encode() for i in range(10)]
+    hall.enrol(
+        [
+            replace(frame(f"p{i}", sequence="s"), image=image, digest=sha256(image).digest())
+            for i, image in enumerate(images)
+        ]
+    )
+    hall.forget("p6")
+    return hall
+
+
+@pytest.fixture
+def folder(directory: Path) -> Path:
+    return directory / "maps" / "hall"
+
+
+def execute(hall: Map, statement: str) -> None:
+    """Behind the back of everything that keeps the map in order."""
+    with hall._writing() as write:
+        write.connection.execute(statement)
+
+
+def test_a_good_map(hall: Map, folder: Path) -> None:
+    report = hall.verify()
+    assert (report.ok, report.places, report.rows) == (True, 9, 10)
+    assert (report.problems, report.stale_caches) == ([], [])
+    stored = sum((folder / f"index-00000{i}.faiss").stat().st_size for i in (1, 2)) + 10 * RECORD_BYTES
+    assert report.checked_bytes == stored + 9 * len("image 0")
+
+
+def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:
+    for row, name in ((1, "descriptors-000001.seg"), (6, "descriptors-000002.seg"), (9, "descriptors-000003.seg")):
+        flip(folder / name, HEADER_BYTES + (row % 4) * RECORD_BYTES)
+    problems = "\n".join(hall.verify().problems)
+    assert "descriptors-000001.seg: row 1 (place 'p1') does not match its checksum" in problems
+    assert "descriptors-000002.seg: row 6 (no place any more) does not match its checksum" in problems
+    assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in problems
+
+
+def test_many_damaged_rows_are_counted(atlas: Atlas, directory: Path) -> None:
+    atlas._rows_per_segment = 64
+    lab = atlas.create("lab", ENCODER, DIMENSION)
+    lab.enrol([frame(f"p{i}") for i in range(30)])
+    for row in range(30):
+        flip(directory / "maps" / "lab" / "descriptors-000001.seg", HEADER_BYTES + row * RECORD_BYTES)
+    problems = lab.verify().problems
+    assert len([problem for problem in problems if "does not match" in problem]) == 10
+    assert "descriptors-000001.seg: so with 20 more rows" in problems
+
+
+def test_a_missing_segment_does_not_hide_the_others(hall: Map, folder: Path) -> None:
+    (folder / "descriptors-000001.seg").unlink()
+    flip(folder / "descriptors-000002.seg", HEADER_BYTES)
+    problems = hall.verify().problems
+    assert "descriptors-000001.seg: the file is missing" in problems
+    assert "descriptors-000002.seg: row 4 (place 'p4') does not match its checksum" in problems
+
+
+def test_a_damaged_picture_is_named(hall: Map) -> None:
+    execute(hall, "UPDATE pictures SET bytes = x'00' WHERE place = 3")
+    assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
+
+
+def test_an_image_that_is_not_the_one_enrolled_is_named(hall: Map) -> None:
+    digest = sha256(b"x").hexdigest()
+    execute(hall, f"UPDATE pictures SET bytes = x'78', digest = x'{digest}' WHERE place = 3")
+    assert hall.verify().problems == ["map.sqlite: the image of place 'p2' does not match its digest"]
+
+
+def test_a_picture_that_is_missing_is_named(hall: Map) -> None:
+    execute(hall, "DELETE FROM pictures WHERE place = 3")
+    assert hall.verify().problems == ["map.sqlite: place 'p2' is said to keep image, which is not so"]
+
+
+def test_a_damaged_cache_is_told_but_is_no_damage(hall: Map, folder: Path) -> None:
+    flip(folder / "index-000001.faiss", 100)
+    (folder / "index-000002.faiss").unlink()
+    report = hall.verify()
+    assert report.ok
+    assert report.stale_caches == [
+        "index-000001.faiss: it does not match its checksum",
+        "index-000002.faiss: it is missing",
+    ]
+
+
+def test_what_is_searched_must_be_what_is_stored(hall: Map) -> None:
+    vectors(hall.snapshot().segments[1].index)[0, 0] += 1
+    assert hall.verify().problems == ["descriptors-000002.seg: row 4 (place 'p4') is not what is searched"]
+
+
+@pytest.mark.parametrize(
+    ("statement", "problem"),
+    [
+        ("UPDATE places SET x = 1, y = 2 WHERE id = 'p1'", "row 1 is searched otherwise than map.sqlite has it"),
+        ("UPDATE places SET ordinal = 77 WHERE id = 'p1'", "row 1 is searched otherwise than map.sqlite has it"),
+        ("DELETE FROM places WHERE id = 'p1'", "9 places in 10 rows are searched, 8 in 10 are stored"),
+        ("UPDATE places SET row = 6 WHERE id = 'p1'", "row 6 is searched otherwise than map.sqlite has it"),
+        ("UPDATE places SET row = 99 WHERE id = 'p1'", "map.sqlite: place 'p1' has row 99, but there are 10"),
+        ("UPDATE places SET checksum = 5 WHERE id = 'p1'", "row 1 (place 'p1') is not the one that map.sqlite names"),
+        (
+            "UPDATE segments SET checksum = 5 WHERE number = 2",
+            "its rows are not those that map.sqlite names",
+        ),
+    ],
+)
+def test_disagreement_of_store_and_snapshot(hall: Map, statement: str, problem: str) -> None:
+    execute(hall, statement)
+    report = hall.verify()
+    assert not report.ok
+    assert any(problem in found for found in report.problems), report.problems
+
+
+def test_a_row_of_a_table_that_belongs_to_nothing(hall: Map) -> None:
+    opened = hall._opened
+    assert opened is not None
+    opened.database._writer.execute("PRAGMA foreign_keys = OFF")
+    execute(hall, "DELETE FROM sequences WHERE name = 's'")
+    assert any("belongs to nothing in sequences" in problem for problem in hall.verify().problems)
+
+
+def test_places_enrolled_meanwhile_are_not_in_the_report(hall: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report is of the moment of the call, although writes go on."""
+    from core.storage import verification
+
+    check_tables = verification._check_tables
+
+    def enrol_first(*arguments: object) -> None:
+        hall.enrol([frame(f"late{i}") for i in range(5)])
+        hall.forget("p1")
+        check_tables(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(verification, "_check_tables", enrol_first)
+    report = hall.verify()
+    assert (report.problems, report.places, report.rows) == ([], 9, 10)
+    assert hall.count_places() == 13

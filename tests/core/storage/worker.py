@@ -1,0 +1,167 @@
+"""A process that uses a data directory until it is killed, traced or refused; ``python -m`` it with an action.
+
+Each acknowledged step is told by a line on standard output that begins with ``ack``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import resource
+import signal
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from core.errors import PlacerecError
+from core.places import PlaceFields
+from core.storage import Atlas, Map, MapSettings
+from tests.core.storage.frames import DIMENSION, ENCODER, frame
+
+LARGE = 4096
+"""Dimension with which the descriptors are by far the most that is written."""
+
+
+def acknowledge(text: str) -> None:
+    os.write(1, f"ack {text}\n".encode())
+
+
+def everything(directory: Path) -> None:
+    """Every kind of write once or more."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    acknowledge("opened")
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"))
+    acknowledge("created map")
+    lab.enrol([frame("p0", sequence="monday")])
+    acknowledge("enrolled one")
+    lab.enrol([frame(f"p{i}", sequence="monday", x=i) for i in range(1, 11)])  # fills two segments
+    acknowledge("enrolled ten")
+    lab.enrol([frame("p1", "another"), frame("p2", sequence="tuesday")])
+    acknowledge("replaced and updated")
+    lab.enrol([frame("begins-a-segment")])  # with no cache to be written at the same time
+    acknowledge("enrolled into a new segment")
+    lab.set_fields("p3", PlaceFields(metadata={"a": 1}))
+    acknowledge("set fields")
+    lab.patch("p4", {"sequence": "tuesday"})
+    acknowledge("patched")
+    lab.edit({"description": "the laboratory"})
+    acknowledge("edited")
+    lab.forget("p5")
+    acknowledge("forgot")
+    lab.forget_sequence("monday")
+    acknowledge("forgot sequence")
+    atlas.create("hall", ENCODER, DIMENSION).enrol([frame("h")])
+    acknowledge("created another")
+    atlas.delete("hall")
+    acknowledge("deleted")
+    atlas.close()
+    acknowledge("closed")
+    atlas = Atlas(directory, rows_per_segment=4)
+    atlas.get("lab").enrol([frame("late")])
+    acknowledge("enrolled after a restart")
+    for i in range(300):  # as many pages as make SQLite move its log into the file
+        atlas.get("lab").patch("late", {"metadata": {"text": f"{i} " * 2000}})
+        acknowledge("patched again")
+    atlas.close()
+
+
+def enrol_for_ever(directory: Path) -> None:
+    """Enrols two new places, replaces one and forgets one, over and over; tells of each step before and after it."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    lab = atlas.get("lab") if atlas.records(None, 1)[0] else atlas.create("lab", ENCODER, DIMENSION)
+    for i in itertools.count(lab.snapshot().rows):
+        fresh, twin = f"new{i}", f"pair{i}"
+        steps: list[tuple[dict[str, str | None], Callable[[], object]]] = [
+            ({fresh: fresh, twin: twin}, partial(lab.enrol, [frame(fresh), frame(twin, sequence="pairs")])),
+            ({fresh: f"again{i}"}, partial(lab.enrol, [frame(fresh, f"again{i}")])),
+            ({twin: None}, partial(lab.forget, twin)),
+        ]
+        for outcome, step in steps[: 1 + i % 3]:
+            os.write(1, f"begin {json.dumps(outcome)}\n".encode())
+            step()
+            acknowledge(json.dumps(outcome))
+
+
+def fill(directory: Path) -> None:
+    """Enrols until a limit on the size of files stops it; then shows that the map still works."""
+    atlas = Atlas(directory, rows_per_segment=1024)
+    lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
+    refused = _until_refused(lab)
+    size = (directory / "maps" / "lab" / "descriptors-000001.seg").stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    before = lab.count_places()
+    lab.enrol([frame("after", dimension=LARGE)])
+    report = lab.verify()
+    answer = {"error": refused, "places": before, "size": size, "after": lab.count_places(), "ok": report.ok}
+    print(json.dumps(answer), flush=True)
+    atlas.close()
+
+
+def _until_refused(lab: Map) -> str:
+    for i in itertools.count():
+        try:
+            lab.enrol([frame(f"p{i}-{j}", dimension=LARGE) for j in range(7)])
+        except PlacerecError as error:
+            return type(error).__name__
+    raise AssertionError
+
+
+def hold(directory: Path) -> None:
+    """Keeps the data directory until standard input ends."""
+    atlas = Atlas(directory)
+    acknowledge("holding")
+    sys.stdin.read()
+    atlas.close()
+
+
+def keep_trying(directory: Path) -> None:
+    """Enrols ten places one by one, telling of each whether it was taken."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    try:
+        lab = atlas.get("lab")
+    except PlacerecError:
+        lab = atlas.get("lab")  # what was refused once is not refused for ever
+    before = lab.count_places()
+    outcomes = []
+    for i in range(10):
+        try:
+            lab.enrol([frame(f"try{i}")])
+            outcomes.append([f"try{i}", "taken"])
+        except PlacerecError as error:
+            outcomes.append([f"try{i}", type(error).__name__])
+    report = lab.verify()
+    found = [place.id for place in lab.places(None, 1000)[0]]
+    answer = {
+        "outcomes": outcomes, "before": before, "searched": lab.count_places(), "found": found, "ok": report.ok,
+        "problems": report.problems,
+    }  # fmt: skip
+    print(json.dumps(answer), flush=True)
+    atlas.close()
+
+
+def die_at_refusal(directory: Path) -> None:
+    """Enrols until the disk refuses, and is killed right then."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    lab = atlas.get("lab")
+    for i in range(10):
+        try:
+            lab.enrol([frame(f"try{i}")])
+            acknowledge(f"try{i}")
+        except PlacerecError:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+ACTIONS: dict[str, Callable[[Path], None]] = {
+    "everything": everything,
+    "enrol-for-ever": enrol_for_ever,
+    "fill": fill,
+    "hold": hold,
+    "keep-trying": keep_trying,
+    "die-at-refusal": die_at_refusal,
+}
+
+if __name__ == "__main__":
+    ACTIONS[sys.argv[1]](Path(sys.argv[2]))
