@@ -12,16 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
 from core.verdict import Calibration, Neighborhood, Whereabouts, judge
 from training.validation import Cameras, Walk
 
 Array = NDArray[np.float32]
 
 NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
-FALSE_ACCEPTS = 0.15
-"""The threshold lets at most this share of unknown places through, on average over the maps."""
-LOST_BY_MARGIN = 0.02
-"""The margin turns at most this share of right answers into ambiguous ones."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,121 @@
+"""A service process to measure, and maps to measure it with."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import numpy as np
+from numpy.typing import NDArray
+
+from core.encoder import Encoder
+from core.places import PlaceFields
+from core.storage import Atlas, Enrolment, MapSettings
+from service.measurement import sample_picture
+
+ROOT = Path(__file__).parents[1]
+START_SECONDS = 120.0
+BATCH = 64
+
+
+@dataclass
+class Process:
+    """A running service.
+
+    ready: seconds from its start to the first 200 of ``/readyz``.
+    """
+
+    client: httpx.Client
+    pid: int
+    ready: float
+
+    def peak_memory(self) -> float:
+        """The most memory that it has had resident, in MB (10^6 bytes)."""
+        lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
+        kilobytes = next(line.split()[1] for line in lines if line.startswith("VmHWM:"))
+        return int(kilobytes) * 1024 / 1e6
+
+
+@contextmanager
+def service(data_dir: Path, threads: int = 0) -> Iterator[Process]:
+    """``placerec serve`` on a directory, until the block ends; ``threads`` of a forward pass, 0 for torch's choice."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    own = {"DATA_DIR": data_dir, "THREADS": threads, "LOG_LEVEL": "warning"}
+    environment = {**os.environ, **{f"PLACEREC_{name}": str(value) for name, value in own.items()}}
+    command = [sys.executable, "-m", "service.commands", "serve", "--host", "127.0.0.1", "--port", str(port)]
+    began = time.monotonic()
+    process = subprocess.Popen(command, cwd=ROOT, env=environment)
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60) as client:
+            yield Process(client, process.pid, _wait(client, process, began))
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+def _wait(client: httpx.Client, process: subprocess.Popen[bytes], began: float) -> float:
+    while time.monotonic() - began < START_SECONDS and process.poll() is None:
+        try:
+            if client.get("/readyz").status_code == 200:
+                return time.monotonic() - began
+        except httpx.TransportError:
+            pass
+        time.sleep(0.01)
+    raise RuntimeError("the service did not become ready")
+
+
+def descriptors(encoder: Encoder, count: int, pictures: int = 60, seed: int = 0) -> Iterator[NDArray[np.float32]]:
+    """``count`` descriptors with the statistics of real ones.
+
+    ``pictures`` are encoded; each further one takes the parts of its words from two of those at random.
+    """
+    real = np.stack([encoder.encode(sample_picture(index)).descriptor for index in range(min(pictures, count))])
+    yield from real
+    words, random = encoder.definition.words, np.random.default_rng(seed)
+    for _ in range(count - len(real)):
+        a, b = random.choice(len(real), 2, replace=False)
+        from_a = random.random(words) < 0.5
+        yield np.where(from_a[:, None], real[a].reshape(words, -1), real[b].reshape(words, -1)).reshape(-1)
+
+
+def fill_map(data_dir: Path, map_id: str, encoder: Encoder, places: int) -> None:
+    """A map of so many places, written through the storage itself."""
+    atlas = Atlas(data_dir)
+    made = atlas.create(map_id, encoder.identity, encoder.dimension, MapSettings(keep="none"))
+    batch: list[Enrolment] = []
+    for index, descriptor in enumerate(descriptors(encoder, places)):
+        batch.append(_enrolment(index, descriptor))
+        if len(batch) == BATCH:
+            made.enrol(batch)
+            batch = []
+    if batch:
+        made.enrol(batch)
+    atlas.close()
+
+
+def _enrolment(index: int, descriptor: NDArray[np.float32]) -> Enrolment:
+    return Enrolment(
+        id=f"p{index:05d}",
+        fields=PlaceFields(sequence="benchmark"),
+        descriptor=descriptor,
+        regions=600,
+        digest=hashlib.sha256(str(index).encode()).digest(),
+        thumbnail=None,
+        image=None,
+    )
+
+
+def median(values: Sequence[float]) -> float:
+    """The median of a list."""
+    return float(np.median(values))

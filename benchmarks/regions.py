@@ -1,0 +1,60 @@
+"""The region pass over two layers against the frozen reference: at least 60 times faster.
+
+python -m benchmarks.regions
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from benchmarks.reference_regions import reference_regions
+from benchmarks.report import report, verdict
+from core.encoder import FeatureExtractor
+from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.regions import extract_regions, fuse
+from service.measurement import medians, sample_picture
+
+LIMIT = 60.0
+
+
+def main(encoder: str = DEFAULT_ENCODER, rounds: Annotated[int, typer.Option(min=3)] = 9) -> None:
+    """Compare results, then times."""
+    extractor: FeatureExtractor = EncoderCatalogue().get(encoder).extractor
+    definition = extractor.definition
+    layers = extractor.activations([sample_picture()])[0]
+    planes = [np.ascontiguousarray(layer.transpose(2, 0, 1)) for layer in layers]
+    steps = definition.steps
+
+    def ours() -> object:
+        return fuse(
+            [
+                extract_regions(layer, step, definition.regions, index)
+                for index, (layer, step) in enumerate(zip(layers, steps, strict=True))
+            ]
+        )
+
+    def reference() -> object:
+        return [reference_regions(plane, step, definition.regions) for plane, step in zip(planes, steps, strict=True)]
+
+    for layer, plane, step in zip(layers, planes, steps, strict=True):
+        made = extract_regions(layer, step, definition.regions)
+        _, energies, features = reference_regions(plane, step, definition.regions)
+        np.testing.assert_allclose(made.energies, energies, rtol=1e-4)
+        # Regions of nearly the same energy may change places; the sets of their features may not.
+        np.testing.assert_allclose(made.features.sum(axis=0), features.sum(axis=0), rtol=1e-2)
+
+    times = medians({"ours": ours, "reference": reference}, rounds, warm_up=1)
+    ratio = times["reference"] / times["ours"]
+    rows = [
+        ("reference (scikit-image)", times["reference"], 1.0, ""),
+        ("region pass", times["ours"], ratio, verdict(ratio, LIMIT, at_least=True)),
+    ]
+    title = f"Regions of {', '.join(definition.layers)}, N = {definition.regions} each"
+    report("regions", title, ["", "ms", "times faster", ""], rows, {"milliseconds": times, "ratio": ratio})
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,108 @@
+"""Traverses on disk: which images a directory holds, in which order, and what is true of two of them."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidGroundTruth, InvalidTraverse
+
+Truth = list[NDArray[np.int64]]
+"""For each query its true references: indices in ascending order, maybe none."""
+
+SUPPORTED_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
+# Pictures that we cannot decode are listed too: left out silently, they would shift every index after them.
+OTHER_SUFFIXES = frozenset({".avif", ".bmp", ".gif", ".heic", ".jp2", ".pbm", ".pgm", ".ppm", ".tif", ".tiff"})
+
+
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sorts names as people count: ``2.jpg`` before ``10.jpg``; equal numbers by their spelling."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
+
+
+def find_images(directory: Path) -> list[Path]:
+    """The images of a directory in natural order, those of its subfolders and hidden files left out.
+
+    Raises:
+        InvalidTraverse: it is no directory, cannot be read, or holds no image.
+    """
+    suffixes = SUPPORTED_SUFFIXES | OTHER_SUFFIXES
+    try:
+        entries = [path for path in directory.iterdir() if not path.name.startswith(".")]
+        images = [path for path in entries if path.suffix.lower() in suffixes and path.is_file()]
+    except OSError as error:
+        raise InvalidTraverse(f"{directory} cannot be read as a directory: {error.strerror}.") from error
+    if not images:
+        raise InvalidTraverse(f"{directory} holds no image ({', '.join(sorted(SUPPORTED_SUFFIXES))}).")
+    return sorted(images, key=lambda path: natural_key(path.name))
+
+
+def tolerance_truth(queries: int, references: int, tolerance: int) -> Truth:
+    """Query i shows what references i - ``tolerance`` to i + ``tolerance`` show."""
+    return [
+        np.arange(max(0, query - tolerance), min(references, query + tolerance + 1), dtype=np.int64)
+        for query in range(queries)
+    ]
+
+
+def read_ground_truth(path: Path, queries: int, references: int) -> Truth:
+    """The true references from a CSV file with rows ``query,reference``, several rows per query.
+
+    A header with these two names may come first; indices count from 0.
+
+    Raises:
+        InvalidGroundTruth: the file cannot be read, a row is malformed, or an index is out of range.
+    """
+    found: list[set[int]] = [set() for _ in range(queries)]
+    for number, line in _lines(path):
+        row = [field.strip() for field in next(csv.reader([line]))]
+        if number == 1 and [field.lower() for field in row] == ["query", "reference"]:
+            continue
+        if len(row) != 2:
+            raise InvalidGroundTruth(f"{path.name}, line {number}: a row is 'query,reference', not {line[:80]!r}.")
+        query = _index(row[0], queries, "query", path, number)
+        found[query].add(_index(row[1], references, "reference", path, number))
+    if not any(found):
+        raise InvalidGroundTruth(f"{path.name} names no true reference.")
+    return [np.array(sorted(true), np.int64) for true in found]
+
+
+def read_kept_references(path: Path, references: int) -> NDArray[np.int64]:
+    """The indices of the references to keep, one a line; int64 [R'], ascending.
+
+    Raises:
+        InvalidGroundTruth: the file cannot be read, a line is no index, or none is kept.
+    """
+    kept = {_index(line.strip(), references, "reference", path, number) for number, line in _lines(path)}
+    if not kept:
+        raise InvalidGroundTruth(f"{path.name} keeps no reference.")
+    return np.array(sorted(kept), np.int64)
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """The lines that are not blank, with their numbers from 1."""
+    try:
+        text = path.read_text("utf-8-sig")
+    except OSError as error:
+        raise InvalidGroundTruth(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise InvalidGroundTruth(f"{path} is not text.") from error
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip():
+            yield number, line
+
+
+def _index(text: str, count: int, what: str, path: Path, number: int) -> int:
+    if not re.fullmatch(r"[0-9]{1,18}", text):
+        raise InvalidGroundTruth(f"{path.name}, line {number}: {text[:80]!r} is not the index of a {what}.")
+    if int(text) >= count:
+        raise InvalidGroundTruth(
+            f"{path.name}, line {number}: there is no {what} {int(text)}; the {count} images are numbered from 0."
+        )
+    return int(text)

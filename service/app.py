@@ -1,0 +1,129 @@
+"""The application: layers around it, routes in it, and what lives while it runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from anyio import to_thread
+from fastapi import FastAPI, Request
+from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.bodies import BodyLimit
+from service.engine import Engine
+from service.metrics import Metrics
+from service.problems import install_problems, problem_response
+from service.routes import ROUTERS
+from service.settings import Settings, read_settings
+from service.telemetry import Telemetry
+
+SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
+DESCRIPTION = """\
+Enrol the frames of a traverse as the places of a map, then ask where another frame was taken.
+
+A frame travels as the raw body (`image/jpeg`, `image/png`, `image/webp`) with its parameters in the query \
+string, or as a `multipart/form-data` with one file part and the same parameters as fields. A 2xx on a write means \
+that it is on disk and found by every later query, so a request without an answer can simply be sent again.
+
+`X-Request-Id` is taken or made. `X-Request-Timeout` (seconds) drops a request that would come too late. \
+An answer with `Retry-After` asks to be tried again.
+"""
+TAGS = [
+    {"name": "maps", "description": "A map is one environment, bound for life to one encoder."},
+    {"name": "places", "description": "A place is one enrolled reference frame."},
+    {"name": "sequences", "description": "A sequence is one traverse: it is listed and deleted as a whole."},
+    {"name": "queries", "description": "A query is one frame, answered with ranked matches and a verdict."},
+    {"name": "frames", "description": "What the encoder makes of a frame, without a map."},
+    {"name": "encoders", "description": "Models and vocabularies installed."},
+    {"name": "service", "description": "Health, counters, version."},
+]
+
+
+def _operation_id(route: APIRoute) -> str:
+    """An operation is called as the function that does it."""
+    return route.name
+
+
+class Published:
+    """ASGI layer that tells the application under which path a proxy publishes it.
+
+    Args:
+        root_path: such as /placerec; requests may come with it or, where the proxy takes it off, without.
+    """
+
+    def __init__(self, app: ASGIApp, root_path: str) -> None:
+        self.app, self.root_path = app, root_path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http":
+            path: str = scope["path"]
+            if not path.startswith(self.root_path + "/"):
+                path = self.root_path + path
+            scope = {**scope, "root_path": self.root_path, "path": path}
+        await self.app(scope, receive, send)
+
+
+async def _tell_methods(request: Request, _error: Exception) -> Response:
+    """405 with all the methods that the resource has; the framework names those of one route alone."""
+    known: set[str] = set()
+    path = request.scope["path"].removeprefix(request.scope["root_path"])
+    for router in ROUTERS:
+        for route in router.routes:
+            if isinstance(route, APIRoute) and route.path_regex.match(path):
+                known |= route.methods or set()
+    known |= {"HEAD"} if "GET" in known else set()
+    allowed = ", ".join(sorted(known))
+    detail = f"{request.scope['method'][:20]} is not possible here; what is: {allowed}."
+    return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The service; nothing is opened or loaded before it starts.
+
+    Args:
+        settings: from the environment if left out.
+
+    Raises:
+        SettingsError: a setting is wrong, or would expose the service without keys.
+    """
+    chosen = settings if settings is not None else read_settings()
+    chosen.check_exposure()
+    metrics = Metrics()
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
+        engine = await to_thread.run_sync(Engine, chosen, metrics)
+        app.state.engine = engine
+        engine.start()
+        try:
+            yield
+        finally:
+            await engine.close()
+
+    app = FastAPI(
+        title="placerec",
+        version=importlib.metadata.version("placerec"),
+        summary=SUMMARY,
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        openapi_url=None,  # routes of our own: strict about nothing from elsewhere
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        generate_unique_id_function=_operation_id,
+        lifespan=lifespan,
+    )
+    install_problems(app)
+    app.add_exception_handler(405, _tell_methods)
+    for router in ROUTERS:
+        app.include_router(router)
+    app.add_middleware(BodyLimit, settings=chosen)
+    app.add_middleware(Telemetry, metrics=metrics)
+    if chosen.root_path:
+        app.add_middleware(Published, root_path=chosen.root_path)  # the outermost is added last
+    return app

@@ -1,0 +1,15 @@
+"""The ``placerec`` command: one module a command.
+
+Modules that take a second to load (torch, FAISS, the service itself) are imported within the
+commands that need them, so that ``placerec --help`` answers at once.
+"""
+
+from service.commands.application import application
+
+
+def main() -> None:
+    """Run the command line of this process; the entry point ``placerec``."""
+    application(prog_name="placerec")
+
+
+__all__ = ["application", "main"]

@@ -1,0 +1,29 @@
+"""The command line's table of contents."""
+
+from __future__ import annotations
+
+import typer
+
+from service.commands.bench import bench
+from service.commands.console import Commands
+from service.commands.enroll import enroll
+from service.commands.evaluate import evaluate
+from service.commands.maps import maps
+from service.commands.model import model
+from service.commands.query import query
+from service.commands.serve import serve
+from service.commands.settings import settings
+from service.commands.vocabulary import vocabulary
+
+application = typer.Typer(
+    cls=Commands,
+    help="Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for command in (serve, enroll, query, evaluate, bench, settings):
+    application.command()(command)
+application.add_typer(maps, name="maps")
+application.add_typer(vocabulary, name="vocabulary")
+application.add_typer(model, name="model")

@@ -1,0 +1,179 @@
+"""What lives as long as the process: the maps, the encoders, the queue, the counters."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import ParamSpec, TypeVar
+
+from anyio import to_thread
+
+from core.encoders import EncoderCatalogue
+from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
+from core.images import Limits
+from core.storage import Atlas, Map, MapRecord
+from core.verdict import Calibration
+from service.faults import EncoderNotInstalled, NotReady
+from service.inference import Encoded, Inference, Patience
+from service.metrics import MapCollector, Metrics
+from service.settings import Settings, unknown_variables
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+DISK_CHECK_SECONDS = 1.0
+"""A readiness probe that comes sooner is told the last result."""
+
+log = logging.getLogger("placerec.engine")
+
+
+async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    """Run blocking work, that of maps above all, in a thread of the pool; it is not broken off."""
+    return await to_thread.run_sync(lambda: work(*args, **kwargs))
+
+
+class Engine:
+    """Everything that the routes work with.
+
+    Raises:
+        DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be had.
+    """
+
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self.settings, self.metrics = settings, metrics
+        self.atlas = Atlas(settings.data_dir)
+        self.catalogue = EncoderCatalogue(settings.models_directory)
+        limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
+        self.inference = Inference(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
+        self._writing: dict[str, threading.Lock] = {}
+        self._encoder_state = "loading"
+        self._disk_state, self._disk_checked = "ok", 0.0
+        self._loading: asyncio.Task[None] | None = None
+        self._map_collector = MapCollector(self._count_places, lambda: len(self.atlas.quarantined()))
+        metrics.registry.register(self._map_collector)
+
+    def start(self) -> None:
+        """Begin to load the default encoder; liveness is answered meanwhile."""
+        for name in unknown_variables():
+            log.warning("the environment sets %s, which is no setting", name)
+        self._loading = asyncio.create_task(self._load_default())
+
+    async def close(self) -> None:
+        """Finish what runs and give the data directory back."""
+        if self._loading is not None:
+            self._loading.cancel()
+        self.metrics.registry.unregister(self._map_collector)
+        await to_thread.run_sync(self.inference.close)
+        await to_thread.run_sync(self.atlas.close)
+
+    async def _load_default(self) -> None:
+        began = time.perf_counter()
+        try:
+            identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
+            await self.inference.load(identity)
+        except PlacerecError as error:
+            self._encoder_state = str(error)
+            log.error("the default encoder cannot be used: %s", error)
+        except Exception:
+            self._encoder_state = "it cannot be loaded; the log says why"
+            log.exception("the default encoder cannot be loaded")
+        else:
+            self._encoder_state = "ok"
+            log.info("ready", extra={"encoder": identity, "seconds": round(time.perf_counter() - began, 2)})
+
+    async def check_readiness(self) -> dict[str, str]:
+        """The outcome of each check, all of them "ok".
+
+        Raises:
+            NotReady: at least one is not.
+        """
+        now = time.monotonic()
+        if now - self._disk_checked > DISK_CHECK_SECONDS:
+            self._disk_checked = now
+            self._disk_state = await in_thread(self._check_disk)
+        checks = {"encoder": self._encoder_state, "maps": "ok", "disk": self._disk_state}
+        bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
+        if bad:
+            raise NotReady(f"Not ready: {'; '.join(bad)}", checks)
+        return checks
+
+    def _check_disk(self) -> str:
+        try:
+            self.atlas.check_writable()
+        except PlacerecError as error:
+            return str(error)
+        return "ok"
+
+    def _count_places(self) -> dict[str, int]:
+        counts: dict[str, int] = {}
+        for record in self.all_records():
+            with suppress(UnknownMap, MapQuarantined):  # deleted, or found to be damaged, since it was listed
+                counts[record.id] = self.atlas.find(record.id).count_places()
+        return counts
+
+    def all_records(self) -> list[MapRecord]:
+        """The records of all maps in service."""
+        found, cursor = self.atlas.records(None, 1000)
+        records = list(found)
+        while cursor is not None:
+            found, cursor = self.atlas.records(cursor, 1000)
+            records += found
+        return records
+
+    @contextmanager
+    def writing(self, map_id: str) -> Iterator[None]:
+        """Possession of a map for a write that depends on a look at it; blocks, so call it in a thread."""
+        with self._writing.setdefault(map_id, threading.Lock()):
+            yield
+
+    # Encoders
+
+    def default_calibration(self, identity: str) -> Calibration | None:
+        """What an encoder ships with; None if it is not installed."""
+        for summary in self.catalogue.describe():
+            if summary.identity == identity:
+                return summary.calibration
+        return None
+
+    def resolve(self, name_or_identity: str | None) -> str:
+        """The identity of an encoder, of the default one for None.
+
+        Raises:
+            UnknownEncoder, InvalidModel: it is not installed, or damaged.
+        """
+        return self.catalogue.resolve(name_or_identity or self.settings.encoder)
+
+    async def map(self, map_id: str) -> Map:
+        """A map, opened if need be.
+
+        Raises:
+            UnknownMap, MapQuarantined: it is not there, or damaged.
+        """
+        return await in_thread(self.atlas.get, map_id)
+
+    async def encode_for(self, map_: Map, data: bytes, patience: Patience) -> Encoded:
+        """Encode a frame with a map's encoder; call it within ``inference.place_in_queue``.
+
+        Raises:
+            EncoderNotInstalled: the map's encoder is not here (any more).
+            Others: as for ``Inference.encode``.
+        """
+        try:
+            return await self.inference.encode(map_.record.encoder, data, patience)
+        except UnknownEncoder as error:
+            raise EncoderNotInstalled(str(error)) from error
+
+    def assert_encoder(self, map_: Map, asserted: str | None) -> None:
+        """See that the encoder that a caller names is the map's.
+
+        Raises:
+            WrongEncoder: it is not.
+        """
+        identity = map_.record.encoder
+        if asserted is None or asserted in (identity, identity.partition("@")[0]):
+            return
+        raise WrongEncoder(f"The map {map_.record.id} is bound to {identity}, not to {asserted[:140]}.")

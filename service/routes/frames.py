@@ -1,0 +1,160 @@
+"""Frames without a map: their descriptor, their regions, the score of two."""
+
+from __future__ import annotations
+
+import base64
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import JSONResponse, Response
+
+from core import errors
+from service.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.engine import in_thread
+from service.faults import (
+    BodyTooLarge,
+    DeadlineExceeded,
+    InvalidRequest,
+    MalformedBody,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.inference import Encoded
+from service.negotiation import preferred
+from service.openapi import BINARY, form_body, frame_body
+from service.parameters import EncoderParameters, RegionsParameters
+from service.problems import problem_documentation
+from service.regions import boxes, draw, layer_grids, strongest
+from service.schemas.frames import Box, Descriptor, Layer, MatchScore, Region, RegionsView
+from service.uploads import read_frame, read_pair
+
+router = APIRouter(
+    prefix="/v1",
+    tags=["frames"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(
+        MalformedBody,
+        BodyTooLarge,
+        errors.TooManyPixels,
+        UnsupportedMediaType,
+        InvalidRequest,
+        errors.NotAnImage,
+        errors.UnknownEncoder,
+        QueueFull,
+        DeadlineExceeded,
+    ),
+)
+JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
+
+
+@router.post(
+    "/encode",
+    response_model=Descriptor,
+    openapi_extra=frame_body(EncoderParameters),
+    responses={
+        200: {"description": "The descriptor.", "content": {OCTETS: {"schema": BINARY}}},
+        **problem_documentation(errors.NoRegions),
+    },
+)
+async def encode(
+    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+) -> Response:
+    """The descriptor of a frame, float32: base64 in JSON, or the bytes alone (`Accept: application/octet-stream`).
+
+    The bytes are little-endian; their encoder and the number of regions stand in the headers
+    `X-Encoder` and `X-Regions`.
+    """
+    engine.inference.check_room()
+    frame = await read_frame(request, engine.settings)
+    identity = await in_thread(engine.resolve, options.joined(frame.fields).encoder)
+    with engine.inference.place_in_queue():
+        encoded = await engine.inference.encode(identity, frame.data, patience)
+    regions = len(encoded.encoding.regions)
+    if regions == 0:
+        raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
+    values = encoded.encoding.descriptor.astype("<f4").tobytes()
+    if preferred(request.headers.get("accept"), JSON, OCTETS) == OCTETS:
+        return Response(values, headers={"X-Encoder": identity, "X-Regions": str(regions)}, media_type=OCTETS)
+    described = Descriptor(
+        encoder=identity,
+        dimension=len(encoded.encoding.descriptor),
+        descriptor=base64.b64encode(values).decode(),
+        regions=regions,
+        milliseconds=_times(request, encoded),
+    )
+    return JSONResponse(described.model_dump())
+
+
+@router.post(
+    "/regions",
+    response_model=RegionsView,
+    openapi_extra=frame_body(RegionsParameters),
+    responses={200: {"description": "The regions.", "content": {PNG: {"schema": BINARY}}}},
+)
+async def regions(
+    options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+) -> Response:
+    """The regions of interest of a frame: as JSON, or drawn (`?format=png`, or `Accept: image/png`)."""
+    engine.inference.check_room()
+    frame = await read_frame(request, engine.settings)
+    options = options.joined(frame.fields)
+    identity = await in_thread(engine.resolve, options.encoder)
+    with engine.inference.place_in_queue():
+        encoded = await engine.inference.encode(identity, frame.data, patience)
+    found = encoded.encoding.regions
+    layers = await in_thread(layer_grids, encoded.encoder)
+    chosen = strongest(found, options.limit)
+    wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
+    if wanted == "png":
+        drawn = await in_thread(draw, encoded.pixels, found, chosen, list(layers.values()))
+        return Response(drawn, headers={"X-Encoder": identity, "X-Regions": str(len(found))}, media_type=PNG)
+    height, width = encoded.pixels.shape[:2]
+    names = list(layers)
+    corners = np.round(boxes(found, list(layers.values()), width, height), 2)
+    view = RegionsView(
+        encoder=identity,
+        width=width,
+        height=height,
+        layers=[Layer(name=name, rows=rows, columns=columns) for name, (rows, columns) in layers.items()],
+        found=len(found),
+        regions=[
+            Region(
+                layer=names[found.layers[index]],
+                channel=int(found.channels[index]),
+                energy=float(found.energies[index]),
+                cells=tuple(found.boxes[index].tolist()),
+                box=Box(**dict(zip(("left", "top", "right", "bottom"), corners[index].tolist(), strict=True))),
+            )
+            for index in chosen
+        ],
+        milliseconds=_times(request, encoded),
+    )
+    return JSONResponse(view.model_dump())
+
+
+@router.post(
+    "/match",
+    openapi_extra=form_body("Two frames.", {"a": BINARY, "b": BINARY, "encoder": {"type": "string"}}, ["a", "b"]),
+)
+async def match(
+    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+) -> MatchScore:
+    """The score of two frames against each other: 1 for the same frame, near 0 for unrelated ones."""
+    engine.inference.check_room()
+    first, second, fields = await read_pair(request, engine.settings)
+    identity = await in_thread(engine.resolve, options.joined(fields).encoder)
+    with engine.inference.place_in_queue():
+        a = await engine.inference.encode(identity, first, patience)
+        b = await engine.inference.encode(identity, second, patience)
+    both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
+    return MatchScore(
+        score=a.encoder.score(a.encoding.descriptor, b.encoding.descriptor),
+        encoder=identity,
+        regions={"a": len(a.encoding.regions), "b": len(b.encoding.regions)},
+        milliseconds=rounded({**both, "total": milliseconds_since(started(request))}),
+    )
+
+
+def _times(request: Request, encoded: Encoded) -> dict[str, float]:
+    return rounded({**encoded.milliseconds, "total": milliseconds_since(started(request))})

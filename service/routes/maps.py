@@ -1,0 +1,157 @@
+"""Maps: create, list, read, edit, delete, verify."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Depends, Response
+
+from core import errors
+from core.places import check_map_id
+from core.storage import Map, MapSettings, VerifyReport
+from core.verdict import Calibration
+from service.bodies import StrictRoute
+from service.dependencies import (
+    EngineDep,
+    IfMatch,
+    MapId,
+    Page,
+    entity_tag,
+    expected_revision,
+    json_body,
+    single_values,
+)
+from service.engine import Engine
+from service.faults import BodyTooLarge, MalformedBody, UnsupportedMediaType
+from service.openapi import json_patch
+from service.problems import problem_documentation
+from service.schemas.maps import (
+    CalibrationChanges,
+    MapChanges,
+    MapPage,
+    MapView,
+    NewMap,
+    QuarantinedMap,
+)
+
+router = APIRouter(
+    prefix="/v1/maps",
+    tags=["maps"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
+)
+BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
+
+
+def show_map(engine: Engine, map_: Map) -> MapView:
+    """A map as callers see it."""
+    record = map_.record
+    calibration = record.calibration or engine.default_calibration(record.encoder)
+    return MapView(**record.model_dump(exclude={"calibration"}), calibration=calibration, places=map_.count_places())
+
+
+@router.post(
+    "",
+    status_code=201,
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(
+        *BODY_PROBLEMS, errors.MapExists, errors.InvalidIdentifier, errors.UnknownEncoder, errors.StorageFull
+    ),
+)
+def create_map(new: NewMap, engine: EngineDep, response: Response) -> MapView:
+    """Create a map, bound for life to one encoder."""
+    check_map_id(new.id)
+    identity = engine.resolve(new.encoder)
+    dimension = next(s.dimension for s in engine.catalogue.describe() if s.identity == identity)
+    settings = MapSettings(**new.model_dump(exclude={"id", "encoder"}))
+    map_ = engine.atlas.create(new.id, identity, dimension, settings)
+    response.headers["ETag"] = entity_tag(map_.record.revision)
+    response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
+    return show_map(engine, map_)
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_maps(page: Page, engine: EngineDep) -> MapPage:
+    """List the maps in the order of their ids, and those that are damaged."""
+    records, next_cursor = engine.atlas.records(page.cursor, page.limit)
+    items = []
+    for record in records:
+        try:
+            items.append(show_map(engine, engine.atlas.find(record.id)))
+        except (errors.UnknownMap, errors.MapQuarantined):
+            continue  # deleted, or found to be damaged, since it was listed
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in engine.atlas.quarantined().items()]
+    return MapPage(items=items, next_cursor=next_cursor, quarantined=quarantined)
+
+
+@router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
+def read_map(map_id: MapId, engine: EngineDep, response: Response) -> MapView:
+    """Read a map's settings, its calibration and its size; the ETag is for editing it."""
+    map_ = engine.atlas.get(map_id)
+    response.headers["ETag"] = entity_tag(map_.record.revision)
+    return show_map(engine, map_)
+
+
+@router.patch(
+    "/{map}",
+    dependencies=[Depends(json_body)],
+    openapi_extra=json_patch(MapChanges),
+    responses=problem_documentation(
+        *BODY_PROBLEMS, errors.UnknownMap, errors.RevisionMismatch, errors.InvalidField, errors.StorageFull
+    ),
+)
+def edit_map(
+    map_id: MapId, changes: MapChanges, engine: EngineDep, response: Response, if_match: IfMatch = None
+) -> MapView:
+    """Edit a map by a merge patch.
+
+    A calibration set here is the map's own (`"source": "manual"`); what is not given of it is taken
+    from the one in force. `null` brings the encoder's default back.
+    """
+    map_ = engine.atlas.get(map_id)
+    expected = expected_revision(if_match, map_.record.revision)
+    edited = map_.edit(_settings_changes(engine, map_, changes), expected)
+    response.headers["ETag"] = entity_tag(edited.revision)
+    return show_map(engine, map_)
+
+
+def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[str, Any]:
+    """A merge patch as values to set: null is the default of its field."""
+    defaults = MapSettings()
+    given = {name: getattr(changes, name) for name in changes.model_fields_set}
+    calibration = given.pop("calibration", None)
+    values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
+    if "calibration" in changes.model_fields_set:
+        values["calibration"] = _own_calibration(engine, map_, calibration)
+    return values
+
+
+def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:
+    if changes is None:
+        return None
+    record = map_.record
+    default = engine.default_calibration(record.encoder)
+    base = record.calibration or default
+    if base is None:
+        raise errors.InvalidField(f"The encoder {record.encoder} is not installed; its calibration is not known.")
+    values = base.model_dump() | {"source": "manual"}
+    for name in changes.model_fields_set:
+        value = getattr(changes, name)
+        values[name] = getattr(default or base, name) if value is None else value
+    return Calibration(**values)
+
+
+@router.delete("/{map}", status_code=204, responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch))
+def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
+    """Delete a map with all that it holds. A damaged map can be deleted too."""
+    if if_match is not None:
+        expected_revision(if_match, engine.atlas.find(map_id).record.revision)
+    engine.atlas.delete(map_id)
+    engine.metrics.forget_map(map_id)
+
+
+@router.post("/{map}/verify", responses=problem_documentation(errors.UnknownMap))
+def verify_map(map_id: MapId, engine: EngineDep) -> VerifyReport:
+    """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
+    return engine.atlas.verify(map_id)

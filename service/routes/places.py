@@ -1,0 +1,242 @@
+"""Places: enrol one frame or many, browse, read, edit, forget, see."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import Response
+
+from core import errors
+from core.places import check_place_id
+from core.storage.patches import merge_patch
+from service.batches import item_problem
+from service.bodies import StrictRoute
+from service.dependencies import (
+    EngineDep,
+    MapId,
+    PatienceDep,
+    PlaceId,
+    PlacePageQuery,
+    json_body,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
+from service.engine import Engine
+from service.enrolment import Candidate, enrol
+from service.faults import (
+    BodyTooLarge,
+    DeadlineExceeded,
+    EncoderNotInstalled,
+    InvalidRequest,
+    MalformedBody,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.multipart import Part
+from service.openapi import form_body, frame_body, json_patch
+from service.parameters import BatchItem, BatchParameters, EnrolParameters, check_metadata, validated
+from service.problems import problem_documentation
+from service.schemas.places import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+from service.uploads import check_part, json_part, read_frame, read_many
+
+router = APIRouter(
+    prefix="/v1/maps/{map}/places",
+    tags=["places"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(errors.UnknownMap, errors.StorageFailure, errors.MapQuarantined),
+)
+ENROLMENT_PROBLEMS = problem_documentation(
+    MalformedBody,
+    errors.UnknownMap,
+    errors.WrongEncoder,
+    BodyTooLarge,
+    UnsupportedMediaType,
+    InvalidRequest,
+    errors.NoRegions,
+    errors.StorageFull,
+    QueueFull,
+    DeadlineExceeded,
+    EncoderNotInstalled,
+    errors.MapQuarantined,
+)
+BATCH_BODY = form_body(
+    "A JSON part `places` and the file parts that it names.",
+    {
+        "places": {
+            "type": "array",
+            "items": {"$ref": "#/components/schemas/BatchItem"},
+            "examples": [[{"id": "p7", "file": "frame7", "x": 1.5, "y": 2.0}]],
+        }
+    },
+    ["places"],
+)
+
+
+@router.put(
+    "/{place}",
+    openapi_extra=frame_body(EnrolParameters),
+    responses={201: {"model": EnrolledPlace, "description": "A new place."}, **ENROLMENT_PROBLEMS},
+)
+async def enrol_place(
+    map_id: MapId,
+    place_id: PlaceId,
+    options: Annotated[EnrolParameters, Query()],
+    request: Request,
+    response: Response,
+    engine: EngineDep,
+    patience: PatienceDep,
+) -> EnrolledPlace:
+    """Enrol one frame under an id of the caller's.
+
+    The whole place is replaced: parameters that are left out are cleared. The same bytes are not
+    encoded again, so a request can be repeated until it succeeds. The answer comes when the place is
+    on disk and found by every later query.
+    """
+    engine.inference.check_room()
+    map_ = await engine.map(map_id)
+    frame = await read_frame(request, engine.settings)
+    options = options.joined(frame.fields)
+    engine.assert_encoder(map_, options.encoder)
+    fields = options.place_fields(engine.settings)
+    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data)], patience))[0]
+    response.status_code = 201 if stored.change == "created" else 200
+    request.state.noted = {"map": map_id, "change": stored.change}
+    return EnrolledPlace(
+        **PlaceView.of(stored.place).__dict__,
+        change=stored.change,
+        encoder=map_.record.encoder,
+        milliseconds=rounded({**stored.milliseconds, "total": milliseconds_since(started(request))}),
+    )
+
+
+@router.post("", response_model_exclude_unset=True, openapi_extra=BATCH_BODY, responses=ENROLMENT_PROBLEMS)
+async def enrol_places(
+    map_id: MapId,
+    options: Annotated[BatchParameters, Query()],
+    request: Request,
+    engine: EngineDep,
+    patience: PatienceDep,
+) -> BatchResults:
+    """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit."""
+    engine.inference.check_room()
+    map_ = await engine.map(map_id)
+    entries, files = json_part(await read_many(request, engine.settings), "places")
+    engine.assert_encoder(map_, options.encoder)
+    _check_batch(entries, files, engine)
+    engine.metrics.batches.labels("enrol").observe(len(entries))
+
+    results: list[BatchResult | None] = [None] * len(entries)
+
+    def reject(position: int, error: Exception) -> None:
+        problem = item_problem(request, error)
+        results[position] = BatchResult(id=_given_id(entries[position]), status=problem.status, problem=problem)
+
+    candidates: dict[int, Candidate] = {}
+    by_name = {part.name: part for part in files}
+    for position, entry in enumerate(entries):
+        try:
+            candidate = _candidate(entry, by_name, engine)
+            if any(candidate.id == other.id for other in candidates.values()):
+                raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
+            candidates[position] = candidate
+        except Exception as error:
+            reject(position, error)
+    positions = list(candidates)
+    stored = await enrol(
+        engine, map_, list(candidates.values()), patience, lambda index, error: reject(positions[index], error)
+    )
+    for index, one in stored.items():
+        results[positions[index]] = BatchResult(
+            id=one.place.id,
+            status=201 if one.change == "created" else 200,
+            change=one.change,
+            place=PlaceView.of(one.place),
+        )
+    request.state.noted = {"map": map_id, "frames": len(entries), "stored": len(stored)}
+    return BatchResults(items=[result for result in results if result is not None], encoder=map_.record.encoder)
+
+
+def _check_batch(entries: Any, files: list[Part], engine: Engine) -> None:
+    """Raise InvalidRequest unless the form as a whole makes sense."""
+    if not isinstance(entries, list) or not entries:
+        raise InvalidRequest("The part 'places' is not a JSON array with at least one place.")
+    if len(entries) > engine.settings.max_batch_items:
+        raise InvalidRequest(f"The batch has {len(entries)} places; the limit is {engine.settings.max_batch_items}.")
+    names = [part.name for part in files]
+    if len(set(names)) != len(names):
+        raise InvalidRequest("Two file parts have the same name.")
+    wanted = {entry.get("file") for entry in entries if isinstance(entry, dict) and isinstance(entry.get("file"), str)}
+    spare = sorted(set(names) - wanted)
+    if spare:
+        raise InvalidRequest(f"No place of the batch names the file part {spare[0][:80]!r}.")
+
+
+def _candidate(entry: Any, files: dict[str, Part], engine: Engine) -> Candidate:
+    item = validated(BatchItem, entry)
+    check_place_id(item.id)
+    fields = item.fields(item.metadata, engine.settings)
+    if item.file not in files:
+        raise InvalidRequest(f"file: the form has no part named {item.file[:80]!r}.")
+    part = files[item.file]
+    check_part(part, engine.settings)
+    return Candidate(item.id, fields, part.data)
+
+
+def _given_id(entry: Any) -> str | None:
+    given = entry.get("id") if isinstance(entry, dict) else None
+    # Half a character can stand in JSON's escapes, but not in the answer.
+    return given[:200].encode("utf-8", "replace").decode() if isinstance(given, str) else None
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_places(map_id: MapId, page: PlacePageQuery, engine: EngineDep) -> PlacePage:
+    """List places in the order of their enrolment, all or those of one traverse."""
+    places, next_cursor = engine.atlas.get(map_id).places(page.cursor, page.limit, page.sequence)
+    return PlacePage(items=[PlaceView.of(place) for place in places], next_cursor=next_cursor)
+
+
+@router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))
+def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView:
+    """Read one place."""
+    return PlaceView.of(engine.atlas.get(map_id).place(place_id))
+
+
+@router.patch(
+    "/{place}",
+    dependencies=[Depends(json_body)],
+    openapi_extra=json_patch(PlaceChanges),
+    responses=problem_documentation(
+        MalformedBody, UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull
+    ),
+)
+def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
+    """Edit what is known of a place by a merge patch: `null` clears, what is left out stays."""
+    map_ = engine.atlas.get(map_id)
+    with engine.writing(map_id):
+        if changes.metadata is not None:
+            check_metadata(merge_patch(map_.place(place_id).metadata, changes.metadata), engine.settings)
+        return PlaceView.of(map_.patch(place_id, changes.model_dump(exclude_unset=True)))
+
+
+@router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
+def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
+    """Forget a place: no later query finds it."""
+    engine.atlas.get(map_id).forget(place_id)
+
+
+@router.get(
+    "/{place}/thumbnail",
+    response_class=Response,
+    responses={
+        200: {"description": "A small JPEG.", "content": {"image/jpeg": {"schema": {"type": "string"}}}},
+        **problem_documentation(errors.UnknownPlace, errors.NoThumbnail),
+    },
+)
+def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Response:
+    """See a place as the map keeps it."""
+    picture = engine.atlas.get(map_id).thumbnail(place_id)
+    return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})

@@ -1,0 +1,73 @@
+"""At the root: is it alive, is it ready, what does it count, what is it."""
+
+from __future__ import annotations
+
+import platform
+
+import faiss
+import torch
+from fastapi import APIRouter, Request
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.responses import HTMLResponse, JSONResponse, Response
+
+from service import openapi
+from service.dependencies import EngineDep
+from service.documentation import SECURITY_POLICY, page
+from service.engine import in_thread
+from service.faults import NotReady
+from service.problems import problem_documentation
+from service.schemas.installation import Health, Readiness, Version
+from service.schemas.maps import QuarantinedMap
+
+router = APIRouter(tags=["service"])
+
+
+@router.get("/livez")
+async def check_liveness() -> Health:
+    """Whether the process answers; cheap, for a supervisor that restarts it."""
+    return Health()
+
+
+@router.get("/readyz", responses=problem_documentation(NotReady))
+async def check_readiness(engine: EngineDep) -> Readiness:
+    """Whether frames can be served: encoder loaded and true to its golden values, maps open, disk writable.
+
+    A damaged map does not make the service unready; it is named here.
+    """
+    checks = await engine.check_readiness()
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in engine.atlas.quarantined().items()]
+    return Readiness(checks=checks, encoder=engine.settings.encoder, quarantined=quarantined)
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"description": "Prometheus's text format.", "content": {"text/plain": {}}}},
+)
+async def read_metrics(engine: EngineDep) -> Response:
+    """The counters for Prometheus."""
+    return Response(await in_thread(engine.metrics.expose), media_type=CONTENT_TYPE_LATEST)
+
+
+@router.get("/version")
+async def read_version(request: Request, engine: EngineDep) -> Version:
+    """What runs here."""
+    return Version(
+        version=request.app.version,
+        encoder=engine.settings.encoder,
+        python=platform.python_version(),
+        torch=torch.__version__,
+        faiss=faiss.__version__,
+    )
+
+
+@router.get("/openapi.json", include_in_schema=False)
+async def read_openapi(request: Request) -> Response:
+    """This interface, described for machines."""
+    return JSONResponse(openapi.document(request.app))
+
+
+@router.get("/docs", include_in_schema=False)
+async def read_documentation(request: Request) -> Response:
+    """This interface, described for people; the page needs nothing from elsewhere."""
+    return HTMLResponse(page(openapi.document(request.app)), headers={"Content-Security-Policy": SECURITY_POLICY})

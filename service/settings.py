@@ -1,0 +1,140 @@
+"""Everything an operator can set, from the environment (``PLACEREC_…``), validated at start."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from core.encoders import DEFAULT_ENCODER
+
+PREFIX = "PLACEREC_"
+MIB = 1024 * 1024
+
+Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
+
+
+class SettingsError(Exception):
+    """A setting is wrong; the text names each by its variable and says why."""
+
+
+class Settings(BaseSettings):
+    """The service's settings; the defaults suit one machine with one user."""
+
+    model_config = SettingsConfigDict(env_prefix=PREFIX, frozen=True, extra="forbid")
+
+    host: str = Field(default="127.0.0.1", min_length=1, description="Address to listen on.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
+    allow_anonymous: bool = Field(
+        default=False,
+        description="Serve other machines although no keys are set: whoever reaches the port may do everything.",
+    )
+    root_path: str = Field(
+        default="",
+        pattern=r"^(/[A-Za-z0-9._~-]+)*$",
+        description="Path under which a proxy in front publishes the service, such as /placerec.",
+    )
+    data_dir: Path = Field(default=Path("data"), description="Directory of the maps; one process at a time holds it.")
+    models_dir: Path | None = Field(
+        default=None,
+        description="Directory of encoders besides the packaged ones; default: 'models' beside the data directory.",
+    )
+    encoder: str = Field(
+        default=DEFAULT_ENCODER,
+        min_length=1,
+        description="Encoder that is loaded at start and used where none is named.",
+    )
+    threads: int = Field(default=0, ge=0, le=1024, description="Threads of one forward pass; 0 uses every core.")
+    storage_threads: int = Field(
+        default=8, ge=1, le=256, description="Searches, reads and writes of maps that run at once."
+    )
+    queue_length: int = Field(
+        default=32,
+        ge=1,
+        le=100_000,
+        description="Requests that may wait for the encoder; one more is answered with 503.",
+    )
+    request_timeout: Seconds = Field(
+        default=30.0,
+        description="Seconds after which a request that still waits is dropped; a client may ask for less.",
+    )
+    shutdown_timeout: Seconds = Field(
+        default=10.0, description="Seconds that requests under way get to finish when the service stops."
+    )
+    max_image_bytes: int = Field(default=16 * MIB, ge=1024, le=1024 * MIB, description="Largest frame, in bytes.")
+    max_image_pixels: int = Field(
+        default=40_000_000, ge=256, le=1_000_000_000, description="Largest frame, in pixels; read from its header."
+    )
+    max_batch_items: int = Field(default=256, ge=1, le=10_000, description="Most frames in one multipart request.")
+    max_batch_bytes: int = Field(
+        default=128 * MIB, ge=1024, le=4096 * MIB, description="Largest multipart request, in bytes."
+    )
+    max_upload_memory: int = Field(
+        default=512 * MIB, ge=1024, description="Bytes of request bodies held at one time; more are answered with 503."
+    )
+    max_json_bytes: int = Field(default=1 * MIB, ge=1024, le=64 * MIB, description="Largest JSON body, in bytes.")
+    max_metadata_bytes: int = Field(
+        default=16 * 1024, ge=2, le=MIB, description="Largest metadata of one place, as JSON bytes."
+    )
+    thumbnail_side: int = Field(default=320, ge=16, le=2048, description="Longer side of a kept thumbnail, in pixels.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least level that is logged."
+    )
+
+    @model_validator(mode="after")
+    def _limits_fit_each_other(self) -> Settings:
+        if self.max_batch_bytes < self.max_image_bytes:
+            raise ValueError(f"{PREFIX}MAX_BATCH_BYTES is less than {PREFIX}MAX_IMAGE_BYTES")
+        if self.max_upload_memory < self.max_batch_bytes:
+            raise ValueError(f"{PREFIX}MAX_UPLOAD_MEMORY is less than {PREFIX}MAX_BATCH_BYTES")
+        return self
+
+    @property
+    def models_directory(self) -> Path:
+        """Where encoders besides the packaged ones lie; it need not exist."""
+        return self.models_dir if self.models_dir is not None else self.data_dir.absolute().parent / "models"
+
+    def is_loopback(self) -> bool:
+        """Whether only this machine can reach the address to listen on."""
+        try:
+            return ipaddress.ip_address(self.host.strip("[]")).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    def check_exposure(self) -> None:
+        """Refuse to serve other machines without keys.
+
+        Raises:
+            SettingsError: the host is no loopback address and anonymous use is not allowed.
+        """
+        if not self.is_loopback() and not self.allow_anonymous:
+            raise SettingsError(
+                f"{PREFIX}HOST is {self.host}: other machines could use the service, and there are no keys. "
+                f"Listen on 127.0.0.1, or set {PREFIX}ALLOW_ANONYMOUS=true if the network is trusted."
+            )
+
+
+def read_settings() -> Settings:
+    """The settings of this process's environment.
+
+    Raises:
+        SettingsError: at least one value is not usable; the text has one line for each.
+    """
+    try:
+        return Settings()
+    except ValidationError as error:
+        lines = []
+        for fault in error.errors(include_url=False):
+            name = PREFIX + "_".join(map(str, fault["loc"])).upper() if fault["loc"] else "settings"
+            lines.append(f"{name}: {fault['msg'].removeprefix('Value error, ')}")
+        raise SettingsError("\n".join(lines)) from error
+
+
+def unknown_variables() -> list[str]:
+    """Variables of the environment that look like settings and are none (a typing error, most likely)."""
+    known = {PREFIX + name.upper() for name in Settings.model_fields} | {f"{PREFIX}URL"}
+    return sorted(name for name in os.environ if name.startswith(PREFIX) and name.upper() not in known)

@@ -1,0 +1,130 @@
+"""The image and its compose file: what must hold of them without an engine to try it."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from service.settings import Settings
+
+ROOT = Path(__file__).parents[2]
+DOCKER = ROOT / "docker"
+
+
+def instructions() -> list[tuple[str, str]]:
+    """The Dockerfile's instructions and their arguments, continued lines joined."""
+    text = re.sub(r"^#.*\n", "", (DOCKER / "Dockerfile").read_text(), flags=re.MULTILINE)
+    lines = re.sub(r"\\\n\s*", "", text).splitlines()
+    return [(name, argument) for name, _, argument in (line.partition(" ") for line in lines if line)]
+
+
+def final_stage() -> dict[str, str]:
+    """The last stage's instructions; the last of each name counts."""
+    found = instructions()
+    start = max(index for index, (name, _) in enumerate(found) if name == "FROM")
+    return dict(found[start:])
+
+
+def service() -> dict[str, Any]:
+    compose: dict[str, Any] = yaml.safe_load((DOCKER / "compose.yaml").read_text())
+    placerec: dict[str, Any] = compose["services"]["placerec"]
+    return placerec
+
+
+def environment() -> dict[str, str]:
+    return dict(pair.split("=", 1) for pair in final_stage()["ENV"].split())
+
+
+def test_image_runs_as_a_user_of_its_own() -> None:
+    stage = final_stage()
+    assert stage["USER"] == "placerec"
+    assert re.search(r"useradd --uid [1-9]\d+ .*placerec", stage["RUN"])
+    assert stage["VOLUME"] == "/data"
+    assert re.search(r"install .*--owner placerec .*/data", stage["RUN"])
+
+
+def test_package_index_is_empty_unless_given() -> None:
+    arguments = [argument for name, argument in instructions() if name == "ARG"]
+    assert {"PIP_INDEX_URL=", "PIP_EXTRA_INDEX_URL="} <= set(arguments)
+    assert all(value in (f"${{{name}:-}}",) for name, value in service()["build"]["args"].items())
+
+
+def test_variables_are_settings_of_the_service() -> None:
+    given = {**environment(), **service()["environment"]}
+    settings = {name.removeprefix("PLACEREC_").lower() for name in given if name.startswith("PLACEREC_")}
+    assert settings and settings <= set(Settings.model_fields)
+    assert all(given[name].startswith("/data/") for name in ("PLACEREC_DATA_DIR", "PLACEREC_MODELS_DIR"))
+
+
+def test_what_is_copied_is_there_and_not_left_out() -> None:
+    left_out, *let_in = [
+        line for line in (ROOT / ".dockerignore").read_text().splitlines() if line and not line.startswith("#")
+    ]
+    assert left_out == "*"
+    for name, argument in instructions():
+        if name == "COPY" and not argument.startswith("--from"):
+            for source in argument.split()[:-1]:
+                assert (ROOT / source).exists() and f"!{source}" in let_in
+
+
+def test_service_is_published_on_this_machine_only() -> None:
+    placerec = service()
+    assert placerec["ports"] and all(port.startswith("127.0.0.1:") for port in placerec["ports"])
+    assert placerec["ports"][0].endswith(":" + environment()["PLACEREC_PORT"])
+
+
+def test_service_is_confined() -> None:
+    placerec = service()
+    assert placerec["read_only"] is True
+    assert placerec["cap_drop"] == ["ALL"]
+    assert "no-new-privileges:true" in placerec["security_opt"]
+    assert "mem_limit" in placerec and "restart" in placerec
+    written = [volume.split(":")[1] for volume in placerec["volumes"]]
+    assert written == [final_stage()["VOLUME"]]
+    assert any(environment()["NUMBA_CACHE_DIR"].startswith(place.split(":")[0]) for place in placerec["tmpfs"])
+
+
+def test_the_proxy_asks_for_a_certificate() -> None:
+    configuration = (DOCKER / "tls.conf").read_text()
+    assert "ssl_verify_client on;" in configuration
+    limit = re.search(r"client_max_body_size (\d+)m;", configuration)
+    assert limit and int(limit[1]) * 2**20 == Settings.model_fields["max_batch_bytes"].default
+
+
+@pytest.fixture
+def answering() -> Iterator[HTTPServer]:
+    class Handler(BaseHTTPRequestHandler):
+        status = 200
+
+        def do_GET(self) -> None:
+            self.send_response(type(self).status if self.path == "/readyz" else 404)
+            self.end_headers()
+
+        def log_message(self, format: str, *arguments: object) -> None:
+            """Say nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+@pytest.mark.parametrize(("status", "healthy"), [(200, True), (503, False)])
+def test_health_check_tells_ready_from_not(answering: HTTPServer, status: int, healthy: bool) -> None:
+    answering.RequestHandlerClass.status = status  # type: ignore[attr-defined]
+    command = json.loads(final_stage()["HEALTHCHECK"].split("CMD ", 1)[1])
+    assert command[0] == "python"
+    variables = {"PLACEREC_PORT": str(answering.server_port)}
+    assert (subprocess.run([sys.executable, *command[1:]], env=variables).returncode == 0) is healthy

@@ -1,0 +1,113 @@
+"""The scripts: they can be run, and .venv is made once, by one of them, from the lock files."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RUNNABLE = [
+    ".ci/run",
+    "docker/entrypoint",
+    *(f"scripts/{name}" for name in ("lint", "lock", "openapi", "serve", "test")),
+]
+
+# Stands for Python: a venv is a copy of this script, an installation a line in a log; all else is real.
+STUB = """#!/bin/bash
+case "$1 $2" in
+    "-m venv") mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python" && echo venv >>"$LOG" ;;
+    "-m pip") sleep 0.1 && echo "${*: -1}" >>"$LOG" && [ ! -e "$LOG.full" ] ;;
+    *) exec REAL "$@" ;;
+esac
+"""
+
+
+@pytest.mark.parametrize("name", RUNNABLE)
+def test_script_can_be_run(name: str) -> None:
+    path = ROOT / name
+    interpreter = path.read_text().splitlines()[0].removeprefix("#!").split()[-1]
+    assert os.access(path, os.X_OK)
+    subprocess.run([interpreter, "-n", str(path)], check=True)
+    assert "set -eu" in path.read_text()
+
+
+class Checkout:
+    """A folder with the real scripts/environment and an interpreter that only notes what it was asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.log = folder, folder / "log"
+        for name in ("scripts", "requirements"):
+            (folder / name).mkdir()
+        (folder / "scripts/environment").write_text((ROOT / "scripts/environment").read_text())
+        (folder / "pyproject.toml").write_text("[project]\n")
+        for name in ("torch", "service", "development"):
+            (folder / f"requirements/{name}.lock").write_text(f"{name}\n")
+        self.python = folder / "python"
+        self.python.write_text(STUB.replace("REAL", sys.executable))
+        self.python.chmod(0o755)
+
+    def start(self, profile: str, python: str | None = None) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            ["bash", "-c", f"set -eu; . '{self.folder}/scripts/environment'; environment {profile}; echo ready"],
+            env={**os.environ, "PYTHON": python or str(self.python), "LOG": str(self.log)},
+            cwd="/",
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def prepare(self, profile: str) -> list[str]:
+        """Run ``environment PROFILE``; what was installed for it, in order."""
+        self.log.write_text("")
+        out, error = self.start(profile).communicate(timeout=30)
+        assert out == "ready\n", error
+        return self.log.read_text().split()
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Checkout:
+    return Checkout(tmp_path)
+
+
+def test_torch_comes_first_and_nothing_twice(checkout: Checkout) -> None:
+    assert checkout.prepare("service") == ["venv", "requirements/torch.lock", "requirements/service.lock", "."]
+    assert checkout.prepare("service") == []
+
+
+def test_development_serves_too(checkout: Checkout) -> None:
+    assert checkout.prepare("development")[2] == "requirements/development.lock"
+    assert checkout.prepare("service") == []
+
+
+def test_a_changed_lock_installs_again_into_the_same_venv(checkout: Checkout) -> None:
+    checkout.prepare("service")
+    (checkout.folder / "requirements/service.lock").write_text("newer\n")
+    assert checkout.prepare("service") == ["requirements/torch.lock", "requirements/service.lock", "."]
+
+
+def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
+    runs = [checkout.start("development") for _ in range(3)]
+    assert [run.communicate(timeout=30)[0] for run in runs] == ["ready\n"] * 3
+    assert checkout.log.read_text().split().count("requirements/torch.lock") == 1
+
+
+def test_a_broken_off_installation_is_taken_up_again(checkout: Checkout) -> None:
+    checkout.prepare("service")
+    (checkout.folder / "requirements/service.lock").write_text("newer\n")
+    full = Path(f"{checkout.log}.full")
+    full.touch()
+    run = checkout.start("service")
+    assert run.communicate(timeout=30)[0] == "" and run.returncode != 0
+    full.unlink()
+    assert checkout.prepare("service")
+
+
+def test_an_old_python_is_refused_in_words(checkout: Checkout) -> None:
+    run = checkout.start("service", python="/bin/false")
+    out, error = run.communicate(timeout=30)
+    assert (out, run.returncode) == ("", 1)
+    assert "Python 3.11 or later" in error

@@ -1,0 +1,33 @@
+"""The command line as a whole: its help, its speed, its errors."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.service.commands.conftest import Placerec
+from tests.service.server import ROOT
+
+COMMANDS = ["serve", "enroll", "query", "evaluate", "vocabulary", "model", "maps", "bench", "settings"]
+
+
+def test_help_names_every_command(placerec: Placerec) -> None:
+    shown = placerec("--help").stdout
+    assert all(name in shown for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", [*COMMANDS, "maps places", "maps sequences", "vocabulary train", "model import"])
+def test_each_command_has_help(placerec: Placerec, command: str) -> None:
+    assert "--help" in placerec(*command.split(), "--help").stdout
+
+
+def test_help_loads_nothing_heavy() -> None:
+    check = "import service.commands, sys; print([n for n in ('torch', 'faiss', 'cv2', 'fastapi') if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", check], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_group_without_a_command_shows_its_help(placerec: Placerec) -> None:
+    assert "create" in placerec("maps", status=2).output

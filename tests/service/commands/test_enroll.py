@@ -1,0 +1,211 @@
+"""``placerec enroll`` in both modes, and what it refuses."""
+
+from __future__ import annotations
+
+import http.server
+import io
+import json
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+import httpx
+import pytest
+from PIL import ExifTags, Image
+
+from tests.service.commands.conftest import Placerec
+from tests.service.scenes import encoded, jpeg, scene
+from tests.service.server import Server
+
+HEADER = "file,id,x,y,z,heading,latitude,longitude,timestamp\n"
+
+
+def test_a_directory_becomes_a_traverse(placerec: Placerec, monday: Path) -> None:
+    done = placerec("enroll", monday, "--map", "lab", "--create")
+    assert "4 of 4 frames are places of lab, sequence monday: 4 created; 0 with a pose" in done.stdout
+
+    places = json.loads(placerec("maps", "places", "list", "lab", "--json").stdout)
+    assert [place["id"] for place in places] == ["1", "2", "9", "10"]
+    assert {place["sequence"] for place in places} == {"monday"}
+    assert all(place["pose"] is None for place in places)
+
+    again = placerec("enroll", monday, "--map", "lab")
+    assert "4 unchanged" in again.stdout
+
+    (monday / "2.jpg").write_bytes(jpeg(7))
+    replaced = placerec("enroll", monday, "--map", "lab")
+    assert "1 replaced, 3 unchanged" in replaced.stdout
+
+
+def test_poses_come_from_the_list_over_http(placerec: Placerec, monday: Path, server: Server, map_id: str) -> None:
+    (monday / "places.csv").write_text(
+        HEADER
+        + "9.jpg,door,1.5,-2,0.25,370,,,2026-11-20T10:00:00+01:00\n"
+        + "1.jpg,,,,,,48.5,2.25,\n"
+        + "2.jpg,,,,,,,,\n".replace("370", ""),
+        encoding="utf-8",
+    )
+    # A heading of more than a turn is refused with its line, before anything is sent.
+    refused = placerec("enroll", monday, "--map", map_id, "--url", server.client.base_url, status=1)
+    assert "places.csv, line 2: heading" in refused.stderr
+    assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
+
+    text = (monday / "places.csv").read_text().replace("370", "-90")
+    (monday / "places.csv").write_text(text)
+    done = placerec("enroll", monday, "--map", map_id, "--url", server.client.base_url, "--sequence", "walk")
+
+    assert "3 of 3 frames" in done.stdout
+    assert "2 with a pose" in done.stdout
+    assert "1 images of" in done.stderr  # 10.jpg is not listed
+    door = server.client.get(f"/v1/maps/{map_id}/places/door").json()
+    assert door["pose"] == {"x": 1.5, "y": -2.0, "z": 0.25, "heading": 270.0}
+    assert door["timestamp"] == "2026-11-20T09:00:00Z"
+    assert door["sequence"] == "walk"
+    assert server.client.get(f"/v1/maps/{map_id}/places/1").json()["pose"] == {"latitude": 48.5, "longitude": 2.25}
+    assert server.client.get(f"/v1/maps/{map_id}/places/2").json()["pose"] is None
+
+
+def test_poses_come_from_exif(placerec: Placerec, tmp_path: Path) -> None:
+    folder = tmp_path / "outdoor"
+    folder.mkdir()
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "S", 2: (48.0, 30.0, 0.0), 3: "E", 4: (2.0, 15.0, 0.0)})
+    file = io.BytesIO()
+    Image.fromarray(scene(0)).save(file, "JPEG", exif=exif.tobytes())
+    (folder / "a.jpg").write_bytes(file.getvalue())
+
+    done = placerec("enroll", folder, "--map", "paris", "--create")
+
+    assert "1 with a pose" in done.stdout
+    shown = json.loads(placerec("maps", "places", "show", "paris", "a", "--json").stdout)
+    assert shown["pose"] == {"latitude": -48.5, "longitude": 2.25}
+
+
+def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) -> None:
+    (monday / "3.jpg").write_bytes(b"not an image")
+    (monday / "4.png").write_bytes(encoded(scene(5), ".png")[:500])
+    done = placerec("enroll", monday, "--map", "lab", "--create", status=1)
+    assert "4 of 6 frames are places of lab" in done.stdout
+    assert "Error: 3.jpg: " in done.stderr
+    assert "Error: 4.png: " in done.stderr
+    assert "1.jpg" not in done.stderr
+
+
+def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
+    refused = placerec("enroll", monday, "--map", "lab", status=1)
+    assert "There is no map 'lab'; --create makes it." in refused.stderr
+    placerec("enroll", monday, "--map", "lab", "--create", "--encoder", "region-vlad", "--keep", "none")
+    made = json.loads(placerec("maps", "show", "lab", "--json").stdout)
+    assert made["encoder"].startswith("region-vlad@")
+    assert made["keep"] == "none"
+    wrong = placerec("enroll", monday, "--map", "lab", "--encoder", "m-region-vlad", status=1)
+    assert "bound to region-vlad@" in wrong.stderr
+    assert "0 of 4 frames are enrolled" in wrong.stderr
+
+
+def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Placerec, monday: Path) -> None:
+    placerec("enroll", monday, "--map", "lab", "--create")
+    tuesday = monday.rename(monday.with_name("tuesday"))
+    refused = placerec("enroll", tuesday, "--map", "lab", status=1)
+    assert "4 ids of this traverse are taken" in refused.stderr
+    assert "--id-prefix tuesday-" in refused.stderr
+    placerec("enroll", tuesday, "--map", "lab", "--id-prefix", "tuesday-")
+    sequences = json.loads(placerec("maps", "sequences", "list", "lab", "--json").stdout)
+    assert [(one["name"], one["places"]) for one in sequences] == [("monday", 4), ("tuesday", 4)]
+
+
+def test_file_names_become_ids(placerec: Placerec, tmp_path: Path) -> None:
+    folder = tmp_path / "odd names"
+    folder.mkdir()
+    for index, name in enumerate(("_hall (2)", "Küche", "x.y~z")):
+        (folder / f"{name}.png").write_bytes(encoded(scene(index, 64, 48), ".png"))
+    placerec("enroll", folder, "--map", "lab", "--create")
+    places = json.loads(placerec("maps", "places", "list", "lab", "--json").stdout)
+    assert [place["id"] for place in places] == ["K-che", "hall-2-", "x.y~z"]  # in the order of the files
+    assert {place["sequence"] for place in places} == {"odd names"}
+
+    (folder / "K che.png").write_bytes(encoded(scene(4, 64, 48), ".png"))
+    clash = placerec("enroll", folder, "--map", "lab", status=1)
+    assert "would both have the id 'K-che'" in clash.stderr
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("file,lattitude\n1.jpg,4\n", "an unknown column 'lattitude'"),
+        ("id,x,y\np,1,2\n", "columns missing or given twice"),
+        ("file,x,x\n1.jpg,1,2\n", "columns missing or given twice"),
+        ("file\n", "lists no frame"),
+        ("", "columns missing"),
+        ("file\nmissing.jpg\n", "line 2: there is no file 'missing.jpg'"),
+        ("file,x,y\n1.jpg,1\n", "line 2: the row has more or fewer cells"),
+        ("file,x,y\n1.jpg,1,2,3\n", "line 2: the row has more or fewer cells"),
+        ("file,x,y\n1.jpg,one,2\n", "line 2: x: Input should be a valid number"),
+        ("file,heading\n1.jpg,90\n", "line 2: a pose is either x, y[, z] or latitude, longitude"),
+        ("file,x,y,latitude,longitude\n1.jpg,1,2,3,4\n", "line 2: a pose is either"),
+        ("file,timestamp\n1.jpg,yesterday\n", "line 2: timestamp: "),
+        ("file,id\n1.jpg,-p\n", "'-p' cannot name a place"),
+        ("file,id\n1.jpg,p\n2.jpg,p\n", "1.jpg and 2.jpg would both have the id 'p'"),
+        ('file\n"1.jpg\n', "is not a CSV file in UTF-8"),
+    ],
+)
+def test_a_wrong_list_is_refused_before_anything_is_sent(
+    placerec: Placerec, monday: Path, content: str, message: str
+) -> None:
+    (monday / "places.csv").write_text(content)
+    refused = placerec("enroll", monday, "--map", "lab", "--create", "--url", "http://127.0.0.1:1", status=1)
+    assert message in refused.stderr
+
+
+def test_a_directory_without_images_is_refused(placerec: Placerec, tmp_path: Path) -> None:
+    refused = placerec("enroll", tmp_path / "nowhere", "--map", "lab", "--url", "http://127.0.0.1:1", status=1)
+    assert "cannot be read as a directory" in refused.stderr
+
+
+class FullAfterOne(http.server.BaseHTTPRequestHandler):
+    """A service whose disk is full after the first frame."""
+
+    protocol_version = "HTTP/1.1"
+    taken = 0
+
+    def answer(self, status: int, kind: str, body: Mapping[str, object]) -> None:
+        content = json.dumps(body).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def do_GET(self) -> None:
+        self.answer(200, "application/json", {"items": [], "next_cursor": None})
+
+    def do_PUT(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        type(self).taken += 1
+        if self.taken == 1:
+            self.answer(201, "application/json", {"change": "created"})
+        else:
+            problem = {"type": "urn:placerec:problem:storage-full", "detail": "The disk is full."}
+            self.answer(507, "application/problem+json", problem)
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Nothing: the test's output stays readable."""
+
+
+def test_a_full_disk_ends_the_run(placerec: Placerec, monday: Path) -> None:
+    with http.server.HTTPServer(("127.0.0.1", 0), FullAfterOne) as full:
+        threading.Thread(target=full.serve_forever, daemon=True).start()
+        stopped = placerec("enroll", monday, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
+        full.shutdown()
+    assert "The disk is full. 1 of 4 frames are enrolled; the same command goes on from there." in stopped.stderr
+    assert FullAfterOne.taken == 2  # the third and fourth were not sent
+
+
+def test_the_data_of_a_running_service_is_left_alone(
+    placerec: Placerec, monday: Path, server: Server, client: httpx.Client
+) -> None:
+    refused = placerec("enroll", monday, "--map", "lab", "--create", "--data-dir", server.data_dir, status=1)
+    assert refused.stderr.startswith("Error: ")
+    assert "Traceback" not in refused.stderr
+    assert "--url" in refused.stderr
+    assert client.get("/v1/maps/lab").status_code == 404

@@ -1,0 +1,97 @@
+"""``placerec maps``: the same commands on the data directory and over HTTP."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.service.commands.conftest import Placerec
+from tests.service.server import Server
+
+
+@pytest.fixture(params=["here", "over HTTP"])
+def where(request: pytest.FixtureRequest) -> list[str]:
+    """The words that choose the mode."""
+    if request.param == "here":
+        return []
+    running: Server = request.getfixturevalue("server")
+    return ["--url", str(running.client.base_url)]
+
+
+def test_a_map_from_its_making_to_its_end(placerec: Placerec, where: list[str]) -> None:
+    name = f"hall-{len(where)}"
+    made = placerec("maps", "create", name, "--description", "by day", "--same-place-radius", 2.5, "--json", *where)
+    assert json.loads(made.stdout)["same_place_radius"] == 2.5
+    assert json.loads(made.stdout)["encoder"].startswith("m-region-vlad@")
+    again = placerec("maps", "create", name, *where, status=1)
+    assert name in again.stderr
+
+    edited = placerec("maps", "edit", name, "--threshold", 2.25, "--keep", "image", "--json", *where)
+    assert json.loads(edited.stdout)["calibration"]["threshold"] == 2.25
+    assert json.loads(edited.stdout)["description"] == "by day"
+    table = placerec("maps", "show", name, *where).stdout
+    assert "threshold 2.250" in table
+    assert "by day" in table
+    default = placerec("maps", "edit", name, "--default-calibration", "--json", *where)
+    assert json.loads(default.stdout)["calibration"]["source"] == "encoder-default"
+
+    listed = json.loads(placerec("maps", "list", "--json", *where).stdout)
+    assert name in [item["id"] for item in listed["items"]]
+    assert listed["quarantined"] == []
+    assert name in placerec("maps", "list", *where).stdout
+    assert "is sound: 0 places" in placerec("maps", "verify", name, *where).stdout
+
+    placerec("maps", "delete", name, *where, status=1, stdin="n\n")
+    placerec("maps", "delete", name, *where, stdin="y\n")
+    assert name in placerec("maps", "show", name, *where, status=1).stderr
+
+
+def test_an_edit_must_change_something(placerec: Placerec) -> None:
+    placerec("maps", "edit", "lab", status=2)
+    placerec("maps", "edit", "lab", "--default-calibration", "--margin", 0.1, status=2)
+
+
+def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str], tmp_path: Path) -> None:
+    name = f"places-{len(where)}"
+    placerec("enroll", monday, "--map", name, "--create", *where)
+
+    placerec("maps", "places", "edit", name, "9", "--x", 1, "--y", 2, "--metadata", '{"door": "open"}', *where)
+    edit = ("maps", "places", "edit", name, "9", "--json", *where)
+    moved = json.loads(placerec(*edit, "--heading", 90).stdout)
+    assert moved["pose"] == {"x": 1.0, "y": 2.0, "heading": 90.0}
+    assert moved["metadata"] == {"door": "open"}
+    # A pose in the other frame of reference takes the place of the old one only when told so.
+    assert "latitude" in placerec(*edit, "--latitude", 48, "--longitude", 2, status=1).stderr
+    on_earth = json.loads(placerec(*edit, "--clear", "pose", "--latitude", 48, "--longitude", 2).stdout)
+    assert on_earth["pose"] == {"latitude": 48.0, "longitude": 2.0}
+    cleared = json.loads(placerec(*edit, "--clear", "pose", "--clear", "metadata").stdout)
+    assert cleared["pose"] is None
+    assert cleared["metadata"] == {}
+    placerec(*edit, status=2)
+    placerec(*edit, "--clear", "id", status=2)
+    assert "--metadata is not JSON" in placerec(*edit, "--metadata", "{", status=1).stderr
+
+    picture = tmp_path / "thumbnail.jpg"
+    placerec("maps", "places", "thumbnail", name, "9", picture, *where)
+    assert picture.read_bytes().startswith(b"\xff\xd8")
+    shown = placerec("maps", "places", "show", name, "9", *where).stdout
+    assert "monday" in shown
+
+    placerec("maps", "places", "forget", name, "1", "2", *where)
+    listed = json.loads(placerec("maps", "places", "list", name, "--sequence", "monday", "--json", *where).stdout)
+    assert [place["id"] for place in listed] == ["9", "10"]
+    forgotten = placerec("maps", "sequences", "forget", name, "monday", "--yes", *where)
+    assert "2 places" in forgotten.stderr
+    assert json.loads(placerec("maps", "sequences", "list", name, "--json", *where).stdout) == []
+
+
+def test_damage_is_found(placerec: Placerec, monday: Path, tmp_path: Path) -> None:
+    placerec("enroll", monday, "--map", "lab", "--create")
+    largest = max((path for path in (tmp_path / "data").rglob("*") if path.is_file()), key=lambda p: p.stat().st_size)
+    content = bytearray(largest.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    largest.write_bytes(content)
+    verified = placerec("maps", "verify", "lab", status=1)
+    assert "damaged" in verified.stderr

@@ -1,0 +1,68 @@
+"""``placerec query`` in both modes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.service.commands.conftest import Placerec
+from tests.service.scenes import blank, encoded, scene, seen_again
+from tests.service.server import Server
+
+
+def test_a_second_look_is_recognized_where_the_threshold_lets_it(
+    placerec: Placerec, monday: Path, tmp_path: Path
+) -> None:
+    placerec("enroll", monday, "--map", "lab", "--create")
+    (tmp_path / "again.png").write_bytes(encoded(seen_again(scene(2)), ".png"))
+
+    done = placerec("query", tmp_path / "again.png", monday / "10.jpg", "-m", "lab", "-k", 3, "--json")
+
+    again, tenth = (json.loads(line) for line in done.stdout.splitlines())
+    assert again["file"].endswith("again.png")
+    assert (again["verdict"], again["place"]["id"]) == ("recognized", "9")
+    assert [match["rank"] for match in again["matches"]] == [1, 2, 3]
+    assert (tenth["verdict"], tenth["place"]["id"]) == ("recognized", "10")
+
+    placerec("maps", "edit", "lab", "--threshold", 1000)
+    strict = json.loads(placerec("query", tmp_path / "again.png", "-m", "lab", "--json").stdout)
+    assert (strict["verdict"], strict["place"]) == ("unknown", None)
+    assert strict["matches"][0]["place"]["id"] == "9"
+    placerec("maps", "edit", "lab", "--default-calibration")
+
+    table = placerec("query", tmp_path / "again.png", "-m", "lab").stdout
+    assert "recognized" in table
+    assert "9" in table
+    assert f"{again['score']:.3f}" in table
+
+
+def test_over_http(placerec: Placerec, server: Server, traverse: str, tmp_path: Path) -> None:
+    (tmp_path / "again.jpg").write_bytes(encoded(seen_again(scene(5))))
+    done = placerec("query", tmp_path / "again.jpg", "-m", traverse, "--url", server.client.base_url, "--json")
+    answer = json.loads(done.stdout)
+    assert answer["matches"][0]["place"]["id"] == "p5"
+    same = server.query(traverse, (tmp_path / "again.jpg").read_bytes())
+    assert answer["score"] == same["score"]
+
+
+def test_an_image_that_is_refused_does_not_stop_the_others(
+    placerec: Placerec, server: Server, traverse: str, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.jpg").write_bytes(b"nothing")
+    (tmp_path / "small.png").write_bytes(encoded(blank(8, 8), ".png"))
+    (tmp_path / "good.jpg").write_bytes(encoded(scene(1)))
+    paths = [tmp_path / name for name in ("bad.jpg", "small.png", "good.jpg")]
+    done = placerec("query", *paths, "-m", traverse, "--url", server.client.base_url, "--json", status=1)
+    assert [json.loads(line)["matches"][0]["place"]["id"] for line in done.stdout.splitlines()] == ["p1"]
+    assert "bad.jpg: " in done.stderr
+    assert "small.png: " in done.stderr
+
+
+def test_what_stops_it(placerec: Placerec, server: Server, tmp_path: Path) -> None:
+    image = tmp_path / "good.jpg"
+    image.write_bytes(encoded(scene(1)))
+    url = server.client.base_url
+    assert "no map" in placerec("query", image, "-m", "nowhere", "--url", url, status=1).stderr
+    missing = placerec("query", tmp_path / "missing.jpg", "-m", "nowhere", "--url", url, status=1)
+    assert "cannot be read" in missing.stderr
+    assert placerec("query", image, "-m", "lab", "-k", 101, status=2).exit_code == 2

@@ -1,0 +1,85 @@
+"""One real server for all tests of the service, and another with tight limits."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from tests.service.encoders import install_coarse_encoder
+from tests.service.scenes import jpeg
+from tests.service.server import Server
+
+_numbers = itertools.count()
+
+TIGHT: dict[str, object] = {
+    "max_image_bytes": 60_000,
+    "max_image_pixels": 400_000,
+    "max_batch_items": 3,
+    "max_batch_bytes": 150_000,
+    "max_upload_memory": 500_000,
+    "max_json_bytes": 4096,
+    "max_metadata_bytes": 200,
+    "queue_length": 1,
+    "request_timeout": 5,
+}
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The service with its default settings."""
+    folder = tmp_path_factory.mktemp("server")
+    install_coarse_encoder(folder / "models")
+    running = Server(folder).wait()
+    yield running
+    assert running.stop() == 0
+
+
+@pytest.fixture(scope="session")
+def tight_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The service with limits that a test can reach."""
+    running = Server(tmp_path_factory.mktemp("tight"), settings=TIGHT).wait()
+    yield running
+    assert running.stop() == 0
+
+
+@pytest.fixture
+def client(server: Server) -> httpx.Client:
+    """Talks to the server."""
+    server.check_running()
+    return server.client
+
+
+@pytest.fixture
+def map_id(server: Server) -> str:
+    """A new, empty map."""
+    server.check_running()
+    name = f"map-{next(_numbers)}"
+    server.create_map(name)
+    return name
+
+
+@pytest.fixture
+def tight_map(tight_server: Server) -> str:
+    """A new, empty map where limits are tight."""
+    name = f"map-{next(_numbers)}"
+    tight_server.create_map(name)
+    return name
+
+
+@pytest.fixture(scope="session")
+def traverse(server: Server) -> str:
+    """A map of eight places two metres apart; nobody changes it."""
+    server.create_map("traverse")
+    for number in range(8):
+        response = server.enrol("traverse", f"p{number}", jpeg(number), x=2 * number, y=0, sequence="monday")
+        assert response.status_code == 201, response.text
+    return "traverse"
+
+
+@pytest.fixture
+def anyio_backend() -> str:
+    """Asynchronous tests run on the event loop that the service runs on."""
+    return "asyncio"

@@ -1,0 +1,152 @@
+"""A real server process on a free port, and what its answers must look like."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+ROOT = Path(__file__).parents[2]
+START_SECONDS = 60.0
+
+
+def free_port() -> int:
+    """A port that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+class Server:
+    """``placerec serve`` in a process of its own.
+
+    Args:
+        folder: for its data and its log.
+        settings: names without the prefix, such as ``{"queue_length": 1}``.
+        wrapper: words before the command, such as those of strace.
+    """
+
+    def __init__(self, folder: Path, settings: Mapping[str, object] | None = None, wrapper: Sequence[str] = ()) -> None:
+        self.folder, self.port = folder, free_port()
+        self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
+        folder.mkdir(parents=True, exist_ok=True)
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
+        own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, **(settings or {})}
+        environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
+        environment["PYTHONFAULTHANDLER"] = "1"  # should it crash, its log says where
+        command = [*wrapper, sys.executable, "-m", "service.commands", "serve"]
+        with self.log_file.open("ab") as log:
+            self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60)
+
+    def check_running(self) -> None:
+        """Fail with the end of the log if the process has ended."""
+        status = self.process.poll()
+        assert status is None, f"the server ended with {status}:\n{self.log_file.read_text()[-4000:]}"
+
+    def wait(self, path: str = "/readyz") -> Server:
+        """Return when ``path`` answers 200."""
+        until = time.monotonic() + START_SECONDS
+        while time.monotonic() < until:
+            self.check_running()
+            try:
+                if self.client.get(path).status_code == 200:
+                    return self
+            except httpx.TransportError:
+                pass
+            time.sleep(0.05)
+        raise AssertionError(f"the server is not ready:\n{self.log_file.read_text()[-4000:]}")
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        self.process.send_signal(signal.SIGKILL)
+        self.process.wait(30)
+        self.client.close()
+
+    def stop(self) -> int:
+        """End it as an operator would; the exit status."""
+        self.process.send_signal(signal.SIGTERM)
+        status = self.process.wait(60)
+        self.client.close()
+        return status
+
+    def lines(self, **wanted: object) -> list[dict[str, Any]]:
+        """The lines of its log with these values."""
+        written = self.log_file.read_text().splitlines(keepends=True)
+        found = [json.loads(line) for line in written if line.endswith("\n")]
+        return [line for line in found if all(line.get(name) == value for name, value in wanted.items())]
+
+    def logged_request(self, request_id: str) -> dict[str, Any]:
+        """The line of a request, which is written when its answer is on its way."""
+        until = time.monotonic() + 10
+        while not (lines := self.lines(message="request", request_id=request_id)) and time.monotonic() < until:
+            time.sleep(0.02)
+        (line,) = lines
+        return line
+
+    def create_map(self, map_id: str, **fields: object) -> dict[str, Any]:
+        """A new map."""
+        response = self.client.post("/v1/maps", json={"id": map_id, **fields})
+        assert response.status_code == 201, response.text
+        made: dict[str, Any] = response.json()
+        return made
+
+    def enrol(self, map_id: str, place_id: str, data: bytes, **parameters: object) -> httpx.Response:
+        """PUT one frame."""
+        return self.client.put(
+            f"/v1/maps/{map_id}/places/{place_id}", params=text(parameters), content=data, headers=typed(data)
+        )
+
+    def query(self, map_id: str, data: bytes, **parameters: object) -> dict[str, Any]:
+        """The answer to one frame."""
+        response = self.client.post(
+            f"/v1/maps/{map_id}/query", params=text(parameters), content=data, headers=typed(data)
+        )
+        assert response.status_code == 200, response.text
+        answer: dict[str, Any] = response.json()
+        return answer
+
+
+def text(parameters: Mapping[str, object]) -> dict[str, str]:
+    """Parameters of a query string; objects as JSON."""
+    return {name: json.dumps(value) if isinstance(value, dict) else str(value) for name, value in parameters.items()}
+
+
+def typed(data: bytes) -> dict[str, str]:
+    """The content type of a frame by its first bytes."""
+    if data.startswith(b"\x89PNG"):
+        return {"Content-Type": "image/png"}
+    return {"Content-Type": "image/webp" if data[8:12] == b"WEBP" else "image/jpeg"}
+
+
+def assert_problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+    """The canonical error: a problem of this status and type that names its request."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem: dict[str, Any] = response.json()
+    assert problem["type"] == f"urn:placerec:problem:{slug}", problem
+    assert problem["status"] == status
+    assert problem["title"]
+    assert problem["detail"]
+    assert problem["instance"] == response.request.url.path
+    assert problem["request_id"] == response.headers["x-request-id"]
+    assert not re.search(r"Traceback|File \"|site-packages", response.text)
+    return problem
+
+
+def assert_item_problem(item: Mapping[str, Any], status: int, slug: str) -> None:
+    """The same for one frame of a batch."""
+    assert item["status"] == status, item
+    assert item["problem"]["type"] == f"urn:placerec:problem:{slug}"
+    assert item["problem"]["status"] == status
+    assert item["problem"]["detail"]

@@ -1,0 +1,101 @@
+"""Settings: from the environment, checked before anything runs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from service.settings import MIB, Settings, SettingsError, read_settings, unknown_variables
+from tests.service.server import ROOT, free_port
+
+
+@pytest.fixture(autouse=True)
+def clean_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+
+    for name in list(os.environ):
+        if name.startswith("PLACEREC_"):
+            monkeypatch.delenv(name)
+
+
+def test_defaults() -> None:
+    settings = read_settings()
+    assert (settings.host, settings.port, settings.data_dir) == ("127.0.0.1", 8000, Path("data"))
+    assert settings.models_directory == Path("data").absolute().parent / "models"
+    assert settings.max_image_bytes == 16 * MIB
+    assert settings.encoder == "m-region-vlad"
+
+
+def test_the_environment_decides(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PLACEREC_PORT", "9000")
+    monkeypatch.setenv("PLACEREC_DATA_DIR", str(tmp_path / "kept"))
+    monkeypatch.setenv("PLACEREC_REQUEST_TIMEOUT", "2.5")
+    settings = read_settings()
+    assert (settings.port, settings.request_timeout) == (9000, 2.5)
+    assert settings.models_directory == tmp_path / "models"
+
+
+def test_each_wrong_value_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLACEREC_PORT", "99999")
+    monkeypatch.setenv("PLACEREC_QUEUE_LENGTH", "many")
+    monkeypatch.setenv("PLACEREC_REQUEST_TIMEOUT", "nan")
+    with pytest.raises(SettingsError) as raised:
+        read_settings()
+    lines = str(raised.value).splitlines()
+    assert [line.split(":")[0] for line in lines] == [
+        "PLACEREC_PORT",
+        "PLACEREC_QUEUE_LENGTH",
+        "PLACEREC_REQUEST_TIMEOUT",
+    ]
+
+
+def test_limits_must_fit_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLACEREC_MAX_IMAGE_BYTES", str(200 * MIB))
+    with pytest.raises(SettingsError, match="MAX_BATCH_BYTES is less than PLACEREC_MAX_IMAGE_BYTES"):
+        read_settings()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", "127.8.8.8"])
+def test_loopback_is_served_without_keys(host: str) -> None:
+    Settings(host=host).check_exposure()
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.4", "robots.example"])
+def test_other_machines_are_not(host: str) -> None:
+    with pytest.raises(SettingsError, match="PLACEREC_ALLOW_ANONYMOUS=true"):
+        Settings(host=host).check_exposure()
+    Settings(host=host, allow_anonymous=True).check_exposure()
+
+
+def test_a_typing_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLACEREC_QUEUE_LENGHT", "1")
+    monkeypatch.setenv("PLACEREC_PORT", "1")
+    monkeypatch.setenv("PLACEREC_URL", "http://robot")
+    assert unknown_variables() == ["PLACEREC_QUEUE_LENGHT"]
+
+
+def test_every_setting_says_what_it_does() -> None:
+    for name, field in Settings.model_fields.items():
+        assert field.description, name
+
+
+@pytest.mark.parametrize(
+    ("variable", "value"), [("PLACEREC_HOST", "0.0.0.0"), ("PLACEREC_PORT", "http"), ("PLACEREC_THREADS", "-1")]
+)
+def test_the_server_refuses_to_start(tmp_path: Path, variable: str, value: str) -> None:
+    environment = {"PLACEREC_DATA_DIR": str(tmp_path / "data"), "PLACEREC_PORT": str(free_port()), variable: value}
+    result = subprocess.run(
+        [sys.executable, "-m", "service.commands", "serve"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert result.returncode != 0
+    assert variable in result.stderr and "Traceback" not in result.stderr
+    assert not (tmp_path / "data").exists()

@@ -1,0 +1,58 @@
+"""Request ids and the log."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+
+import pytest
+
+from service.telemetry import JsonLines
+from tests.service.scenes import jpeg
+from tests.service.server import Server
+
+
+def test_a_plain_request_id_is_taken(server: Server) -> None:
+    response = server.client.get("/livez", headers={"X-Request-Id": "robot-7:frame.0001"})
+    assert response.headers["x-request-id"] == "robot-7:frame.0001"
+
+
+@pytest.mark.parametrize("given", [None, "", "a b", "x" * 129, "-x", 'quote"', "ä".encode("latin-1"), "<script>"])
+def test_any_other_is_replaced(server: Server, given: str | bytes | None) -> None:
+    headers = {} if given is None else {"X-Request-Id": given}
+    made = server.client.get("/livez", headers=headers).headers["x-request-id"]  # type: ignore[arg-type]
+    assert re.fullmatch(r"[0-9a-f]{32}", made)
+
+
+def test_one_line_for_each_request(server: Server, traverse: str) -> None:
+    headers = {"X-Request-Id": "logged-query", "Content-Type": "image/jpeg"}
+    frame = jpeg(1)
+    response = server.client.post(f"/v1/maps/{traverse}/query?k=1", content=frame, headers=headers)
+    line = server.logged_request("logged-query")
+    assert line["method"] == "POST" and line["status"] == 200
+    assert line["path"] == f"/v1/maps/{traverse}/query" and line["route"] == "/v1/maps/{map}/query"
+    assert line["bytes_in"] == len(frame) and line["bytes_out"] == len(response.content)
+    assert line["milliseconds"] > 0 and line["map"] == traverse and line["verdict"] == "recognized"
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z", line["time"])
+
+
+def test_failures_are_logged_too(server: Server) -> None:
+    server.client.get("/made/up", headers={"X-Request-Id": "logged-404"})
+    line = server.logged_request("logged-404")
+    assert (line["status"], line["route"], line["problem"]) == (404, "(none)", "unknown-path")
+
+
+def test_every_line_of_the_server_is_json(server: Server) -> None:
+    for line in server.log_file.read_text().splitlines():
+        assert {"time", "level", "logger", "message"} <= set(json.loads(line))
+
+
+def test_a_traceback_stays_on_one_line() -> None:
+    try:
+        raise ValueError("line one\nline two")
+    except ValueError as error:
+        record = logging.makeLogRecord({"msg": "broken %s", "args": ("pipe",), "exc_info": (ValueError, error, None)})
+    written = JsonLines().format(record)
+    assert "\n" not in written
+    assert json.loads(written)["message"] == "broken pipe" and "line two" in json.loads(written)["exception"]
