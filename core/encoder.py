@@ -15,7 +15,7 @@ from core.backbone import Backbone
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.identity import json_digest, tensors_digest
 from core.matching import scores
-from core.preprocessing import Pixels, prepare
+from core.preprocessing import Pixels, contrast, prepare
 from core.regions import Regions, extract_regions, fuse, unit_length
 from core.threads import keep_numpy_single_threaded
 from core.verdict import Calibration
@@ -33,6 +33,8 @@ class FeatureDefinition(BaseModel):
 
     ``steps`` are the quantisation steps, one a layer, in units of its activations.
     ``unit_features`` scales each regional feature to unit length before anything else.
+    ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
+    network through its biases alone, and what looks like regions says nothing of the scene.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -41,6 +43,7 @@ class FeatureDefinition(BaseModel):
     regions: int = Field(ge=1, le=10_000, description="N, per layer")
     steps: tuple[float, ...]
     unit_features: bool
+    least_contrast: float = Field(default=2.0, ge=0, le=255, allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _one_step_a_layer(self) -> FeatureDefinition:
@@ -93,11 +96,15 @@ class FeatureExtractor:
         """Identity of the features: what a vocabulary must have been trained on."""
 
     def activations(self, frames: Sequence[Pixels]) -> list[list[Array]]:
-        """For each frame the rectified maps of each layer, float32 [X, Y, K]."""
+        """For each frame the rectified maps of each layer, float32 [X, Y, K]; zeros for a blank frame."""
         batch = np.stack([prepare(frame, self.backbone.input) for frame in frames])  # B x H x W x 3
         with torch.inference_mode():
             outputs = self.backbone(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
         maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
+        for index, frame in enumerate(frames):
+            if contrast(frame) < self.definition.least_contrast:
+                for layer in maps:
+                    layer[index] = 0
         return [[layer[index] for layer in maps] for index in range(len(frames))]
 
     def regions(self, activations: Sequence[Array]) -> Regions:

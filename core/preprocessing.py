@@ -49,3 +49,13 @@ def prepare(pixels: Pixels, definition: InputDefinition) -> NDArray[np.float32]:
         pixels = pixels[:, :, ::-1]
     centred = np.subtract(pixels, np.array(definition.mean, np.float32), dtype=np.float32)
     return np.multiply(centred, np.array(definition.scale, np.float32), out=centred)
+
+
+def contrast(pixels: Pixels) -> float:
+    """The largest standard deviation of a colour channel, in 0–255 units, over a grid of some 5 000 pixels.
+
+    Args:
+        pixels: H x W x 3 uint8.
+    """
+    stride = max(1, min(pixels.shape[:2]) // 64)
+    return float(pixels[::stride, ::stride].reshape(-1, 3).std(axis=0).max())

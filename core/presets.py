@@ -16,7 +16,7 @@ PRESETS: dict[str, EncoderDefinition] = {
     "m-region-vlad": EncoderDefinition(
         layers=("conv3", "conv4"),
         regions=300,
-        steps=(0.1, 0.1),
+        steps=(2.0, 2.0),
         unit_features=True,
         words=128,
         gamma=0.5,
@@ -26,7 +26,7 @@ PRESETS: dict[str, EncoderDefinition] = {
     "region-vlad": EncoderDefinition(
         layers=("conv3",),
         regions=400,
-        steps=(0.1,),
+        steps=(2.0,),
         unit_features=True,
         words=256,
         gamma=0.5,

@@ -89,16 +89,16 @@ def camera_trials(task: Cameras, scores: Array, distractors: Array, calibration:
 def choose(maps: list[Trials], calibration: Calibration) -> Calibration:
     """Threshold and margin for trials on several kinds of maps, each kind counting alike.
 
-    The threshold is the lowest at which at most FALSE_ACCEPTS of the unknown places pass, averaged
-    over the kinds.  The margin is the highest that costs at most LOST_BY_MARGIN of the right answers
-    that pass the threshold.
+    The margin is the highest that costs at most LOST_BY_MARGIN of the right answers.  The threshold
+    is the lowest at which, with that margin, at most FALSE_ACCEPTS of the unknown places are
+    recognized, averaged over the kinds.
     """
+    margin = max(0.0, float(np.quantile(np.concatenate([t.margin[t.right] for t in maps]), LOST_BY_MARGIN)))
+    strangers = [t.decision[~t.known & (t.margin >= margin)] for t in maps]
+    unknown = [int((~t.known).sum()) for t in maps]
     steps = np.linspace(-1, 20, 4201)
-    accepted = [[float((t.decision[~t.known] >= step).mean()) for step in steps] for t in maps]
-    passing = np.mean(accepted, axis=0) <= FALSE_ACCEPTS
-    threshold = float(steps[int(np.argmax(passing))])
-    margins = np.concatenate([t.margin[t.right & (t.decision >= threshold)] for t in maps])
-    margin = max(0.0, float(np.quantile(margins, LOST_BY_MARGIN)))
+    accepted = [[float((s >= step).sum()) / n for step in steps] for s, n in zip(strangers, unknown, strict=True)]
+    threshold = float(steps[int(np.argmax(np.mean(accepted, axis=0) <= FALSE_ACCEPTS))])
     return calibration.model_copy(update={"threshold": round(threshold, 3), "margin": round(margin, 5)})
 
 

@@ -36,17 +36,19 @@ CHANGES: dict[str, dict[str, Any]] = {
     "raw sums": {"unit_features": False},
     "global": {"normalization": "global"},
     "raw sums, global (as the thesis's code)": {"unit_features": False, "normalization": "global"},
-    "step 0.03": {"steps": (0.03, 0.03)},
-    "step 0.3": {"steps": (0.3, 0.3)},
+    "step 0.1": {"steps": (0.1, 0.1)},
+    "step 0.5": {"steps": (0.5, 0.5)},
     "step 1.0": {"steps": (1.0, 1.0)},
+    "step 1.5": {"steps": (1.5, 1.5)},
+    "step 3.0": {"steps": (3.0, 3.0)},
     "N = 150": {"regions": 150},
     "N = 600": {"regions": 600},
     "V = 64": {"words": 64},
     "V = 256": {"words": 256},
     "γ = 0.2": {"gamma": 0.2},
     "γ = 1": {"gamma": 1.0},
-    "conv3 alone, N = 600": {"layers": ("conv3",), "steps": (0.1,), "regions": 600},
-    "conv4 alone, N = 600": {"layers": ("conv4",), "steps": (0.1,), "regions": 600},
+    "conv3 alone, N = 600": {"layers": ("conv3",), "steps": (2.0,), "regions": 600},
+    "conv4 alone, N = 600": {"layers": ("conv4",), "steps": (2.0,), "regions": 600},
 }
 COLUMNS = ("lip6 recall@1", "lip6 AUC-PR", "webcams recall@1", "night recall@1", "corridor recall@1", "corridor AUC-PR")
 

@@ -89,6 +89,22 @@ def test_a_frame_without_regions_has_a_zero_descriptor() -> None:
     assert not encoding.descriptor.any()
 
 
+@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (20, 120, 200)])
+def test_a_blank_frame_has_no_region_whatever_its_colour(colour: tuple[int, int, int]) -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    blank = np.full((240, 320, 3), colour, np.uint8)
+    noise = np.random.default_rng(0).normal(0, 1, blank.shape).round()
+    for frame in (blank, np.clip(blank + noise, 0, 255).astype(np.uint8)):
+        encoding = encoder.encode(frame)
+        assert len(encoding.regions) == 0
+        assert not encoding.descriptor.any()
+
+
+def test_a_dark_frame_is_not_a_blank_one() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    assert len(encoder.encode((random_frame(4) // 16).astype(np.uint8)).regions) > 0
+
+
 def test_the_score_is_the_mean_cosine(encoder: Encoder) -> None:
     a, b = (encoder.encode(random_frame(n)).descriptor for n in (1, 2))
     assert encoder.score(a, b) == pytest.approx(float(a @ b) / 8)
