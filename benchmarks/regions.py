@@ -14,7 +14,7 @@ from benchmarks.reference_regions import reference_regions
 from benchmarks.report import report, verdict
 from core.encoder import FeatureExtractor
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.regions import extract_regions, fuse
+from core.regions import extract_regions
 from service.measurement import medians, sample_picture
 
 LIMIT = 60.0
@@ -29,18 +29,13 @@ def main(encoder: str = DEFAULT_ENCODER, rounds: Annotated[int, typer.Option(min
     steps = definition.steps
 
     def ours() -> object:
-        return fuse(
-            [
-                extract_regions(layer, step, definition.regions, index)
-                for index, (layer, step) in enumerate(zip(layers, steps, strict=True))
-            ]
-        )
+        return extract_regions(layers, steps, definition.regions)
 
     def reference() -> object:
         return [reference_regions(plane, step, definition.regions) for plane, step in zip(planes, steps, strict=True)]
 
     for layer, plane, step in zip(layers, planes, steps, strict=True):
-        made = extract_regions(layer, step, definition.regions)
+        made = extract_regions([layer], [step], definition.regions)
         _, energies, features = reference_regions(plane, step, definition.regions)
         np.testing.assert_allclose(made.energies, energies, rtol=1e-4)
         # Regions of nearly the same energy may change places; the sets of their features may not.

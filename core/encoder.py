@@ -16,7 +16,7 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.identity import json_digest, tensors_digest
 from core.matching import scores
 from core.preprocessing import Pixels, contrast, prepare
-from core.regions import Regions, extract_regions, fuse, unit_length
+from core.regions import Regions, extract_regions, unit_length
 from core.threads import keep_numpy_single_threaded
 from core.verdict import Calibration
 from core.vlad import Normalization, aggregate
@@ -110,12 +110,7 @@ class FeatureExtractor:
     def regions(self, activations: Sequence[Array]) -> Regions:
         """The regions of all layers of one frame, fused (eqs. 4.4, 4.5)."""
         definition = self.definition
-        found = fuse(
-            [
-                extract_regions(layer, step, definition.regions, index)
-                for index, (layer, step) in enumerate(zip(activations, definition.steps, strict=True))
-            ]
-        )
+        found = extract_regions(activations, definition.steps, definition.regions)
         if not definition.unit_features:
             return found
         return Regions(found.boxes, found.energies, found.channels, found.layers, unit_length(found.features))

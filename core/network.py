@@ -292,4 +292,5 @@ def load_network(path: Path, outputs: Iterable[str]) -> ShallowNetwork:
     except (OSError, SafetensorError) as error:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
     network.load_weights(weights)
-    return network.eval().requires_grad_(False)
+    # Frames arrive channels last, and the region pass reads the maps that way.
+    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -11,6 +11,7 @@ cells at or above the level where ``count`` regions are complete are ever labell
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -48,14 +49,29 @@ class Regions:
         return len(self.energies)
 
 
+def _foreground(
+    activations: Activations, step: np.float32
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Cells of level 1 and above: flat cell index (y * width + x) and channel of each, and its level, all [F]."""
+    values = activations.reshape(-1)
+    # NumPy compares sixteen values at a time, and few pass: much quicker than a compiled loop.
+    passed = np.flatnonzero(values >= step)
+    cells, channels = np.divmod(passed, activations.shape[2])
+    return cells, channels, np.floor(values[passed] / step)
+
+
 @numba.njit(cache=True, nogil=True)
-def _level_with(activations, step, wanted):  # type: ignore[no-untyped-def]
-    """The highest level >= 1 at or above which at least ``wanted`` cells lie (1 if there are fewer)."""
+def _histogram(levels):  # type: ignore[no-untyped-def]
+    """How many cells each level has, int64 [HISTOGRAM_BINS]."""
     histogram = np.zeros(HISTOGRAM_BINS, np.int64)
-    for value in activations.flat:
-        level = np.floor(value / step)
-        if level >= 1:
-            histogram[int(min(level, np.float32(HISTOGRAM_BINS - 1)))] += 1
+    for level in levels:
+        histogram[int(min(level, np.float32(HISTOGRAM_BINS - 1)))] += 1
+    return histogram
+
+
+@numba.njit(cache=True, nogil=True)
+def _level_with(histogram, wanted):  # type: ignore[no-untyped-def]
+    """The highest level >= 1 at or above which at least ``wanted`` cells lie (1 if there are fewer)."""
     seen, level = 0, HISTOGRAM_BINS
     while level > 1 and seen < wanted:
         level -= 1
@@ -64,57 +80,53 @@ def _level_with(activations, step, wanted):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
-def _cells_by_channel(activations, step, lowest):  # type: ignore[no-untyped-def]
-    """Cells at or above level ``lowest``, sorted by channel, then row, then column.
+def _by_channel(maps, levels, lowest, channels):  # type: ignore[no-untyped-def]
+    """The cells of level >= ``lowest``, sorted by channel and within it as before.
 
-    Returns the flat cell index (y * width + x) of each, and where each channel starts, int64 [K + 1].
+    Returns their indices, and where each channel starts, int64 [K + 1].
     """
-    height, width, channels = activations.shape
     starts = np.zeros(channels + 1, np.int64)
-    for y in range(height):
-        for x in range(width):
-            for k in range(channels):
-                starts[k + 1] += np.floor(activations[y, x, k] / step) >= lowest
+    for i in range(len(maps)):
+        if levels[i] >= lowest:
+            starts[maps[i] + 1] += 1
     for k in range(channels):
         starts[k + 1] += starts[k]
-    cells = np.empty(starts[channels], np.int64)
+    order = np.empty(starts[channels], np.int64)
     fill = starts[:-1].copy()
-    for y in range(height):
-        for x in range(width):
-            for k in range(channels):
-                if np.floor(activations[y, x, k] / step) >= lowest:
-                    cells[fill[k]] = y * width + x
-                    fill[k] += 1
-    return cells, starts
+    for i in range(len(maps)):
+        if levels[i] >= lowest:
+            order[fill[maps[i]]] = i
+            fill[maps[i]] += 1
+    return order, starts
 
 
 @numba.njit(cache=True, nogil=True)
-def _label(activations, step, lowest):  # type: ignore[no-untyped-def]
+def _label(activations, cells, maps, levels, lowest):  # type: ignore[no-untyped-def]
     """All regions of level >= ``lowest`` in order of their first cell (map-major, then row-major).
 
     Returns boxes int32 [R, 4], mean activations float64 [R], channels int32 [R].
     """
     height, width, channels = activations.shape
-    cells, starts = _cells_by_channel(activations, step, lowest)
-    boxes = np.empty((len(cells), 4), np.int32)
-    energies = np.empty(len(cells), np.float64)
-    maps = np.empty(len(cells), np.int32)
+    order, starts = _by_channel(maps, levels, lowest, channels)
+    boxes = np.empty((len(order), 4), np.int32)
+    energies = np.empty(len(order), np.float64)
+    owners = np.empty(len(order), np.int32)
     found = 0
-    levels = np.zeros((height + 2, width + 2), np.float32)  # with a rim of background
+    grid = np.zeros((height + 2, width + 2), np.float32)  # with a rim of background
     stack = np.empty(height * width, np.int64)
     for k in range(channels):
-        for cell in cells[starts[k] : starts[k + 1]]:
-            y, x = cell // width, cell % width
-            levels[y + 1, x + 1] = np.floor(activations[y, x, k] / step)
-        for seed in cells[starts[k] : starts[k + 1]]:
-            y, x = seed // width, seed % width
-            level = levels[y + 1, x + 1]
+        members = order[starts[k] : starts[k + 1]]
+        for i in members:
+            grid[cells[i] // width + 1, cells[i] % width + 1] = levels[i]
+        for i in members:
+            y, x = cells[i] // width, cells[i] % width
+            level = grid[y + 1, x + 1]
             if level == 0:  # taken by an earlier region
                 continue
             top, left, bottom, right = y, x, y, x
             total, size = 0.0, 0
-            levels[y + 1, x + 1] = 0
-            stack[0], depth = seed, 1
+            grid[y + 1, x + 1] = 0
+            stack[0], depth = cells[i], 1
             while depth > 0:
                 depth -= 1
                 y, x = stack[depth] // width, stack[depth] % width
@@ -123,37 +135,37 @@ def _label(activations, step, lowest):  # type: ignore[no-untyped-def]
                 top, left, bottom, right = min(top, y), min(left, x), max(bottom, y), max(right, x)
                 for v in range(y, y + 3):
                     for u in range(x, x + 3):
-                        if levels[v, u] == level:
-                            levels[v, u] = 0
+                        if grid[v, u] == level:
+                            grid[v, u] = 0
                             stack[depth] = (v - 1) * width + u - 1
                             depth += 1
             boxes[found, 0], boxes[found, 1] = top, left
             boxes[found, 2], boxes[found, 3] = bottom + 1, right + 1
             energies[found] = total / size
-            maps[found] = k
+            owners[found] = k
             found += 1
-    return boxes[:found], energies[:found], maps[:found]
+    return boxes[:found], energies[:found], owners[:found]
 
 
 @numba.njit(cache=True, nogil=True)
-def _strongest(activations, step, count):  # type: ignore[no-untyped-def]
+def _strongest(activations, cells, maps, levels, count):  # type: ignore[no-untyped-def]
     """The ``count`` regions of highest energy over all maps (eq. 3.3), ties by first occurrence."""
+    histogram = _histogram(levels)
     wanted = FIRST_GUESS * count
     while True:
-        lowest = _level_with(activations, step, wanted)
-        boxes, energies, maps = _label(activations, step, lowest)
+        lowest = _level_with(histogram, wanted)
+        boxes, energies, owners = _label(activations, cells, maps, levels, lowest)
         if len(energies) >= count or lowest == 1:
             break
         wanted *= 2
     order = np.argsort(-energies, kind="mergesort")[:count]
-    return boxes[order], energies[order], maps[order]
+    return boxes[order], energies[order], owners[order]
 
 
 @numba.njit(cache=True, nogil=True)
-def _box_sums(activations, boxes):  # type: ignore[no-untyped-def]
-    """Sum of the local descriptors in each box by a summed-area table; float32 [T, K]."""
+def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
+    """Put the sum of the local descriptors in each box into ``sums``, float32 [T, K], by the summed-area ``table``."""
     height, width, channels = activations.shape
-    table = np.zeros((height + 1, width + 1, channels), np.float64)
     row = np.empty(channels, np.float64)
     for y in range(height):
         row[:] = 0
@@ -161,49 +173,64 @@ def _box_sums(activations, boxes):  # type: ignore[no-untyped-def]
             for k in range(channels):
                 row[k] += activations[y, x, k]
                 table[y + 1, x + 1, k] = table[y, x + 1, k] + row[k]
-    sums = np.empty((len(boxes), channels), np.float32)
     for t in range(len(boxes)):
         top, left, bottom, right = boxes[t]
         for k in range(channels):
             sums[t, k] = table[bottom, right, k] - table[top, right, k] - table[bottom, left, k] + table[top, left, k]
-    return sums
 
 
-def extract_regions(activations: Activations, step: float, count: int, layer: int = 0) -> Regions:
-    """The ``count`` strongest regions of one layer and their features (eqs. 3.1–3.4).
+class _Workspace(threading.local):
+    """The summed-area table that one thread's passes share: fresh pages would cost as much as the sums."""
+
+    shape: tuple[int, ...] = ()
+
+    def fit(self, shape: tuple[int, ...]) -> None:
+        """Have room for the table of activations of this shape."""
+        if shape != self.shape:
+            height, width, channels = shape
+            # The first row and column are never written: they stay zero.
+            self.table = np.zeros((height + 1, width + 1, channels), np.float64)
+            self.shape = shape
+
+
+_workspace = _Workspace()
+
+
+def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
+    """The ``count`` strongest regions of each layer and their features, fused (eqs. 3.1–3.4, 4.1–4.5).
 
     Args:
-        activations: float32 [X, Y, K], rectified and finite, channels last.
-        step: quantisation step q > 0, in units of the activations.
-        count: N; fewer are returned where the frame has fewer.
-        layer: index to mark the regions with.
+        layers: of one frame, each float32 [X, Y, K], rectified and finite, channels last; K is the
+            same for all, X and Y need not be.
+        steps: quantisation step q > 0 of each layer, in units of its activations.
+        count: N, per layer; fewer are returned where a layer has fewer.
 
     Returns:
-        At most ``count`` regions; none for a blank frame.
+        At most N regions a layer; none for a blank frame.
 
     Raises:
-        ValueError: ``step`` or ``count`` is not positive, or the array is not 3-D.
+        ValueError: a step or ``count`` is not positive, an array is not 3-D, or K differs.
     """
-    if not step > 0 or count < 1 or activations.ndim != 3:
-        raise ValueError(f"step {step}, count {count} and shape {activations.shape} must be positive and 3-D")
-    grid = np.ascontiguousarray(activations, np.float32)
-    boxes, energies, channels = _strongest(grid, np.float32(step), count)
+    if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
+        raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
+    if len({layer.shape[2] for layer in layers}) != 1:
+        raise ValueError("the layers that are fused have the same number of channels")
+    grids = [np.ascontiguousarray(layer, np.float32) for layer in layers]
+    found = [
+        _strongest(grid, *_foreground(grid, np.float32(step)), count) for grid, step in zip(grids, steps, strict=True)
+    ]
+    features = np.empty((sum(len(boxes) for boxes, _, _ in found), layers[0].shape[2]), np.float32)
+    start = 0
+    for grid, (boxes, _, _) in zip(grids, found, strict=True):
+        _workspace.fit(grid.shape)
+        _box_sums(grid, boxes, _workspace.table, features[start : start + len(boxes)])
+        start += len(boxes)
     return Regions(
-        boxes=boxes,
-        energies=energies.astype(np.float32),
-        channels=channels,
-        layers=np.full(len(boxes), layer, np.int32),
-        features=_box_sums(grid, boxes),
-    )
-
-
-def fuse(regions: Sequence[Regions]) -> Regions:
-    """The regions of several layers of equal K as one set, T x K (eqs. 4.4, 4.5)."""
-    return Regions(
-        *(
-            np.concatenate([getattr(part, field) for part in regions])
-            for field in ("boxes", "energies", "channels", "layers", "features")
-        )
+        boxes=np.concatenate([boxes for boxes, _, _ in found]),
+        energies=np.concatenate([energies for _, energies, _ in found]).astype(np.float32),
+        channels=np.concatenate([channels for _, _, channels in found]),
+        layers=np.repeat(np.arange(len(found), dtype=np.int32), [len(boxes) for boxes, _, _ in found]),
+        features=features,
     )
 
 

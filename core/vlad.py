@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,10 +34,17 @@ def assign(features: Array, centers: Array) -> NDArray[np.int64]:
 
 def residuals(features: Array, centers: Array) -> Array:
     """v_u = Σ (f - o_u) over the features assigned to u (eqs. 3.8, 4.8); float32 [V, K]."""
-    words = assign(features, centers)
-    members = np.zeros((len(centers), len(features)), np.float32)
-    members[words, np.arange(len(features))] = 1
-    return members @ features - members.sum(axis=1, keepdims=True) * centers
+    return _summed(features, centers, assign(features, centers))
+
+
+@numba.njit(cache=True, nogil=True)
+def _summed(features, centers, words):  # type: ignore[no-untyped-def]
+    vectors = np.zeros_like(centers)
+    for t in range(len(features)):
+        u = words[t]
+        for k in range(features.shape[1]):
+            vectors[u, k] += features[t, k] - centers[u, k]
+    return vectors
 
 
 def power(vectors: Array, gamma: float) -> Array:

@@ -14,7 +14,7 @@ def test_both_find_the_same_regions(count: int) -> None:
     random = np.random.default_rng(count)
     activations = np.maximum(0, random.normal(0.3, 1.0, (9, 7, 12))).astype(np.float32)  # X x Y x K
 
-    ours = extract_regions(activations, 0.5, count)
+    ours = extract_regions([activations], [0.5], count)
     boxes, energies, features = reference_regions(activations.transpose(2, 0, 1), 0.5, count)
 
     assert len(ours) == len(boxes) > 0

@@ -14,7 +14,7 @@ from core.encoders import EncoderCatalogue
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.network import ShallowNetwork, caffenet_definition
 from core.preprocessing import InputDefinition
-from core.regions import extract_regions, fuse, unit_length
+from core.regions import extract_regions, unit_length
 from core.verdict import Calibration
 from core.vlad import aggregate
 from core.vocabulary import Vocabulary, pool_features, train_vocabulary
@@ -55,7 +55,7 @@ def test_the_stages_follow_one_another(encoder: Encoder) -> None:
     frame = random_frame(9)
     encoding = encoder.encode(frame)
     conv3, conv4 = encoder.extractor.activations([frame])[0]
-    regions = fuse([extract_regions(conv3, 0.05, 50, 0), extract_regions(conv4, 0.05, 50, 1)])
+    regions = extract_regions([conv3, conv4], (0.05, 0.05), 50)
     wanted = aggregate(unit_length(regions.features), encoder.centers, 0.5, "intra")
     np.testing.assert_array_equal(encoding.descriptor, wanted)
     assert len(encoding.regions) == 100

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from skimage import measure
 
-from core.regions import extract_regions, fuse, unit_length
+from core.regions import extract_regions, unit_length
 
 Array = NDArray[np.float32]
 
@@ -30,7 +30,7 @@ def obvious_regions(activations: Array, step: float, count: int) -> list[tuple[f
 
 
 def assert_same_regions(activations: Array, step: float, count: int) -> None:
-    made = extract_regions(activations, step, count)
+    made = extract_regions([activations], [step], count)
     wanted = obvious_regions(activations, step, count)
     assert len(made) == len(wanted)
     assert [tuple(box) for box in made.boxes.tolist()] == [box for _, _, box in wanted]
@@ -70,14 +70,14 @@ def test_agrees_on_maps_of_the_real_size(scale: float, count: int) -> None:
 def test_levels_beyond_any_histogram_are_told_apart(largest: float) -> None:
     activations = np.zeros((4, 4, 1), np.float32)
     activations[0, 0], activations[0, 1], activations[3, 3] = largest, largest * 0.5, largest
-    made = extract_regions(activations, 1.0, 10)
+    made = extract_regions([activations], [1.0], 10)
     assert made.boxes.tolist() == [[0, 0, 1, 1], [3, 3, 4, 4], [0, 1, 1, 2]]
 
 
 def test_diagonal_neighbours_are_one_region() -> None:
     activations = np.zeros((3, 3, 1), np.float32)
     activations[[0, 1, 2], [0, 1, 2], 0] = [1.2, 1.4, 1.6]
-    made = extract_regions(activations, 1.0, 5)
+    made = extract_regions([activations], [1.0], 5)
     assert made.boxes.tolist() == [[0, 0, 3, 3]]
     assert made.energies[0] == pytest.approx(1.4)
 
@@ -86,23 +86,23 @@ def test_a_feature_sums_over_the_box_and_over_all_channels() -> None:
     activations = np.zeros((3, 3, 2), np.float32)
     activations[[0, 1], [0, 1], 0] = 5
     activations[0, 1, 1] = 0.25  # inside the box, outside the region, below the first level
-    made = extract_regions(activations, 1.0, 5)
+    made = extract_regions([activations], [1.0], 5)
     assert made.features.tolist() == [[10.0, 0.25]]
 
 
 def test_a_blank_frame_has_no_region() -> None:
-    made = extract_regions(np.zeros((13, 13, 384), np.float32), 1.0, 300)
+    made = extract_regions([np.zeros((13, 13, 384), np.float32)], [1.0], 300)
     assert len(made) == 0
     assert made.features.shape == (0, 384)
 
 
 def test_a_single_cell() -> None:
-    assert extract_regions(np.full((1, 1, 1), 3.5, np.float32), 1.0, 300).boxes.tolist() == [[0, 0, 1, 1]]
+    assert extract_regions([np.full((1, 1, 1), 3.5, np.float32)], [1.0], 300).boxes.tolist() == [[0, 0, 1, 1]]
 
 
 def test_a_large_grid_with_one_region() -> None:
     activations = np.ones((200, 300, 2), np.float32)
-    made = extract_regions(activations, 1.0, 300)
+    made = extract_regions([activations], [1.0], 300)
     assert made.boxes.tolist() == [[0, 0, 200, 300]] * 2
     np.testing.assert_allclose(made.features, 60_000)
 
@@ -110,25 +110,29 @@ def test_a_large_grid_with_one_region() -> None:
 def test_negative_activations_are_background() -> None:
     activations = np.full((4, 4, 1), -7, np.float32)
     activations[2, 2] = 1
-    assert extract_regions(activations, 1.0, 9).boxes.tolist() == [[2, 2, 3, 3]]
+    assert extract_regions([activations], [1.0], 9).boxes.tolist() == [[2, 2, 3, 3]]
 
 
 @pytest.mark.parametrize(("step", "count"), [(0.0, 1), (-1.0, 1), (float("nan"), 1), (1.0, 0)])
 def test_senseless_parameters_are_refused(step: float, count: int) -> None:
     with pytest.raises(ValueError, match="positive"):
-        extract_regions(np.zeros((2, 2, 1), np.float32), step, count)
+        extract_regions([np.zeros((2, 2, 1), np.float32)], [step], count)
 
 
 def test_fusion_keeps_the_layers_apart() -> None:
     generator = np.random.default_rng(0)
     layers = [generator.random((size, size, 6)).astype(np.float32) * 9 for size in (13, 6)]
-    parts = [extract_regions(layer, 1.0, 20, index) for index, layer in enumerate(layers)]
-    fused = fuse(parts)
+    fused = extract_regions(layers, (1.0, 1.0), 20)
     assert len(fused) == 40
     assert fused.layers.tolist() == [0] * 20 + [1] * 20
-    np.testing.assert_array_equal(fused.features[20:], parts[1].features)
+    np.testing.assert_array_equal(fused.features[20:], extract_regions(layers[1:], (1.0,), 20).features)
 
 
 def test_unit_length_leaves_zero_rows_alone() -> None:
     made = unit_length(np.array([[3, 4], [0, 0]], np.float32))
     np.testing.assert_allclose(made, np.array([[0.6, 0.8], [0, 0]], np.float32), rtol=1e-6)
+
+
+def test_layers_of_other_channels_cannot_be_fused() -> None:
+    with pytest.raises(ValueError, match="channels"):
+        extract_regions([np.ones((2, 2, 3), np.float32), np.ones((2, 2, 4), np.float32)], (1.0, 1.0), 5)
