@@ -1,4 +1,4 @@
-"""A second encoder, made for the tests: coarse steps, so that a blank frame has no region, and few words."""
+"""A second encoder, made for the tests: few regions, few words, another normalization."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from core.encoder import Encoder, EncoderDefinition, FeatureDefinition, FeatureExtractor
+from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
 from core.network import load_network
 from core.verdict import Calibration
 from core.vocabulary import train_vocabulary
-from tests.service.scenes import blank, scene
+from tests.service.scenes import scene
 
 COARSE = "coarse"
 
@@ -23,13 +23,10 @@ def install_coarse_encoder(folder: Path) -> str:
     (network,) = (summary.network for summary in catalogue.describe() if summary.name == DEFAULT_ENCODER)
     layers = ("conv3", "conv4")
     backbone = load_network(catalogue.network_file(network), layers)
-    # A frame of one colour gives every layer some activation at its rim: the steps are above it.
-    plain = FeatureExtractor(backbone, FeatureDefinition(layers=layers, regions=1, steps=(1, 1), unit_features=True))
-    steps = tuple(1.05 * float(layer.max()) for layer in plain.activations([blank()])[0])
     definition = EncoderDefinition(
         layers=layers,
         regions=50,
-        steps=steps,
+        steps=(0.5, 0.5),
         unit_features=True,
         words=8,
         gamma=0.5,
