@@ -20,13 +20,17 @@ from service.measurement import medians, sample_picture
 LIMIT = 60.0
 
 
-def main(encoder: str = DEFAULT_ENCODER, rounds: Annotated[int, typer.Option(min=3)] = 9) -> None:
+def main(
+    encoder: str = DEFAULT_ENCODER,
+    step: Annotated[float | None, typer.Option(help="Quantisation step of every layer; else the encoder's.")] = None,
+    rounds: Annotated[int, typer.Option(min=3)] = 9,
+) -> None:
     """Compare results, then times."""
     extractor: FeatureExtractor = EncoderCatalogue().get(encoder).extractor
     definition = extractor.definition
     layers = extractor.activations([sample_picture()])[0]
     planes = [np.ascontiguousarray(layer.transpose(2, 0, 1)) for layer in layers]
-    steps = definition.steps
+    steps = definition.steps if step is None else (step,) * len(layers)
 
     def ours() -> object:
         return extract_regions(layers, steps, definition.regions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -38,7 +39,18 @@ def exchange(
                         count += connection.send(chunk)
                 else:
                     time.sleep(0.01)
+        connection.settimeout(max(0.1, until - time.monotonic()))
+        with suppress(ConnectionError):  # head and body may come in two pieces
+            while not complete(answer) and (piece := connection.recv(65536)):
+                answer += piece
         return answer, count
+
+
+def complete(answer: bytes) -> bool:
+    """Whether an answer has come to its end; an interim one (100) has no body."""
+    start, end, body = answer.partition(b"\r\n\r\n")
+    length = re.search(rb"(?i)\r\ncontent-length: *(\d+)", start)
+    return bool(end) and (length is None or len(body) >= int(length[1]))
 
 
 def head(path: str, *lines: str) -> bytes:

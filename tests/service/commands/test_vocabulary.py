@@ -68,6 +68,7 @@ def test_options_reach_the_definition_and_a_map_uses_it(
         "regions": 30,
         "steps": (0.1, 0.2),
         "unit_features": False,
+        "least_contrast": 2.0,
         "words": 4,
         "gamma": 0.7,
         "normalization": "global",
