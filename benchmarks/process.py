@@ -75,27 +75,34 @@ def _wait(client: httpx.Client, process: subprocess.Popen[bytes], began: float) 
     raise RuntimeError("the service did not become ready")
 
 
-def descriptors(encoder: Encoder, count: int, pictures: int = 60, seed: int = 0) -> Iterator[NDArray[np.float32]]:
-    """``count`` descriptors with the statistics of real ones.
+def descriptors(
+    encoder: Encoder, count: int, pictures: int = 60, seed: int = 0
+) -> Iterator[tuple[NDArray[np.float32], NDArray[np.int8]]]:
+    """``count`` descriptors, float32 [D], with the statistics of real ones, and local descriptors, int8 [C, L].
 
-    ``pictures`` are encoded; each further one takes the parts of its words from two of those at random.
+    ``pictures`` are encoded; each further one takes the parts of its words, and its cells, from two of those at
+    random.
     """
-    real = np.stack([encoder.encode(sample_picture(index)).descriptor for index in range(min(pictures, count))])
+    encodings = [encoder.encode(sample_picture(index)) for index in range(min(pictures, count))]
+    real = [(encoding.descriptor, encoding.local) for encoding in encodings]
     yield from real
     words, random = encoder.definition.words, np.random.default_rng(seed)
     for _ in range(count - len(real)):
         a, b = random.choice(len(real), 2, replace=False)
         from_a = random.random(words) < 0.5
-        yield np.where(from_a[:, None], real[a].reshape(words, -1), real[b].reshape(words, -1)).reshape(-1)
+        descriptor = np.where(from_a[:, None], real[a][0].reshape(words, -1), real[b][0].reshape(words, -1))
+        cells_from_a = random.random(encoder.local_shape[0]) < 0.5
+        yield descriptor.reshape(-1), np.where(cells_from_a[:, None], real[a][1], real[b][1])
 
 
 def fill_map(data_dir: Path, map_id: str, encoder: Encoder, places: int) -> None:
     """A map of so many places, written through the storage itself."""
     atlas = Atlas(data_dir)
-    made = atlas.create(map_id, encoder.identity, encoder.dimension, MapSettings(keep="none"))
+    settings = MapSettings(keep="none")
+    made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape)
     batch: list[Enrolment] = []
-    for index, descriptor in enumerate(descriptors(encoder, places)):
-        batch.append(_enrolment(index, descriptor))
+    for index, (descriptor, local) in enumerate(descriptors(encoder, places)):
+        batch.append(_enrolment(index, descriptor, local))
         if len(batch) == BATCH:
             made.enrol(batch)
             batch = []
@@ -104,11 +111,12 @@ def fill_map(data_dir: Path, map_id: str, encoder: Encoder, places: int) -> None
     atlas.close()
 
 
-def _enrolment(index: int, descriptor: NDArray[np.float32]) -> Enrolment:
+def _enrolment(index: int, descriptor: NDArray[np.float32], local: NDArray[np.int8]) -> Enrolment:
     return Enrolment(
         id=f"p{index:05d}",
         fields=PlaceFields(sequence="benchmark"),
         descriptor=descriptor,
+        local=local,
         regions=600,
         digest=hashlib.sha256(str(index).encode()).digest(),
         thumbnail=None,

@@ -28,7 +28,8 @@ def main(
     """Compare results, then times."""
     extractor: FeatureExtractor = EncoderCatalogue().get(encoder).extractor
     definition = extractor.definition
-    layers = extractor.activations([sample_picture()])[0]
+    # What the encoder's second stage alone compares stands behind the layers that regions come from.
+    layers = extractor.activations([sample_picture()])[0][: len(definition.layers)]
     planes = [np.ascontiguousarray(layer.transpose(2, 0, 1)) for layer in layers]
     steps = definition.steps if step is None else (step,) * len(layers)
 

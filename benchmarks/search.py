@@ -1,6 +1,6 @@
-"""How long one query takes against a map: our snapshot, one plain FAISS index, and NumPy.
+"""How long one query takes against a map, before any second stage: our snapshot, one plain FAISS index, and NumPy.
 
-    python -m benchmarks.search [--places 100 1622 5000] [--dimension 49152] [--rounds 30] [--json OUT.json]
+    python -m benchmarks.search [--places 100 1622 5000] [--dimension 16384] [--rounds 30] [--json OUT.json]
 
 The three are measured in turns, so that whatever else the machine does falls on all of them alike;
 what is shown are medians, and in the JSON the quartiles too.  All three answer with every place,
@@ -87,7 +87,7 @@ def measure(runners: dict[str, Callable[[Array], object]], queries: Array, round
 def main() -> None:
     parser = argparse.ArgumentParser(description="Time one query against a map.")
     parser.add_argument("--places", type=int, nargs="+", default=[100, 1622, 5000])
-    parser.add_argument("--dimension", type=int, default=49152)
+    parser.add_argument("--dimension", type=int, default=16384)
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--json", type=Path)
     arguments = parser.parse_args()

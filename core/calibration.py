@@ -17,7 +17,7 @@ from core.verdict import Calibration, Judgement, Neighborhood, Whereabouts, judg
 
 Scores = NDArray[np.float32]
 
-FALSE_ACCEPTS = 0.15
+FALSE_ACCEPTS = 0.10
 """The threshold lets at most this share of unknown places through."""
 
 LOST_BY_MARGIN = 0.02

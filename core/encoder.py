@@ -1,22 +1,25 @@
-"""From a frame to its descriptor: backbone, regions, fusion, VLAD (thesis, Figure 4.1)."""
+"""From a frame to its descriptors: backbone, regions, fusion, VLAD (thesis, Figure 4.1); cells for the second stage."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.agreement import AgreementDefinition, Cells, agreement, local_descriptors
 from core.backbone import Backbone
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.identity import json_digest, tensors_digest
 from core.matching import scores
 from core.preprocessing import Pixels, contrast, prepare
-from core.regions import Regions, extract_regions, unit_length
+from core.projection import Projection
+from core.regions import Regions, box_sums, extract_regions, unit_length
 from core.threads import keep_numpy_single_threaded
 from core.verdict import Calibration
 from core.vlad import Normalization, aggregate
@@ -33,6 +36,7 @@ class FeatureDefinition(BaseModel):
 
     ``steps`` are the quantisation steps, one a layer, in units of its activations.
     ``unit_features`` scales each regional feature to unit length before anything else.
+    ``projection`` is to how many values regional features are projected (``projection.py``); None: not at all.
     ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
     network through its biases alone, and what looks like regions says nothing of the scene.
     """
@@ -43,21 +47,48 @@ class FeatureDefinition(BaseModel):
     regions: int = Field(ge=1, le=10_000, description="N, per layer")
     steps: tuple[float, ...]
     unit_features: bool
+    projection: int | None = Field(default=None, ge=1)
     least_contrast: float = Field(default=2.0, ge=0, le=255, allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _one_step_a_layer(self) -> FeatureDefinition:
         if len(self.steps) != len(self.layers) or not all(0 < step < float("inf") for step in self.steps):
             raise ValueError("each layer needs one positive quantisation step")
+        if self.projection is not None and not self.unit_features:
+            raise ValueError("projected features are of unit length")
         return self
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The layers that the backbone must return: first those whose regions are fused."""
+        return self.layers
+
+    def projected(self) -> dict[str, int]:
+        """How many values of each layer's projection are in use."""
+        return {} if self.projection is None else dict.fromkeys(self.layers, self.projection)
 
 
 class EncoderDefinition(FeatureDefinition):
-    """All choices of an encoder besides its backbone and its vocabulary's values."""
+    """All choices of an encoder besides its backbone and the values of its projections and its vocabulary."""
 
     words: int = Field(ge=1, le=65_536, description="V")
     gamma: float = Field(gt=0, le=1)
     normalization: Normalization
+    agreement: AgreementDefinition | None = Field(default=None, description="The second stage; null: none.")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The layers that the backbone must return: those whose regions are fused, then those only compared."""
+        further = () if self.agreement is None else self.agreement.layers
+        return self.layers + tuple(layer for layer in further if layer not in self.layers)
+
+    def projected(self) -> dict[str, int]:
+        """How many values of each layer's projection are in use."""
+        used = super().projected()
+        if self.agreement is not None:
+            for layer in self.agreement.layers:
+                used[layer] = max(used.get(layer, 0), self.agreement.values)
+        return used
 
 
 @dataclass(frozen=True)
@@ -65,10 +96,13 @@ class Encoding:
     """What a frame becomes.
 
     descriptor: float32 [D]; zeros where the frame has no region.
-    milliseconds: of the stages ``forward``, ``regions`` and ``vlad``.
+    local: int8 [C, L], local descriptors of the C cells for the second stage, zeros where the frame has no region;
+        [0, 0] without one.
+    milliseconds: of the stages ``forward``, ``regions`` and ``vlad``; the last includes the local descriptors.
     """
 
     descriptor: Array
+    local: Cells
     regions: Regions
     milliseconds: dict[str, float]
 
@@ -76,27 +110,36 @@ class Encoding:
 class FeatureExtractor:
     """Frames to regions of interest with their features, T x K.
 
+    Args:
+        projections: by layer; as many as the definition asks for.
+
     Raises:
-        InvalidModel: the backbone does not return the layers of the definition.
+        InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or short.
     """
 
-    def __init__(self, backbone: Backbone, definition: FeatureDefinition) -> None:
-        if backbone.outputs != definition.layers:
-            raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.layers}.")
+    def __init__(
+        self, backbone: Backbone, definition: FeatureDefinition, projections: Mapping[str, Projection] | None = None
+    ) -> None:
+        if backbone.outputs != definition.outputs:
+            raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
         keep_numpy_single_threaded()
         self.backbone, self.definition = backbone, definition
-        fields = FeatureDefinition.model_fields
-        self.origin = json_digest(
-            {
-                "network": backbone.describe(),
-                "weights": tensors_digest(backbone.weights()),
-                "features": definition.model_dump(mode="json", include=set(fields)),
-            }
-        )
+        self.projections = dict(projections or {})
+        for layer, values in definition.projected().items():
+            if layer not in self.projections or self.projections[layer].matrix.shape[1] < values:
+                raise InvalidModel(f"the encoder needs a projection of {layer} to {values} values.")
+        parts: dict[str, Any] = {
+            "network": backbone.describe(),
+            "weights": tensors_digest(backbone.weights()),
+            "features": _content(definition, set(FeatureDefinition.model_fields)),
+        }
+        if definition.projected():
+            parts["projections"] = tensors_digest(projection_tensors(self.projections))
+        self.origin = json_digest(parts)
         """Identity of the features: what a vocabulary must have been trained on."""
 
     def activations(self, frames: Sequence[Pixels]) -> list[list[Array]]:
-        """For each frame the rectified maps of each layer, float32 [X, Y, K]; zeros for a blank frame."""
+        """For each frame the rectified maps of each output, float32 [X, Y, K]; zeros for a blank frame."""
         batch = np.stack([prepare(frame, self.backbone.input) for frame in frames])  # B x H x W x 3
         with torch.inference_mode():
             outputs = self.backbone(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
@@ -107,24 +150,63 @@ class FeatureExtractor:
                     layer[index] = 0
         return [[layer[index] for layer in maps] for index in range(len(frames))]
 
-    def regions(self, activations: Sequence[Array]) -> Regions:
-        """The regions of all layers of one frame, fused (eqs. 4.4, 4.5)."""
+    def products(self, activations: Sequence[Array]) -> dict[str, Array]:
+        """Of each projected layer what its projection makes of its cells; float32 [C, d] by layer."""
+        maps = zip(self.definition.outputs, activations, strict=True)
+        used = self.definition.projected()
+        return {name: self.projections[name].products(_cells(layer)) for name, layer in maps if name in used}
+
+    def regions(self, activations: Sequence[Array], products: Mapping[str, Array] | None = None) -> Regions:
+        """The regions of all layers of one frame, fused (eqs. 4.4, 4.5).
+
+        Args:
+            products: as :meth:`products` gives them, if they are known.
+        """
         definition = self.definition
-        found = extract_regions(activations, definition.steps, definition.regions)
-        if not definition.unit_features:
+        fused = activations[: len(definition.layers)]
+        found = extract_regions(fused, definition.steps, definition.regions)
+        if definition.projection is not None:
+            features = self._projected(found, fused, products or self.products(activations), definition.projection)
+        elif definition.unit_features:
+            features = unit_length(found.features)
+        else:
             return found
-        return Regions(found.boxes, found.energies, found.channels, found.layers, unit_length(found.features))
+        return Regions(found.boxes, found.energies, found.channels, found.layers, features)
+
+    def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
+        """The regional features projected, float32 [T, values]: a projection of sums is a sum of projections."""
+        lengths = np.sqrt(np.einsum("tk,tk->t", found.features, found.features))
+        ends = np.searchsorted(found.layers, np.arange(len(fused) + 1))  # regions come layer by layer
+        parts = []
+        for name, layer, start, stop in zip(self.definition.layers, fused, ends, ends[1:], strict=False):
+            grid = products[name].reshape(*layer.shape[:2], -1)
+            sums = box_sums(grid, found.boxes[start:stop])
+            parts.append(self.projections[name].finish(sums, lengths[start:stop], values))
+        return np.concatenate(parts)
+
+    def projected_cells(
+        self, activations: Sequence[Array], products: Mapping[str, Array], layers: Sequence[str], values: int
+    ) -> list[Array]:
+        """The projected local descriptors D^L of some layers of one frame, float32 [C, values] each."""
+        maps = dict(zip(self.definition.outputs, activations, strict=True))
+        made = []
+        for name in layers:
+            cells = _cells(maps[name])
+            lengths = np.sqrt(np.einsum("ck,ck->c", cells, cells))
+            made.append(self.projections[name].finish(products[name], lengths, values))
+        return made
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
         """Cells (rows, columns) of each layer's maps at the network's input size."""
         shown = self.backbone.input
         blank = np.zeros((shown.height, shown.width, 3), np.uint8)
         maps = self.activations([blank])[0]
-        return {name: layer.shape[:2] for name, layer in zip(self.definition.layers, maps, strict=True)}
+        return {name: layer.shape[:2] for name, layer in zip(self.definition.outputs, maps, strict=True)}
 
 
 class Encoder:
-    """M-Region-VLAD, or Region-VLAD with one layer: a frame to one vector of V·K values.
+    """M-Region-VLAD, or Region-VLAD with one layer: a frame to one vector of V·K values, K of a projected feature
+    if features are projected, and to the local descriptors of its cells if there is a second stage.
 
     Thread-safe: encoding changes nothing.
 
@@ -133,11 +215,13 @@ class Encoder:
         extractor: backbone and regions.
         vocabulary: trained on the features of just this extractor.
         calibration: the default that a map uses until it has its own.
-        golden: float [D], the canary frame's descriptor where the encoder was made.
+        golden: what the canary frame gave where the encoder was made: float [D], its descriptor, and
+            int8 [C, L], its local descriptors.
 
     Raises:
         WrongVocabulary: the vocabulary was trained for another extractor.
-        InvalidModel: it has another number of words than the definition says.
+        InvalidModel: it has another number of words than the definition says, or the layers of the
+            second stage have different grids.
     """
 
     def __init__(
@@ -147,7 +231,7 @@ class Encoder:
         definition: EncoderDefinition,
         vocabulary: Vocabulary,
         calibration: Calibration,
-        golden: Array | None = None,
+        golden: tuple[Array, Cells] | None = None,
     ) -> None:
         if vocabulary.origin != extractor.origin:
             raise WrongVocabulary(
@@ -161,6 +245,36 @@ class Encoder:
         self.calibration, self._golden = calibration, golden
         self.dimension = int(self.centers.size)
         self.identity = encoder_identity(name, definition, vocabulary)
+        self.grid = self._agreement_grid()
+        """Rows and columns of the cells that the second stage compares; (0, 0) without one."""
+
+    def _agreement_grid(self) -> tuple[int, int]:
+        if self.definition.agreement is None:
+            return 0, 0
+        grids = self.layer_grids()
+        found = {grids[layer] for layer in self.definition.agreement.layers}
+        if len(found) != 1:
+            raise InvalidModel(f"{self.name}: the layers of its second stage have different grids, {sorted(found)}.")
+        return found.pop()
+
+    @property
+    def local_shape(self) -> tuple[int, int]:
+        """C and L, cells of a frame and values of each that the second stage compares; (0, 0) without one."""
+        stage = self.definition.agreement
+        return (0, 0) if stage is None else (self.grid[0] * self.grid[1], stage.length)
+
+    @property
+    def candidates(self) -> int:
+        """How many of the best matches the second stage examines."""
+        stage = self.definition.agreement
+        return 0 if stage is None else stage.candidates
+
+    def agreement(self, query: Cells, candidates: Cells) -> Array:
+        """What the second stage adds to the candidates' scores, at least 0; int8 [C, L], [k, C, L] to float32 [k]."""
+        stage = self.definition.agreement
+        if stage is None:
+            return np.zeros(len(candidates), np.float32)
+        return agreement(query, candidates, self.grid[1], stage)
 
     def encode(self, pixels: Pixels) -> Encoding:
         """Encode one frame, H x W x 3 uint8 BGR of any size."""
@@ -173,28 +287,56 @@ class Encoder:
         started = time.perf_counter()
         activations = self.extractor.activations(frames)
         forward = 1e3 * (time.perf_counter() - started) / len(frames)
-        return [self._describe(layers, forward) for layers in activations]
+        return [self.describe(layers, forward) for layers in activations]
 
-    def _describe(self, activations: Sequence[Array], forward: float) -> Encoding:
+    def describe(self, activations: Sequence[Array], forward: float = 0.0) -> Encoding:
+        """Encode a frame whose activations are known, as ``extractor.activations`` gives them; ``forward`` in ms."""
         definition = self.definition
         began = time.perf_counter()
-        regions = self.extractor.regions(activations)
+        products = self.extractor.products(activations)
+        regions = self.extractor.regions(activations, products)
         between = time.perf_counter()
         descriptor = aggregate(regions.features, self.centers, definition.gamma, definition.normalization)
+        local = self._local(activations, products, len(regions) == 0)
         ended = time.perf_counter()
         times = {"forward": forward, "regions": 1e3 * (between - began), "vlad": 1e3 * (ended - between)}
-        return Encoding(descriptor, regions, times)
+        return Encoding(descriptor, local, regions, times)
+
+    def _local(self, activations: Sequence[Array], products: Mapping[str, Array], blank: bool) -> Cells:
+        stage = self.definition.agreement
+        if stage is None or blank:  # whatever a frame without regions excites, it is like no other
+            return np.zeros(self.local_shape, np.int8)
+        cells = self.extractor.projected_cells(activations, products, stage.layers, stage.values)
+        return local_descriptors(cells, stage)
 
     def scores_from_inner_products(self, inner_products: Array) -> Array:
-        """Inner products of descriptors, any shape, as the scores that users see."""
-        return scores(inner_products, self.definition.words, self.definition.normalization)
+        """Inner products of descriptors, any shape, as the scores that users see: of places not examined further."""
+        first = scores(inner_products, self.definition.words, self.definition.normalization)
+        stage = self.definition.agreement
+        return first if stage is None else first * np.float32(1 - stage.share)
 
-    def score(self, a: Array, b: Array) -> float:
-        """The score of two descriptors, float32 [D]: J / V (eq. 4.13) or the inner product."""
-        return float(self.scores_from_inner_products(np.array(a @ b, np.float32)))
+    def score(self, a: Encoding, b: Encoding) -> float:
+        """The score of two frames: J / V (eq. 4.13) or the inner product, shared with their agreement if it counts."""
+        product = np.array(a.descriptor @ b.descriptor, np.float32)
+        return float(self.scores_from_inner_products(product) + self.agreement(a.local, b.local[np.newaxis])[0])
+
+    def with_agreement(self, scores: Array, query: Cells, references: Cells) -> Array:
+        """The scores of one query after the second stage: those of the best ``candidates`` have gained.
+
+        Args:
+            scores: float32 [R], in any order.
+            query: int8 [C, L], its local descriptors.
+            references: int8 [R, C, L], in the order of ``scores``.
+        """
+        if not self.candidates:
+            return scores
+        best = np.argsort(-scores, kind="stable")[: self.candidates]
+        raised = scores.copy()
+        raised[best] += self.agreement(query, references[best])
+        return raised
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
-        """Cells (rows, columns) of each fused layer's maps."""
+        """Cells (rows, columns) of the maps of each layer in use."""
         return self.extractor.layer_grids()
 
     def check_golden(self) -> None:
@@ -205,17 +347,47 @@ class Encoder:
         """
         if self._golden is None:
             raise GoldenMismatch(f"{self.name} has no golden values.")
-        made = self.encode(canary_frame()).descriptor
-        golden = self._golden.astype(np.float32)
-        cosine = float(made @ golden / max(1e-12, float(np.linalg.norm(made) * np.linalg.norm(golden))))
-        if not cosine >= GOLDEN_COSINE:
-            raise GoldenMismatch(f"{self.name} gives a cosine of {cosine:.4f} to its golden values on this machine.")
+        made = self.encode(canary_frame())
+        descriptor, local = self._golden
+        for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
+            if not cosine >= GOLDEN_COSINE:
+                raise GoldenMismatch(
+                    f"{self.name} gives a cosine of {cosine:.4f} to its golden values on this machine."
+                )
+        self.agreement(made.local, made.local[np.newaxis])  # compiled now, as all else is, and not by the first query
+
+
+def _cells(layer: Array) -> Array:
+    """Maps, float32 [X, Y, K], as C local descriptors, [C, K]."""
+    return layer.reshape(-1, layer.shape[2])
+
+
+def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
+    """Of two arrays of one shape, flattened; 1 where both are empty."""
+    if found.shape != golden.shape:
+        return 0.0
+    a, b = found.astype(np.float64).ravel(), golden.astype(np.float64).ravel()
+    return float(a @ b / max(1e-12, float(np.linalg.norm(a) * np.linalg.norm(b)))) if a.size else 1.0
+
+
+def _content(definition: BaseModel, fields: set[str] | None = None) -> dict[str, Any]:
+    """What a definition says; choices that came with later versions are left out where not made."""
+    return definition.model_dump(mode="json", include=fields, exclude_none=True)
+
+
+def projection_tensors(projections: Mapping[str, Projection]) -> dict[str, torch.Tensor]:
+    """``<layer>.mean`` and ``<layer>.matrix`` of each."""
+    tensors: dict[str, torch.Tensor] = {}
+    for layer, projection in projections.items():
+        tensors[f"{layer}.mean"] = torch.from_numpy(projection.mean)
+        tensors[f"{layer}.matrix"] = torch.from_numpy(projection.matrix)
+    return tensors
 
 
 def encoder_identity(name: str, definition: EncoderDefinition, vocabulary: Vocabulary) -> str:
     """``<name>@<sha256>`` over every field that can change a descriptor, tensors by content."""
     centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
-    fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": definition.model_dump(mode="json")}
+    fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": _content(definition)}
     return f"{name}@{json_digest(fields)}"
 
 

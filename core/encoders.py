@@ -1,6 +1,6 @@
 """The encoders installed on a machine: those packaged here and those of the user's directory.
 
-An encoder is one file ``<name>.encoder.safetensors`` (vocabulary, golden descriptor, definition,
+An encoder is one file ``<name>.encoder.safetensors`` (vocabulary, projections, golden values, definition,
 calibration) that names a network file ``<network>.network.safetensors`` beside it or among the
 packaged ones.
 """
@@ -11,24 +11,28 @@ import json
 import os
 import re
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame
+from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame, projection_tensors
 from core.errors import InvalidModel, UnknownEncoder
 from core.identity import canonical_json
 from core.network import NAME, load_network
+from core.projection import Projection
 from core.verdict import Calibration
 from core.vocabulary import Vocabulary
 
 DEFAULT_ENCODER = "m-region-vlad"
 PACKAGED = Path(__file__).parent / "models"
 FORMAT = "placerec-encoder/1"
+PROJECTION = "projection."
 ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
 
 
@@ -38,6 +42,7 @@ class EncoderSummary(BaseModel):
     name: str
     identity: str
     dimension: int
+    local_shape: tuple[int, int] = Field(description="Cells and values of each that the second stage compares.")
     default: bool
     source: Literal["packaged", "installed"]
     network: str
@@ -58,6 +63,7 @@ class _Header(BaseModel):
     calibration: Calibration
     training: dict[str, Any]
     dimension: int
+    local_shape: tuple[int, int] = (0, 0)
 
 
 def save_encoder(
@@ -87,15 +93,19 @@ def save_encoder(
         calibration=encoder.calibration,
         training=training,
         dimension=encoder.dimension,
+        local_shape=encoder.local_shape,
     )
-    golden = encoder.encode(canary_frame()).descriptor.astype(np.float16)
+    canary = encoder.encode(canary_frame())
+    tensors: dict[str, NDArray[Any]] = {
+        "centers": vocabulary.centers,
+        "golden": canary.descriptor.astype(np.float16),
+        "golden_local": canary.local,
+    }
+    for name, tensor in projection_tensors(encoder.extractor.projections).items():
+        tensors[f"{PROJECTION}{name}"] = tensor.numpy()
     path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
     partial = path.with_name(path.name + ".tmp")
-    save_file(
-        {"centers": vocabulary.centers, "golden": golden},
-        partial,
-        {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))},
-    )
+    save_file(tensors, partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
     partial.chmod(0o644)
     os.replace(partial, path)
     return path
@@ -125,15 +135,30 @@ def load_encoder(path: Path, network: Path) -> Encoder:
     header = _read_header(path)
     try:
         with safe_open(path, "np") as file:
-            centers, golden = file.get_tensor("centers"), file.get_tensor("golden")
-    except (OSError, SafetensorError) as error:
+            tensors = {name: np.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+        centers, golden = tensors["centers"].astype(np.float32), tensors["golden"]
+    except (OSError, SafetensorError, KeyError) as error:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
-    vocabulary = Vocabulary(np.asarray(centers, np.float32), header.origin)
-    extractor = FeatureExtractor(load_network(network, header.definition.layers), header.definition)
-    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, golden)
+    vocabulary = Vocabulary(centers, header.origin)
+    backbone = load_network(network, header.definition.outputs)
+    extractor = FeatureExtractor(backbone, header.definition, _read_projections(path, tensors))
+    canary = (golden, tensors.get("golden_local", np.zeros((0, 0), np.int8)))
+    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, canary)
     if encoder.identity != header.identity:
         raise InvalidModel(f"{path.name} says it is {header.identity}, its contents are {encoder.identity}.")
     return encoder
+
+
+def _read_projections(path: Path, tensors: Mapping[str, NDArray[np.generic]]) -> dict[str, Projection]:
+    parts = {name.removeprefix(PROJECTION): tensor for name, tensor in tensors.items() if name.startswith(PROJECTION)}
+    projections = {}
+    for layer in sorted({name.rpartition(".")[0] for name in parts}):
+        mean, matrix = parts.get(f"{layer}.mean"), parts.get(f"{layer}.matrix")
+        fits = mean is not None and matrix is not None and matrix.ndim == 2 and mean.shape == matrix.shape[:1]
+        if mean is None or matrix is None or not fits or not (np.isfinite(mean).all() and np.isfinite(matrix).all()):
+            raise InvalidModel(f"{path.name}: its projection of {layer} is not a finite mean and matrix.")
+        projections[layer] = Projection(mean.astype(np.float32), matrix.astype(np.float32))
+    return projections
 
 
 class EncoderCatalogue:
@@ -181,6 +206,7 @@ class EncoderCatalogue:
             blank: dict[str, Any] = {
                 "identity": "",
                 "dimension": 0,
+                "local_shape": (0, 0),
                 "network": "",
                 "definition": None,
                 "calibration": None,

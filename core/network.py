@@ -95,17 +95,18 @@ class NetworkDefinition(BaseModel):
         return tuple(layer for layer in self.layers if isinstance(layer, Convolution))
 
     def truncated(self, names: Iterable[str]) -> NetworkDefinition:
-        """This network cut after the deepest of the convolutions ``names`` and its rectifier.
+        """This network cut after the deepest of the convolutions (and its rectifier) or poolings ``names``.
 
         Raises:
-            InvalidModel: a name is not that of a convolution of this network.
+            InvalidModel: a name is not that of a convolution or pooling of this network.
         """
         wanted = set(names)
-        missing = wanted - {layer.name for layer in self.convolutions()}
+        offered = [layer.name for layer in self.layers if isinstance(layer, Convolution | Pooling)]
+        missing = wanted - set(offered)
         if missing or not wanted:
             raise InvalidModel(
-                f"network {self.name!r} has no convolution named {', '.join(sorted(missing)) or '(none given)'}; "
-                f"it has {', '.join(layer.name for layer in self.convolutions())}"
+                f"network {self.name!r} has no convolution or pooling named "
+                f"{', '.join(sorted(missing)) or '(none given)'}; it has {', '.join(offered)}"
             )
         last = max(i for i, layer in enumerate(self.layers) if layer.name in wanted)
         if last + 1 < len(self.layers) and isinstance(self.layers[last + 1], Relu):
@@ -181,14 +182,14 @@ def build_layer(layer: Layer, channels: int) -> nn.Module:
 
 
 class ShallowNetwork(nn.Module):
-    """A sequential network whose rectified convolution outputs can be read by name.
+    """A sequential network whose rectified convolutions and poolings can be read by name.
 
     Args:
         definition: the layers; cut it with :meth:`NetworkDefinition.truncated` first.
-        outputs: the convolutions to return, in the order wanted.
+        outputs: the convolutions and poolings to return, in the order wanted.
 
     Raises:
-        InvalidModel: an output is not a convolution of the definition.
+        InvalidModel: an output is not a convolution or pooling of the definition.
     """
 
     def __init__(self, definition: NetworkDefinition, outputs: Iterable[str]) -> None:
@@ -205,7 +206,7 @@ class ShallowNetwork(nn.Module):
             raise InvalidModel(f"layer {layer.name} of {self.definition.name!r} cannot be built: {error}") from error
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:  # B x 3 x H x W
-        """Activations of the named convolutions after their rectifier, each B x K x X x Y."""
+        """Activations of the named convolutions after their rectifier, and of the poolings, each B x K x X x Y."""
         found: dict[str, Tensor] = {}
         x, open_name = images, ""
         for layer in self.definition.layers:
@@ -214,6 +215,8 @@ class ShallowNetwork(nn.Module):
             x = self.stages[layer.name](x)
             if isinstance(layer, Convolution):
                 open_name = layer.name
+            elif isinstance(layer, Pooling) and layer.name in self.outputs:
+                found[layer.name] = x
         if open_name:
             found[open_name] = x
         return tuple(found[name] for name in self.outputs)

@@ -24,6 +24,9 @@ Activations = NDArray[np.float32]
 HISTOGRAM_BINS = 4096
 """Levels of the histogram that prunes; all higher levels share its last bin."""
 
+TABLES = 8
+"""Summed-area tables that a thread keeps."""
+
 FIRST_GUESS = 2
 """Cells per wanted region in the first attempt to label few enough cells."""
 
@@ -180,17 +183,20 @@ def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
 
 
 class _Workspace(threading.local):
-    """The summed-area table that one thread's passes share: fresh pages would cost as much as the sums."""
+    """The summed-area tables that one thread's passes share: fresh pages would cost as much as the sums."""
 
-    shape: tuple[int, ...] = ()
+    def __init__(self) -> None:
+        self._tables: dict[tuple[int, ...], NDArray[np.float64]] = {}
 
-    def fit(self, shape: tuple[int, ...]) -> None:
-        """Have room for the table of activations of this shape."""
-        if shape != self.shape:
+    def table(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """The table for activations of this shape; an encoder has few."""
+        if shape not in self._tables:
+            if len(self._tables) >= TABLES:
+                self._tables.clear()
             height, width, channels = shape
             # The first row and column are never written: they stay zero.
-            self.table = np.zeros((height + 1, width + 1, channels), np.float64)
-            self.shape = shape
+            self._tables[shape] = np.zeros((height + 1, width + 1, channels), np.float64)
+        return self._tables[shape]
 
 
 _workspace = _Workspace()
@@ -222,8 +228,7 @@ def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count
     features = np.empty((sum(len(boxes) for boxes, _, _ in found), layers[0].shape[2]), np.float32)
     start = 0
     for grid, (boxes, _, _) in zip(grids, found, strict=True):
-        _workspace.fit(grid.shape)
-        _box_sums(grid, boxes, _workspace.table, features[start : start + len(boxes)])
+        _box_sums(grid, boxes, _workspace.table(grid.shape), features[start : start + len(boxes)])
         start += len(boxes)
     return Regions(
         boxes=np.concatenate([boxes for boxes, _, _ in found]),
@@ -232,6 +237,13 @@ def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count
         layers=np.repeat(np.arange(len(found), dtype=np.int32), [len(boxes) for boxes, _, _ in found]),
         features=features,
     )
+
+
+def box_sums(grid: Activations, boxes: NDArray[np.int32]) -> NDArray[np.float32]:
+    """The sum of a layer's local descriptors, float32 [X, Y, K], in each box, int32 [T, 4]; float32 [T, K]."""
+    sums = np.empty((len(boxes), grid.shape[2]), np.float32)
+    _box_sums(np.ascontiguousarray(grid, np.float32), boxes, _workspace.table(grid.shape), sums)
+    return sums
 
 
 def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:

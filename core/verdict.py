@@ -1,10 +1,13 @@
 """Recognized, ambiguous or unknown: what the scores of one query against a map amount to.
 
 The raw score J / V does not travel between maps and conditions, so it is judged against the rest
-of the map.  The decision value says by how many standard deviations the best score stands out of
-the best of the scores of places that cannot be the one shown.  A map of a few places says little
-about those, so it is filled up with imagined places that score as unrelated frames did when the
-encoder was made.
+of the map.  Of an encoder with one stage the decision value says by how many standard deviations
+the best score stands out of the best of the scores of places that cannot be the one shown.  The
+score of an encoder with a second stage (``agreement.py``) means more by itself: there the decision
+value is the geometric mean of the best score and of its lead over the best others that were examined
+too, for neither is enough alone: in a map whose places are all alike strangers score high as well, and
+where nothing is alike a small score leads.  A map of a few places says little about others, so it is
+filled up with imagined places that score as unrelated frames did when the encoder was made.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ TOP_PLACES = 5
 class Calibration(BaseModel):
     """When to believe a match; measured on frames held out of training.
 
-    ``threshold`` is on the decision value (standard deviations), ``margin`` on the difference of
+    ``threshold`` is on the decision value, ``margin`` on the difference of
     two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
     frames, in units of the score.
     """
@@ -103,8 +106,22 @@ class Judgement:
     """Position of the best rival in the ranking."""
 
 
+def filled_up(scores: NDArray[np.float32], fewest: int, calibration: Calibration) -> NDArray[np.float64]:
+    """At least ``fewest`` scores of other places, best first: the missing ones are those of imagined places.
+
+    Args:
+        scores: float32 [n], n >= 0, best first.
+    """
+    missing = fewest - len(scores)
+    if missing <= 0:
+        return scores.astype(np.float64)
+    quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / missing) for i in range(missing)])
+    imagined = calibration.background_mean + calibration.background_deviation * quantiles
+    return np.sort(np.concatenate([scores, imagined]))[::-1]
+
+
 def standing_out(best: float, rest: NDArray[np.float32], calibration: Calibration) -> float:
-    """The decision value: (best - mean of the top of the rest) / standard deviation of the rest.
+    """The decision value of one stage: (best - mean of the top of the rest) / standard deviation of the rest.
 
     The best few of the rest grow with the number of places just as the best score of an unknown
     place does, so the value means the same on a small map and on a large one.
@@ -114,20 +131,30 @@ def standing_out(best: float, rest: NDArray[np.float32], calibration: Calibratio
         rest: float32 [n], n >= 0, best first: the scores of places that are not the best one's place.
         calibration: says how the imagined places score.
     """
-    scores = rest.astype(np.float64)
-    if len(scores) < FEWEST_PLACES:
-        missing = FEWEST_PLACES - len(scores)
-        quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / missing) for i in range(missing)])
-        imagined = calibration.background_mean + calibration.background_deviation * quantiles
-        scores = np.sort(np.concatenate([scores, imagined]))[::-1]
-    top = scores[:TOP_PLACES].mean()
+    scores = filled_up(rest, FEWEST_PLACES, calibration)
     # Equal scores throughout would make any difference infinite; the encoder's own spread bounds it.
     spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
-    return float((best - top) / spread)
+    return float((best - scores[:TOP_PLACES].mean()) / spread)
+
+
+def leading(best: float, rest: NDArray[np.float32], calibration: Calibration) -> float:
+    """The decision value after a second stage: √(best · (best - mean of the top of the rest)); 0 if negative.
+
+    Args:
+        best: the best score.
+        rest: float32 [n], n >= 0, best first: of the examined places that are not the best one's place.
+        calibration: says how the imagined places score.
+    """
+    scores = filled_up(rest, TOP_PLACES, calibration)
+    return float(np.sqrt(max(0.0, best) * max(0.0, best - scores[:TOP_PLACES].mean())))
 
 
 def judge(
-    scores: NDArray[np.float32], whereabouts: Whereabouts, calibration: Calibration, neighborhood: Neighborhood
+    scores: NDArray[np.float32],
+    whereabouts: Whereabouts,
+    calibration: Calibration,
+    neighborhood: Neighborhood,
+    examined: int = 0,
 ) -> Judgement:
     """The verdict on one query.
 
@@ -136,6 +163,7 @@ def judge(
         whereabouts: of the same n places in the same order.
         calibration: thresholds of the map or of the encoder.
         neighborhood: which places are no rivals of each other.
+        examined: how many of the first places the encoder's second stage has examined; 0: it has none.
 
     Returns:
         ``unknown`` for an empty map and for a decision value under the threshold, ``ambiguous``
@@ -145,7 +173,10 @@ def judge(
         return Judgement("unknown", None, None, None, None)
     best = float(scores[0])
     others = np.flatnonzero(~whereabouts.near(0, neighborhood))
-    decision = standing_out(best, scores[others], calibration)
+    if examined:
+        decision = leading(best, scores[others[others < examined]], calibration)
+    else:
+        decision = standing_out(best, scores[others], calibration)
     rival = int(others[0]) if len(others) else None
     margin = None if rival is None else best - float(scores[rival])
     verdict: Verdict = "recognized"

@@ -86,7 +86,7 @@ async def enrol(
 
 
 def _prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
-    """What to commit for one frame: descriptor, fields, and of the picture what the map keeps."""
+    """What to commit for one frame: descriptors, fields, and of the picture what the map keeps."""
     encoding, keep = encoded.encoding, map_.record.keep
     if len(encoding.regions) == 0:
         raise NoRegions("The frame has no region of interest: it is blank, or nearly so.")
@@ -95,6 +95,7 @@ def _prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, enc
         id=candidate.id,
         fields=candidate.fields,
         descriptor=encoding.descriptor,
+        local=encoding.local,
         regions=len(encoding.regions),
         digest=digest,
         thumbnail=thumbnail,

@@ -1,4 +1,4 @@
-"""From a query's descriptor to its answer: search, judge, look up; no HTTP."""
+"""From a query's encoding to its answer: search, examine the best, judge, look up; no HTTP."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from core.encoder import Encoder
+from core.agreement import Cells, reranked
+from core.encoder import Encoder, Encoding
 from core.places import Place
 from core.storage import Map, Ranking, Snapshot
 from core.verdict import Calibration, Judgement, Neighborhood, judge
@@ -23,7 +23,7 @@ class Located:
     """The answer to one query.
 
     matches: score and place, best first; at most k.
-    search: milliseconds of search, judgement and look-up.
+    search: milliseconds of search, second stage, judgement and look-up.
     """
 
     judgement: Judgement
@@ -32,12 +32,12 @@ class Located:
     search: float
 
 
-def locate(map_: Map, encoder: Encoder, descriptors: Sequence[NDArray[np.float32]], k: int) -> list[Located]:
+def locate(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int) -> list[Located]:
     """Search one snapshot of a map for several queries and judge each.
 
     Args:
         encoder: that of the map.
-        descriptors: float32 [D] each; at least one.
+        encodings: of the queries, made by it; at least one.
         k: how many matches to list.
 
     Raises:
@@ -45,37 +45,56 @@ def locate(map_: Map, encoder: Encoder, descriptors: Sequence[NDArray[np.float32
     """
     began = time.perf_counter()
     snapshot = map_.snapshot()
-    rankings = snapshot.search_batch(np.stack(descriptors))
-    share = 1e3 * (time.perf_counter() - began) / len(descriptors)
+    rankings = snapshot.search_batch(np.stack([encoding.descriptor for encoding in encodings]))
+    share = 1e3 * (time.perf_counter() - began) / len(encodings)
     located = []
-    for descriptor, ranking in zip(descriptors, rankings, strict=True):
+    for encoding, ranking in zip(encodings, rankings, strict=True):
         began = time.perf_counter()
         current, attempt = snapshot, 1
-        while (found := _judge(map_, encoder, current, ranking, k, settle=attempt == ATTEMPTS)) is None:
+        scored = examine(encoder, current, encoding.local, ranking)
+        while (found := _judge(map_, encoder, current, scored, k, settle=attempt == ATTEMPTS)) is None:
             current, attempt = map_.snapshot(), attempt + 1
-            ranking = current.search(descriptor)
+            scored = examine(encoder, current, encoding.local, current.search(encoding.descriptor))
         judgement, matches, calibration = found
         located.append(Located(judgement, matches, calibration, share + 1e3 * (time.perf_counter() - began)))
     return located
 
 
-def _judge(
-    map_: Map, encoder: Encoder, snapshot: Snapshot, ranking: Ranking, k: int, settle: bool
-) -> tuple[Judgement, list[tuple[float, Place]], Calibration] | None:
-    """Judge a ranking; None if a place was deleted since the snapshot, unless it is to settle for the others."""
-    record = map_.record
+def examine(encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking) -> Ranking:
+    """The second stage: the first ``encoder.candidates`` of a ranking gain by how far they agree with the query.
+
+    No gain is negative, so that the order among the first is all that can change.
+
+    Args:
+        local: of the query, int8 [C, L].
+        ranking: of the snapshot's search, rows int64 [n] and inner products float32 [n].
+
+    Returns:
+        The rows, best first, and their scores, float32 [n].
+    """
     rows, inner_products = ranking
+    scores = encoder.scores_from_inner_products(inner_products)
+    gains = encoder.agreement(local, snapshot.locals_at(rows[: encoder.candidates]))
+    order, scores = reranked(scores, gains)
+    return rows[order], scores
+
+
+def _judge(
+    map_: Map, encoder: Encoder, snapshot: Snapshot, scored: Ranking, k: int, settle: bool
+) -> tuple[Judgement, list[tuple[float, Place]], Calibration] | None:
+    """Judge what was found; None if a place was deleted since the snapshot, unless it is to settle for the others."""
+    record = map_.record
+    rows, scores = scored
     places = map_.places_at(rows[:k].tolist())
     if None in places:
         if not settle:
             return None
         kept = np.ones(len(rows), np.bool_)
         kept[: len(places)] = [place is not None for place in places]
-        rows, inner_products = rows[kept], inner_products[kept]
-    scores = encoder.scores_from_inner_products(inner_products)
+        rows, scores = rows[kept], scores[kept]
     calibration = record.calibration or encoder.calibration
     neighborhood = Neighborhood(record.same_place_radius, record.same_place_frames)
-    judgement = judge(scores, snapshot.whereabouts.take(rows), calibration, neighborhood)
+    judgement = judge(scores, snapshot.whereabouts.take(rows), calibration, neighborhood, encoder.candidates)
     present = [place for place in places if place is not None]
     matches = [(float(score), place) for score, place in zip(scores, present, strict=False)]
     return judgement, matches, calibration

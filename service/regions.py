@@ -22,8 +22,9 @@ COLOURS = ((60, 200, 255), (255, 140, 60), (120, 220, 90), (200, 90, 230))
 
 @lru_cache(maxsize=16)
 def layer_grids(encoder: Encoder) -> dict[str, tuple[int, int]]:
-    """Rows and columns of each layer of an encoder; found by a forward pass, once."""
-    return encoder.layer_grids()
+    """Rows and columns of each layer that regions come from; found by a forward pass, once."""
+    grids = encoder.layer_grids()
+    return {layer: grids[layer] for layer in encoder.definition.layers}
 
 
 def strongest(regions: Regions, limit: int | None) -> NDArray[np.int64]:

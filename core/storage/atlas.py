@@ -20,7 +20,7 @@ from pathlib import Path
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.places import check_map_id
 from core.storage.cursors import Listing, decode_name, encode_cursor
-from core.storage.descriptors import ROWS_PER_SEGMENT, Layout
+from core.storage.descriptors import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.disk import Damage, FolderLock, refusals, sync_file, sync_folder, write_file
 from core.storage.map import Map
 from core.storage.opening import create_folder, read_record
@@ -106,8 +106,18 @@ class Atlas:
             log.error("Map %s cannot be opened: %s", folder.name, refusal)
             self._refused[folder.name] = str(refusal)
 
-    def create(self, map_id: str, encoder_identity: str, dimension: int, settings: MapSettings | None = None) -> Map:
+    def create(
+        self,
+        map_id: str,
+        encoder_identity: str,
+        dimension: int,
+        settings: MapSettings | None = None,
+        local_shape: tuple[int, int] = NO_LOCAL,
+    ) -> Map:
         """Make an empty map, bound to an encoder for life; it is durable when this returns.
+
+        Args:
+            dimension, local_shape: of the encoder's descriptors, D and (C, L).
 
         Raises:
             InvalidIdentifier: the id does not have the form of one.
@@ -115,12 +125,14 @@ class Atlas:
             StorageFull, StorageFailure.
         """
         check_map_id(map_id)
-        Layout(dimension, encoder_identity, self._rows_per_segment)  # refuses an identity that has no room
+        Layout(dimension, encoder_identity, self._rows_per_segment, local_shape)  # refuses what no file can hold
         now = datetime.now(UTC)
         record = MapRecord(
             id=map_id,
             encoder=encoder_identity,
             dimension=dimension,
+            local_cells=local_shape[0],
+            local_values=local_shape[1],
             revision=1,
             created_at=now,
             updated_at=now,

@@ -1,8 +1,8 @@
 """FAISS files of full segments: caches, read instead of the descriptors when a map is opened.
 
-A cache is what ``faiss.write_index`` writes, readable by any FAISS, followed by a trailer that says
-of which descriptors it was made and that it is whole.  One that is missing, stale or damaged is
-made again from the descriptors.
+A cache is what ``faiss.write_index`` writes, readable by any FAISS, followed by the segment's local
+descriptors as they are and by a trailer that says of which descriptors all that was made and that it
+is whole.  One that is missing, stale or damaged is made again from the descriptors.
 """
 
 from __future__ import annotations
@@ -15,13 +15,18 @@ from contextlib import suppress
 from pathlib import Path
 
 import faiss
+import numpy as np
 
+from core.storage.descriptors import NO_LOCAL, Layout, Local
 from core.storage.disk import TEMPORARY, sync_file, sync_folder
 
 log = logging.getLogger(__name__)
 
-_TRAILER = struct.Struct("<8sIIII")  # magic, rows, dimension, checksum of the segment, CRC-32 of all before it
-_MAGIC = b"PLRCIDX\x01"
+# Magic, rows, dimension, with local descriptors their cells and values, and the checksum of the segment;
+# behind that the CRC-32 of all before it.
+_TRAILER, _LOCAL_TRAILER = struct.Struct("<8sIII"), struct.Struct("<8sIIIII")
+_MAGIC, _LOCAL_MAGIC = b"PLRCIDX\x01", b"PLRCIDX\x02"
+_CRC = struct.Struct("<I")
 _CHUNK_BYTES = 8 << 20
 
 
@@ -34,6 +39,13 @@ def cache_name(number: int) -> str:
     return f"index-{number + 1:06d}.faiss"
 
 
+def _trailer(rows: int, dimension: int, local_shape: tuple[int, int], checksum: int) -> bytes:
+    """The trailer of a whole cache, but for its last four bytes."""
+    if local_shape == NO_LOCAL:
+        return _TRAILER.pack(_MAGIC, rows, dimension, checksum)
+    return _LOCAL_TRAILER.pack(_LOCAL_MAGIC, rows, dimension, *local_shape, checksum)
+
+
 def _checksum(path: Path, size: int) -> int:
     running = 0
     with path.open("rb", buffering=0) as file:
@@ -43,11 +55,11 @@ def _checksum(path: Path, size: int) -> int:
     return running
 
 
-def check_cache(path: Path, rows: int, dimension: int, checksum: int) -> int:
+def check_cache(path: Path, layout: Layout, checksum: int) -> int:
     """Read a cache through without making an index of it.
 
     Args:
-        rows, dimension, checksum: of the segment as SQLite names it.
+        layout, checksum: of the full segment, as SQLite names it.
 
     Returns:
         Its size in bytes.
@@ -55,17 +67,17 @@ def check_cache(path: Path, rows: int, dimension: int, checksum: int) -> int:
     Raises:
         StaleCache: it is missing, damaged, or was made of other descriptors.
     """
+    wanted = _trailer(layout.rows_per_segment, layout.dimension, layout.local_shape, checksum)
     try:
         size = path.stat().st_size
         with path.open("rb") as file:
-            file.seek(max(0, size - _TRAILER.size))
-            trailer = file.read()
-        if len(trailer) != _TRAILER.size or trailer[:8] != _MAGIC:
+            file.seek(max(0, size - len(wanted) - _CRC.size))
+            found = file.read()
+        if len(found) != len(wanted) + _CRC.size or found[:8] != wanted[:8]:
             raise StaleCache("it is not whole")
-        _, found_rows, found_dimension, found_checksum, whole = _TRAILER.unpack(trailer)
-        if (found_rows, found_dimension, found_checksum) != (rows, dimension, checksum):
+        if found[: len(wanted)] != wanted:
             raise StaleCache("it was made of other descriptors")
-        if _checksum(path, size - 4) != whole:
+        if _CRC.pack(_checksum(path, size - _CRC.size)) != found[len(wanted) :]:
             raise StaleCache("it does not match its checksum")
     except FileNotFoundError as error:
         raise StaleCache("it is missing") from error
@@ -74,35 +86,50 @@ def check_cache(path: Path, rows: int, dimension: int, checksum: int) -> int:
     return size
 
 
-def load_cache(path: Path, rows: int, dimension: int, checksum: int) -> faiss.IndexFlatIP:
-    """The index of a full segment, from its cache.
+def load_cache(path: Path, layout: Layout, checksum: int) -> tuple[faiss.IndexFlatIP, Local]:
+    """The index of a full segment and its local descriptors, int8 [n, C, L], from its cache.
 
     Raises:
         StaleCache: it is missing, damaged, or was made of other descriptors.
     """
     # FAISS believes what a file says of its sizes, so nothing reaches it that was not checked.
-    check_cache(path, rows, dimension, checksum)
+    size = check_cache(path, layout, checksum)
+    rows, dimension, shape = layout.rows_per_segment, layout.dimension, layout.local_shape
     try:
         index = faiss.read_index(str(path))
+        local = _read_local(path, size, (rows, *shape))
     except RuntimeError as error:
         raise StaleCache("FAISS cannot read it") from error
+    except OSError as error:
+        raise StaleCache(f"it cannot be read: {error.strerror}") from error
     if not isinstance(index, faiss.IndexFlatIP) or (index.ntotal, index.d) != (rows, dimension):
         raise StaleCache("it holds another kind of index")
-    return index
+    return index, local
 
 
-def write_cache(path: Path, index: faiss.IndexFlatIP, checksum: int) -> None:
-    """Write the cache of a full segment; a failure is logged, for nothing depends on it."""
+def _read_local(path: Path, size: int, shape: tuple[int, int, int]) -> Local:
+    """The local descriptors of a checked cache of ``size`` bytes: the last thing before its trailer."""
+    count = shape[0] * shape[1] * shape[2]
+    behind = _CRC.size + (_LOCAL_TRAILER.size if count else _TRAILER.size)
+    return np.fromfile(path, np.int8, count, offset=size - behind - count).reshape(shape)
+
+
+def write_cache(path: Path, index: faiss.IndexFlatIP, local: Local, checksum: int) -> None:
+    """Write the cache of a full segment; a failure is logged, for nothing depends on it.
+
+    Args:
+        index, local: n descriptors, and int8 [n, C, L].
+        checksum: the segment's.
+    """
     temporary = path.with_name(path.name + TEMPORARY)
     try:
         faiss.write_index(index, str(temporary))
-        size = temporary.stat().st_size
-        fixed = _TRAILER.pack(_MAGIC, index.ntotal, index.d, checksum, 0)[:-4]
         with temporary.open("ab") as file:
-            file.write(fixed)
-        whole = _checksum(temporary, size + len(fixed))
+            file.write(np.ascontiguousarray(local).data)
+            file.write(_trailer(index.ntotal, index.d, local.shape[1:], checksum))
+        whole = _checksum(temporary, temporary.stat().st_size)
         with temporary.open("ab") as file:
-            file.write(struct.pack("<I", whole))
+            file.write(_CRC.pack(whole))
         sync_file(temporary)
         os.replace(temporary, path)
         sync_folder(path.parent)

@@ -3,10 +3,13 @@
 A segment file is a header of 4 096 bytes and records of one size, so that it can be mapped into
 memory as it is (:func:`map_records`):
 
-    header   magic, version, dtype, dimension, rows of a full segment, first row, encoder identity,
-             zeros, CRC-32 of all before it
-    record   descriptor (float32 [D]), row (uint64), CRC-32 of descriptor and row (uint32), zeros (uint32)
+    header   magic, version, dtype, dimension, rows of a full segment, first row, length of the encoder
+             identity; in version 2 the cells and the values a cell of the local descriptors; the
+             identity, zeros, CRC-32 of all before it
+    record   descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
+             CRC-32 of descriptors and row (uint32), zeros (uint32)
 
+Maps whose encoder has no second stage are of version 1, which is version 2 without local descriptors.
 Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  Only as many
 records count as SQLite names; what stands behind them was never acknowledged and is overwritten.
 """
@@ -28,42 +31,60 @@ from numpy.typing import ArrayLike, NDArray
 from core.storage.disk import Damage, sync_folder, write_at
 
 Descriptor = NDArray[np.float32]
+Local = NDArray[np.int8]
+"""Local descriptors of one frame, [C, L]; [0, 0] where the encoder has no second stage."""
+
+NO_LOCAL = (0, 0)
+"""Shape of the local descriptors of an encoder that has none."""
 
 ROWS_PER_SEGMENT = 256
-"""Rows of a full segment of a new map: 50 MB of the default encoder's descriptors."""
+"""Rows of a full segment of a new map: some tens of megabytes of the default encoder's descriptors."""
 
 HEADER_BYTES = 4096
 _HEADER = struct.Struct("<8sI8sIIQH")
-_MAGIC, _VERSION, _DTYPE = b"PLRCSEG\x00", 1, b"<f4"
+_LOCAL_SHAPE = struct.Struct("<II")
+_MAGIC, _VERSION, _LOCAL_VERSION, _DTYPE = b"PLRCSEG\x00", 1, 2, b"<f4"
 _IDENTITY_BYTES = 1024
 _CHUNK_BYTES = 8 << 20
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What all segment files of a map have in common."""
+    """What all segment files of a map have in common; ``local_shape`` is (C, L)."""
 
     dimension: int
     identity: str
     rows_per_segment: int
+    local_shape: tuple[int, int] = NO_LOCAL
 
     def __post_init__(self) -> None:
         if len(self.identity.encode()) > _IDENTITY_BYTES:
             raise ValueError(f"an encoder identity has at most {_IDENTITY_BYTES} bytes")
+        if self.local_shape != NO_LOCAL and min(self.local_shape) < 1:
+            raise ValueError(f"local descriptors of {self.local_shape} cells and values make no sense")
 
     @property
     def record(self) -> np.dtype[np.void]:
         """The structured type of one record."""
         return np.dtype(
-            [("descriptor", "<f4", (self.dimension,)), ("row", "<u8"), ("checksum", "<u4"), ("reserved", "<u4")]
+            [
+                ("descriptor", "<f4", (self.dimension,)),
+                ("local", "i1", self.local_shape),
+                ("row", "<u8"),
+                ("checksum", "<u4"),
+                ("reserved", "<u4"),
+            ]
         )
 
     def header(self, number: int) -> bytes:
         """The first 4 096 bytes of segment ``number``."""
         identity = self.identity.encode()
         first_row = number * self.rows_per_segment
-        fixed = _HEADER.pack(_MAGIC, _VERSION, _DTYPE, self.dimension, self.rows_per_segment, first_row, len(identity))
-        content = (fixed + identity).ljust(HEADER_BYTES - 4, b"\x00")
+        has_local = self.local_shape != NO_LOCAL
+        version = _LOCAL_VERSION if has_local else _VERSION
+        fixed = _HEADER.pack(_MAGIC, version, _DTYPE, self.dimension, self.rows_per_segment, first_row, len(identity))
+        shape = _LOCAL_SHAPE.pack(*self.local_shape) if has_local else b""
+        content = (fixed + shape + identity).ljust(HEADER_BYTES - 4, b"\x00")
         return content + struct.pack("<I", zlib.crc32(content))
 
 
@@ -72,9 +93,11 @@ def segment_name(number: int) -> str:
     return f"descriptors-{number + 1:06d}.seg"
 
 
-def row_checksum(descriptor: Descriptor, row: int) -> int:
-    """CRC-32 over a descriptor's bytes and its row: a record in the wrong place does not pass."""
-    return zlib.crc32(struct.pack("<Q", row), zlib.crc32(np.ascontiguousarray(descriptor, dtype="<f4").data))
+def row_checksum(descriptor: Descriptor, local: Local, row: int) -> int:
+    """CRC-32 over the bytes of a frame's descriptors and its row: a record in the wrong place does not pass."""
+    running = zlib.crc32(np.ascontiguousarray(descriptor, dtype="<f4").data)
+    running = zlib.crc32(np.ascontiguousarray(local, dtype="i1").data, running)
+    return zlib.crc32(struct.pack("<Q", row), running)
 
 
 def chain(checksums: ArrayLike, before: int = 0) -> int:
@@ -125,7 +148,7 @@ def damaged_rows(records: NDArray[np.void], first_row: int) -> list[int]:
     damaged = []
     for offset, record in enumerate(records):
         row = first_row + offset
-        if record["row"] != row or record["checksum"] != row_checksum(record["descriptor"], row):
+        if record["row"] != row or record["checksum"] != row_checksum(record["descriptor"], record["local"], row):
             damaged.append(row)
     return damaged
 
@@ -152,8 +175,13 @@ def map_records(folder: Path, layout: Layout, number: int, rows: int) -> np.memm
     return np.memmap(folder / segment_name(number), dtype=layout.record, mode="r", offset=HEADER_BYTES, shape=(rows,))
 
 
-def append(folder: Path, layout: Layout, first_row: int, descriptors: Sequence[Descriptor]) -> list[int]:
-    """Write descriptors behind the ``first_row`` rows there are, and sync every file and folder touched.
+def append(
+    folder: Path, layout: Layout, first_row: int, descriptors: Sequence[Descriptor], local: Sequence[Local]
+) -> list[int]:
+    """Write frames behind the ``first_row`` rows there are, and sync every file and folder touched.
+
+    Args:
+        descriptors, local: of the same n frames, float32 [D] and int8 [C, L] each.
 
     Returns:
         The checksum of each row.
@@ -165,10 +193,11 @@ def append(folder: Path, layout: Layout, first_row: int, descriptors: Sequence[D
     while len(checksums) < len(descriptors):
         row = first_row + len(checksums)
         number, offset = divmod(row, layout.rows_per_segment)
-        batch = descriptors[len(checksums) : len(checksums) + layout.rows_per_segment - offset]
-        records = np.zeros(len(batch), dtype=layout.record)
-        for i, descriptor in enumerate(batch):
-            records[i] = (descriptor, row + i, row_checksum(descriptor, row + i), 0)
+        batch = slice(len(checksums), len(checksums) + layout.rows_per_segment - offset)
+        frames = list(zip(descriptors[batch], local[batch], strict=True))
+        records = np.zeros(len(frames), dtype=layout.record)
+        for i, (descriptor, cells) in enumerate(frames):
+            records[i] = (descriptor, cells, row + i, row_checksum(descriptor, cells, row + i), 0)
         _write(folder / segment_name(number), layout, number, offset, records)
         checksums += records["checksum"].tolist()
     return checksums

@@ -158,7 +158,8 @@ class Map:
                     raise
             self._snapshot, self._record = after, write.record
             for number, checksum in write.filled.items():
-                write_cache(self._folder / cache_name(number), after.segments[number].index, checksum)
+                full = after.segments[number]
+                write_cache(self._folder / cache_name(number), full.index, full.local, checksum)
 
     def _doubt(self, error: BaseException, opened: OpenMap, before: Snapshot) -> None:
         """After a failure: what stands behind the rows that are named, in the segment files and in SQLite's log?
@@ -220,10 +221,10 @@ class Map:
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
             NoRegions: a descriptor is all zero.
-            ValueError: a descriptor or digest of the wrong kind.
+            ValueError: descriptors or a digest of the wrong kind.
         """
         for item in items:
-            check_enrolment(item, self._record.dimension)
+            check_enrolment(item, self._record.dimension, self._record.local_shape)
         if not items:
             return []
         with self._writing() as write:

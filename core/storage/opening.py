@@ -18,7 +18,7 @@ from core.places import Pose
 from core.storage import descriptors, ledger
 from core.storage.caches import StaleCache, cache_name, load_cache, write_cache
 from core.storage.database import FILE, Database, connect
-from core.storage.descriptors import Layout
+from core.storage.descriptors import Layout, Local
 from core.storage.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.storage.patches import complaint
 from core.storage.records import MapRecord
@@ -83,7 +83,7 @@ def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     """
     try:
         record, rows_per_segment = ledger.read_record(connection)
-        return record, Layout(record.dimension, record.encoder, rows_per_segment)
+        return record, Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape)
     except ValueError as error:
         raise Damage(f"map.sqlite: the map's own record cannot be read: {complaint(error)}") from error
 
@@ -144,26 +144,28 @@ def living_rows(connection: sqlite3.Connection, rows: int) -> Iterator[tuple[int
         yield row, checksum, spot_of(pose, sequence, ordinal)
 
 
-def _load_segment(folder: Path, layout: Layout, named: NamedSegment, wanted: dict[int, int]) -> Any:
-    """The index of a segment: from its cache if it has a good one, else from the descriptors."""
+def _load_segment(folder: Path, layout: Layout, named: NamedSegment, wanted: dict[int, int]) -> tuple[Any, Local]:
+    """Index and local descriptors of a segment: from its cache if it has a good one, else from the records."""
     full = named.rows == layout.rows_per_segment
     cache = folder / cache_name(named.number)
     if full:
         try:
-            return load_cache(cache, named.rows, layout.dimension, named.checksum)
+            return load_cache(cache, layout, named.checksum)
         except StaleCache as stale:
             log.warning("Map %s: %s is made again from the descriptors: %s.", folder.name, cache.name, stale)
     index = flat_index(named.rows, layout.dimension)
+    local = np.zeros((named.rows, *layout.local_shape), dtype=np.int8)
     target, filled = vectors(index), 0
     for records in descriptors.read_checked(folder, layout, named.number, named.rows, named.checksum):
         for record in records:
             if wanted.get(int(record["row"]), int(record["checksum"])) != record["checksum"]:
                 raise Damage(f"{descriptors.segment_name(named.number)}: row {record['row']} is of another frame")
         target[filled : filled + len(records)] = records["descriptor"]
+        local[filled : filled + len(records)] = records["local"]
         filled += len(records)
     if full:
-        write_cache(cache, index, named.checksum)
-    return index
+        write_cache(cache, index, local, named.checksum)
+    return index, local
 
 
 def read_snapshot(folder: Path, layout: Layout, connection: sqlite3.Connection) -> Snapshot:
@@ -184,9 +186,9 @@ def read_snapshot(folder: Path, layout: Layout, connection: sqlite3.Connection) 
     for segment in named:
         first = segment.number * layout.rows_per_segment
         part = slice(first, first + segment.rows)
-        index = _load_segment(folder, layout, segment, wanted)
-        segments.append(Segment(index, first, whereabouts_of(spots[part]), alive[part].copy()))
-    return Snapshot(layout.dimension, layout.rows_per_segment, tuple(segments))
+        index, local = _load_segment(folder, layout, segment, wanted)
+        segments.append(Segment(index, local, first, whereabouts_of(spots[part]), alive[part].copy()))
+    return Snapshot(layout.dimension, layout.rows_per_segment, tuple(segments), layout.local_shape)
 
 
 def open_map(folder: Path) -> OpenMap:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
@@ -40,10 +40,17 @@ class MapRecord(MapSettings):
     id: str
     encoder: str = Field(description="Identity of the one encoder whose descriptors the map holds.")
     dimension: int = Field(gt=0, description="Values of one descriptor.")
+    local_cells: int = Field(default=0, ge=0, description="Local descriptors of one frame; 0: there are none.")
+    local_values: int = Field(default=0, ge=0, description="Values of one local descriptor.")
     calibration: Calibration | None = Field(default=None, description="The map's own; none: that of its encoder.")
     revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
     created_at: Timestamp
     updated_at: Timestamp
+
+    @property
+    def local_shape(self) -> tuple[int, int]:
+        """(C, L), the shape of a frame's local descriptors; (0, 0) where the encoder has no second stage."""
+        return self.local_cells, self.local_values
 
     def settings(self) -> MapSettings:
         """The part that its owner chose."""
@@ -65,7 +72,7 @@ class SequenceSummary(BaseModel):
 class Enrolment:
     """One frame to be remembered.
 
-    descriptor: float32 [D] of the map's encoder.
+    descriptor, local: float32 [D] and int8 [C, L] of the map's encoder; [0, 0] where it has no second stage.
     digest: SHA-256 of the image's bytes, 32 bytes.
     thumbnail, image: JPEG made from the frame, and the bytes as received; the map keeps what it is set to keep.
     """
@@ -75,6 +82,7 @@ class Enrolment:
     descriptor: NDArray[np.float32]
     regions: int
     digest: bytes
+    local: NDArray[np.int8] = field(default_factory=lambda: np.empty((0, 0), np.int8))
     thumbnail: bytes | None = None
     image: bytes | None = None
 

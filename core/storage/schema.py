@@ -73,7 +73,13 @@ _FIRST: Migration = (
     ) STRICT""",
 )
 
-MIGRATIONS: Sequence[Migration] = (_FIRST,)
+# Shape of the local descriptors behind each descriptor; none in the maps that were there before.
+_LOCAL: Migration = (
+    "ALTER TABLE map ADD COLUMN local_cells INTEGER NOT NULL DEFAULT 0 CHECK (local_cells >= 0)",
+    "ALTER TABLE map ADD COLUMN local_values INTEGER NOT NULL DEFAULT 0 CHECK (local_values >= 0)",
+)
+
+MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:

@@ -1,9 +1,9 @@
 """What is searched: an immutable view of a map, made of FAISS flat inner-product indexes.
 
 A map's rows lie in segments of a fixed size; the last one, the tail, still grows.  A write makes a
-new snapshot that shares every index with the one before: descriptors are put behind the rows that
-older snapshots see, and only the few bytes per row that say where a place is, and whether it is
-still alive, are copied, for the segments that the write touches.
+new snapshot that shares every index, and the local descriptors beside it, with the one before:
+descriptors are put behind the rows that older snapshots see, and only the few bytes per row that say
+where a place is, and whether it is still alive, are copied, for the segments that the write touches.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from core.storage.descriptors import NO_LOCAL, Descriptor, Local
 from core.verdict import Whereabouts
 
-Descriptor = NDArray[np.float32]
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Rows, best first, and their inner products."""
 
@@ -82,11 +82,13 @@ class Segment:
     """Consecutive rows of a map.
 
     index: holds ``len(self)`` rows, and behind them room that nobody reads.
+    local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room behind them.
     first_row: the map's row that is row 0 here.
     alive: bool [n], False for the rows of places that were forgotten or got another frame.
     """
 
     index: faiss.IndexFlatIP
+    local: Local
     first_row: int
     whereabouts: Whereabouts
     alive: NDArray[np.bool_]
@@ -94,20 +96,26 @@ class Segment:
     def __len__(self) -> int:
         return len(self.alive)
 
-    def appended(self, descriptors: Sequence[Descriptor], spots: Sequence[Spot], largest: int) -> Segment:
+    def appended(
+        self, descriptors: Sequence[Descriptor], spots: Sequence[Spot], local: Sequence[Local], largest: int
+    ) -> Segment:
         """With more rows.  Only on the newest segment, by one thread: the room behind it is shared."""
         n, end = len(self), len(self) + len(descriptors)
-        index = self.index
+        index, cells = self.index, self.local
         if end > index.ntotal:
             # Doubling: over a segment's life each row is copied about once.
-            index = flat_index(min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL)), self.index.d)
-            vectors(index)[:n] = vectors(self.index)[:n]
+            capacity = min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL))
+            index, cells = flat_index(capacity, self.index.d), np.zeros((capacity, *cells.shape[1:]), np.int8)
+            vectors(index)[:n], cells[:n] = vectors(self.index)[:n], self.local[:n]
         rows = vectors(index)
         for offset, descriptor in enumerate(descriptors, start=n):
             rows[offset] = descriptor
+        for offset, of_frame in enumerate(local, start=n):
+            cells[offset] = of_frame
         return replace(
             self,
             index=index,
+            local=cells,
             whereabouts=joined([self.whereabouts, whereabouts_of(spots)]),
             alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
         )
@@ -184,11 +192,12 @@ def _together(run: Callable[[_Part], None], parts: Sequence[_Part], calling_too:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """All places of a map at one moment.  ``rows_per_segment`` is the map's."""
+    """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's."""
 
     dimension: int
     rows_per_segment: int
     segments: tuple[Segment, ...] = ()
+    local_shape: tuple[int, int] = NO_LOCAL
 
     def __len__(self) -> int:
         return len(self._living)
@@ -257,16 +266,42 @@ class Snapshot:
         order = np.argsort(-found, kind="stable")
         return living[order], found[order]
 
-    def appended(self, descriptors: Sequence[Descriptor], spots: Sequence[Spot]) -> Snapshot:
-        """With further places.  Only on the newest snapshot, by one thread at a time."""
+    def locals_at(self, rows: NDArray[np.int64]) -> Local:
+        """The local descriptors of rows, as :meth:`search` returns them: int8 [k, C, L], a copy.
+
+        Raises:
+            IndexError: there is no such row.
+        """
+        if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
+            raise IndexError(f"the map has rows 0 to {self.rows - 1}")
+        found = np.empty((len(rows), *self.local_shape), np.int8)
+        for position, row in enumerate(rows.tolist()):
+            segment = self.segments[row // self.rows_per_segment]
+            found[position] = segment.local[row - segment.first_row]
+        return found
+
+    def appended(
+        self, descriptors: Sequence[Descriptor], spots: Sequence[Spot], local: Sequence[Local] = ()
+    ) -> Snapshot:
+        """With further places.  Only on the newest snapshot, by one thread at a time.
+
+        Args:
+            descriptors, spots, local: one of each a place, float32 [D] and int8 [C, L]; ``local`` may be
+                left out where the map has no local descriptors.
+        """
+        if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
+            raise ValueError("every place of this map has local descriptors")
         segments, done = list(self.segments), 0
         while done < len(descriptors):
             if not segments or len(segments[-1]) == self.rows_per_segment:
                 row = sum(len(segment) for segment in segments)
                 empty = np.empty(0, dtype=np.bool_)
-                segments.append(Segment(flat_index(0, self.dimension), row, whereabouts_of([]), empty))
+                no_local = np.empty((0, *self.local_shape), np.int8)
+                segments.append(Segment(flat_index(0, self.dimension), no_local, row, whereabouts_of([]), empty))
             stop = done + self.rows_per_segment - len(segments[-1])
-            segments[-1] = segments[-1].appended(descriptors[done:stop], spots[done:stop], self.rows_per_segment)
+            segments[-1] = segments[-1].appended(
+                descriptors[done:stop], spots[done:stop], local[done:stop], self.rows_per_segment
+            )
             done = min(stop, len(descriptors))
         return replace(self, segments=tuple(segments))
 

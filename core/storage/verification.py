@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from core.storage import descriptors
 from core.storage.caches import StaleCache, cache_name, check_cache
 from core.storage.database import FILE, connect
@@ -147,15 +149,14 @@ def _check_segment(
     foreign: list[int] = []
     differing: list[int] = []
     running = 0
-    searched = vectors(snapshot.segments[named.number].index) if snapshot is not None else None
+    searched = None if snapshot is None else snapshot.segments[named.number]
     for records in descriptors.read_records(folder, layout, named.number, named.rows):
         damaged += descriptors.damaged_rows(records, row)
         running = descriptors.chain(records["checksum"], running)
         for offset, record in enumerate(records, start=row):
             if offset in places and places[offset][1] != record["checksum"]:
                 foreign.append(offset)
-            in_memory = None if searched is None else searched[offset - named.number * layout.rows_per_segment]
-            if in_memory is not None and in_memory.tobytes() != record["descriptor"].tobytes():
+            if searched is not None and not _same_descriptors(searched, offset - searched.first_row, record):
                 differing.append(offset)
         findings.checked_bytes += records.nbytes
         row += len(records)
@@ -172,6 +173,12 @@ def _check_segment(
             findings.problems.append(f"{name}: so with {len(rows) - _NAMED} more rows")
     if not damaged and running != named.checksum:
         findings.problems.append(f"{descriptors.segment_name(named.number)}: its rows are not those that {FILE} names")
+
+
+def _same_descriptors(segment: Segment, offset: int, record: np.void) -> bool:
+    """Byte for byte, for a bit may be flipped that changes no comparison."""
+    in_memory = vectors(segment.index)[offset].tobytes(), segment.local[offset].tobytes()
+    return in_memory == (record["descriptor"].tobytes(), record["local"].tobytes())
 
 
 def _same_spot(segment: Segment, offset: int, spot: Spot) -> bool:
@@ -203,6 +210,6 @@ def _check_caches(folder: Path, layout: Layout, segments: list[NamedSegment], fi
         if named.rows == layout.rows_per_segment:
             name = cache_name(named.number)
             try:
-                findings.checked_bytes += check_cache(folder / name, named.rows, layout.dimension, named.checksum)
+                findings.checked_bytes += check_cache(folder / name, layout, named.checksum)
             except StaleCache as stale:
                 findings.stale_caches.append(f"{name}: {stale}")

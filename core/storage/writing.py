@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
@@ -18,18 +17,23 @@ from core.storage.records import Change, Enrolment, MapRecord
 from core.storage.snapshot import Snapshot, Spot
 
 
-def check_enrolment(item: Enrolment, dimension: int) -> None:
+def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:
     """Refuse what a map cannot hold before anything is written.
+
+    Args:
+        dimension, local_shape: of the map's descriptors, D and (C, L).
 
     Raises:
         InvalidIdentifier: the id does not have the form of one.
         NoRegions: the descriptor is all zero.
-        ValueError: a descriptor or digest of the wrong kind, which is the caller's mistake.
+        ValueError: descriptors or a digest of the wrong kind, which is the caller's mistake.
     """
     check_place_id(item.id)
     descriptor = item.descriptor
     if descriptor.dtype != np.float32 or descriptor.shape != (dimension,):
         raise ValueError(f"a descriptor of this map is float32 [{dimension}]")
+    if item.local.dtype != np.int8 or item.local.shape != local_shape:
+        raise ValueError(f"the local descriptors of a frame of this map are int8 {list(local_shape)}")
     with np.errstate(over="ignore"):
         squares = float(np.dot(descriptor, descriptor))
     if not np.isfinite(squares):
@@ -64,7 +68,7 @@ class Write:
         self._folder = folder
         self._layout = opened.layout
         self._snapshot = snapshot
-        self._born: list[NDArray[np.float32]] = []
+        self._born: list[Enrolment] = []
         self._spots: list[Spot] = []
         self._moved: dict[int, Spot] = {}
         self._dead: list[int] = []
@@ -76,7 +80,7 @@ class Write:
         if stored is not None and stored.digest == item.digest:
             return self.set_fields(stored, item.fields)
         row = self._snapshot.rows + len(self._born)
-        checksum = descriptors.row_checksum(item.descriptor, row)
+        checksum = descriptors.row_checksum(item.descriptor, item.local, row)
         keep = self.record.keep
         if stored is None:
             now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
@@ -84,7 +88,7 @@ class Write:
             ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
             now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
             self._bury(stored.row)
-        self._born.append(item.descriptor)
+        self._born.append(item)
         self._spots.append(_spot(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
 
@@ -129,9 +133,12 @@ class Write:
         before = self._snapshot
         if self._born:
             self.appending = True
-            checksums = descriptors.append(self._folder, self._layout, before.rows, self._born)
+            vectors, local = [item.descriptor for item in self._born], [item.local for item in self._born]
+            checksums = descriptors.append(self._folder, self._layout, before.rows, vectors, local)
             self._name_rows(before.rows, checksums)
-        after = before.appended(self._born, self._spots) if self._born else before
+            after = before.appended(vectors, self._spots, local)
+        else:
+            after = before
         after = after.moved(self._moved) if self._moved else after
         return after.without(self._dead) if self._dead else after
 

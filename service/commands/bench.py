@@ -22,7 +22,7 @@ def bench(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures.")] = None,
     models_dir: ModelsDir = None,
 ) -> None:
-    """Measure encoding against the bare forward pass, the region pass, and a search, in this process.
+    """Measure encoding against the bare forward pass, the region pass, and a search of both stages, in this process.
 
     What is compared runs interleaved. The scripts in benchmarks/ measure the rest: queries over HTTP, the region
     pass against its reference, start and memory.
@@ -34,6 +34,7 @@ def bench(
     from core.storage.descriptors import ROWS_PER_SEGMENT
     from core.storage.snapshot import Snapshot, Spot
     from core.verdict import NO_POSE
+    from service.localization import examine
     from service.measurement import better_forward, encoding_runs, jpeg, medians, sample_picture
 
     if threads:
@@ -42,11 +43,17 @@ def bench(
     data = jpeg(sample_picture()) if image is None else read_bytes(image)
     with progress() as bar:
         bar.add_task("Measuring", total=None)
-        known = np.random.default_rng(0).standard_normal((places, chosen.dimension), np.float32)
+        random, middle = np.random.default_rng(0), places // 2
+        known = random.standard_normal((places, chosen.dimension), np.float32)
+        local = random.integers(-127, 128, (places, *chosen.local_shape), np.int8)
         nowhere = Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)
-        snapshot = Snapshot(chosen.dimension, ROWS_PER_SEGMENT).appended(list(known), [nowhere] * places)
-        runs = {**encoding_runs(chosen, data), "search": lambda: snapshot.search(known[places // 2])}
-        times = medians(runs, rounds)
+        empty = Snapshot(chosen.dimension, ROWS_PER_SEGMENT, local_shape=chosen.local_shape)
+        snapshot = empty.appended(list(known), [nowhere] * places, list(local))
+
+        def search() -> object:
+            return examine(chosen, snapshot, local[middle], snapshot.search(known[middle]))
+
+        times = medians({**encoding_runs(chosen, data), "search": search}, rounds)
     forward = better_forward(times)
     figures = {
         "encoder": chosen.identity,

@@ -140,7 +140,8 @@ async def regions(
 async def match(
     options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
 ) -> MatchScore:
-    """The score of two frames against each other: 1 for the same frame, near 0 for unrelated ones."""
+    """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
+    itself reach where parts of it are plain."""
     engine.inference.check_room()
     first, second, fields = await read_pair(request, engine.settings)
     identity = await in_thread(engine.resolve, options.joined(fields).encoder)
@@ -149,7 +150,7 @@ async def match(
         b = await engine.inference.encode(identity, second, patience)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     return MatchScore(
-        score=a.encoder.score(a.encoding.descriptor, b.encoding.descriptor),
+        score=a.encoder.score(a.encoding, b.encoding),
         encoder=identity,
         regions={"a": len(a.encoding.regions), "b": len(b.encoding.regions)},
         milliseconds=rounded({**both, "total": milliseconds_since(started(request))}),

@@ -63,9 +63,9 @@ def create_map(new: NewMap, engine: EngineDep, response: Response) -> MapView:
     """Create a map, bound for life to one encoder."""
     check_map_id(new.id)
     identity = engine.resolve(new.encoder)
-    dimension = next(s.dimension for s in engine.catalogue.describe() if s.identity == identity)
+    encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder"}))
-    map_ = engine.atlas.create(new.id, identity, dimension, settings)
+    map_ = engine.atlas.create(new.id, identity, encoder.dimension, settings, encoder.local_shape)
     response.headers["ETag"] = entity_tag(map_.record.revision)
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
     return show_map(engine, map_)

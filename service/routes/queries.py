@@ -113,8 +113,8 @@ async def query_batch(
 async def _locate(engine: Engine, map_: Map, encoded: list[Encoded], k: int) -> list[QueryAnswer]:
     """The answers to frames that were encoded, in their order."""
     seen = [one for one in encoded if len(one.encoding.regions)]
-    descriptors = [one.encoding.descriptor for one in seen]
-    located = await in_thread(locate, map_, seen[0].encoder, descriptors, k) if seen else []
+    encodings = [one.encoding for one in seen]
+    located = await in_thread(locate, map_, seen[0].encoder, encodings, k) if seen else []
     remaining = iter(located)
     answers = []
     for one in encoded:

@@ -63,7 +63,9 @@ class RegionsView(BaseModel):
 class MatchScore(BaseModel):
     """How alike two frames are."""
 
-    score: float
+    score: float = Field(
+        description="As that of a query's match; with a second stage, as that of one that was examined."
+    )
     encoder: str
     regions: dict[str, int] = Field(description="Of each frame; one without regions scores 0.")
     milliseconds: Milliseconds

@@ -14,17 +14,17 @@ from service.schemas.fields import IDENTITY_EXAMPLE, Cursor
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",
     "encoder": IDENTITY_EXAMPLE,
-    "dimension": 49152,
+    "dimension": 16384,
     "description": "Second floor, by day",
     "keep": "thumbnail",
     "same_place_radius": 5.0,
     "same_place_frames": 3,
     "calibration": {
         "source": "encoder-default",
-        "threshold": 4.5,
-        "margin": 0.01,
-        "background_mean": 0.03,
-        "background_deviation": 0.01,
+        "threshold": 0.09,
+        "margin": 0.004,
+        "background_mean": 0.07,
+        "background_deviation": 0.014,
     },
     "places": 111,
     "revision": 1,
@@ -99,7 +99,7 @@ class MapChanges(BaseModel):
 
     model_config = ConfigDict(
         extra="forbid",
-        json_schema_extra={"examples": [{"description": "By night", "calibration": {"threshold": 5.0}}]},
+        json_schema_extra={"examples": [{"description": "By night", "calibration": {"threshold": 0.12}}]},
     )
 
     description: str | None = Field(default=None, max_length=2000)

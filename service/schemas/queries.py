@@ -16,7 +16,11 @@ class Match(BaseModel):
     """One of the best places."""
 
     rank: int
-    score: float
+    score: float = Field(
+        description="J / V, or the cosine of descriptors that are normalized as a whole. If the encoder has a "
+        "second stage (`agreement` of its definition), that counts by 1 - `share`, and to the scores of the best "
+        "`candidates` by it is added `share` times how far their cells agree with the frame's."
+    )
     place: PlaceView
 
 
@@ -31,8 +35,8 @@ class QueryAnswer(BaseModel):
                     "place": PLACE_EXAMPLE,
                     "score": 0.41,
                     "margin": 0.12,
-                    "decision": 7.9,
-                    "threshold": 4.5,
+                    "decision": 0.29,
+                    "threshold": 0.09,
                     "reason": None,
                     "matches": [{"rank": 1, "score": 0.41, "place": PLACE_EXAMPLE}],
                     "encoder": IDENTITY_EXAMPLE,
@@ -52,9 +56,12 @@ class QueryAnswer(BaseModel):
 
     verdict: Verdict
     place: PlaceView | None = Field(description="Non-null only if recognized.")
-    score: float | None = Field(description="Score of the best match; null in an empty map.")
+    score: float | None = Field(description="Score of the best match (see its `score`); null in an empty map.")
     margin: float | None = Field(description="Best score minus that of the best rival; null without a rival.")
-    decision: float | None = Field(description="By how much the best match stands out of the rest of the map.")
+    decision: float | None = Field(
+        description="By how much the best match stands out of the rest of the map: in standard deviations of the other "
+        "scores or, if the encoder has a second stage, the geometric mean of its score and its lead."
+    )
     threshold: float = Field(description="Least decision value that is believed.")
     reason: Literal["no-regions", "empty-map"] | None = Field(
         default=None, description="Why there is nothing to compare, if so."

@@ -14,7 +14,7 @@ from service.measurement import jpeg, sample_picture
 def test_descriptors_are_made_of_parts_of_real_ones() -> None:
     encoder = EncoderCatalogue().get("region-vlad")
     words = encoder.definition.words
-    made = list(descriptors(encoder, 8, pictures=3))
+    made = [descriptor for descriptor, _ in descriptors(encoder, 8, pictures=3)]
     real = np.stack(made[:3]).reshape(3, words, -1)
     assert len(made) == 8
     for descriptor in made[3:]:

@@ -8,12 +8,14 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from core.agreement import AgreementDefinition, Cells, agreement
 from core.backbone import PluggedNetwork
 from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame
 from core.encoders import EncoderCatalogue
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.network import ShallowNetwork, caffenet_definition
 from core.preprocessing import InputDefinition
+from core.projection import Projection
 from core.regions import extract_regions, unit_length
 from core.verdict import Calibration
 from core.vlad import aggregate
@@ -106,9 +108,84 @@ def test_a_dark_frame_is_not_a_blank_one() -> None:
 
 
 def test_the_score_is_the_mean_cosine(encoder: Encoder) -> None:
-    a, b = (encoder.encode(random_frame(n)).descriptor for n in (1, 2))
-    assert encoder.score(a, b) == pytest.approx(float(a @ b) / 8)
-    assert encoder.score(a, a) == pytest.approx(np.count_nonzero(a.reshape(8, -1).any(axis=1)) / 8, abs=1e-5)
+    first, second = (encoder.encode(random_frame(n)) for n in (1, 2))
+    a, b = first.descriptor, second.descriptor
+    assert encoder.score(first, second) == pytest.approx(float(a @ b) / 8)
+    words_used = np.count_nonzero(a.reshape(8, -1).any(axis=1))
+    assert encoder.score(first, first) == pytest.approx(words_used / 8, abs=1e-5)
+
+
+def test_with_a_second_stage_the_score_is_shared_with_the_agreement() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    stage = encoder.definition.agreement
+    assert stage is not None
+    assert encoder.local_shape == (13 * 13, stage.length)
+    a, b = (encoder.encode(random_frame(n)) for n in (1, 2))
+    first = (1 - stage.share) * float(a.descriptor @ b.descriptor) / encoder.definition.words
+    second = float(encoder.agreement(a.local, b.local[np.newaxis])[0])
+    assert encoder.score(a, b) == pytest.approx(first + second, abs=1e-5)
+    assert encoder.score(a, b) < 0.5 < encoder.score(a, a) <= 1 + 1e-3
+
+
+def test_a_frame_without_regions_scores_zero_in_the_second_stage_too() -> None:
+    packaged = EncoderCatalogue().get("m-region-vlad")
+    definition = packaged.definition.model_copy(update={"steps": (1e6, 1e6)})  # levels that nothing reaches
+    extractor = FeatureExtractor(packaged.extractor.backbone, definition, packaged.extractor.projections)
+    vocabulary = Vocabulary(packaged.centers, extractor.origin)
+    encoding = Encoder("blind", extractor, definition, vocabulary, CALIBRATION).encode(random_frame(1))
+    assert len(encoding.regions) == 0
+    assert encoding.local.shape == packaged.local_shape and not encoding.local.any()
+    assert packaged.score(encoding, encoding) == 0
+    assert packaged.score(packaged.encode(random_frame(1)), encoding) == 0
+
+
+def test_regional_features_are_projected_whatever_the_layers_grids() -> None:
+    torch.manual_seed(0)
+    module = nn.Sequential(nn.Conv2d(3, 12, 5, 2), nn.ReLU(), nn.Conv2d(12, 12, 3, 2))
+    shown = InputDefinition(height=64, width=96, mean=(120.0, 110.0, 100.0), scale=(0.02,) * 3)
+    definition = DEFINITION.model_copy(update={"layers": ("2", "0"), "projection": 5})
+    generator = np.random.default_rng(0)
+    projections = {
+        layer: Projection(
+            (generator.random(12) / 12).astype(np.float32), generator.standard_normal((12, 7)).astype(np.float32)
+        )
+        for layer in ("0", "2")
+    }
+    extractor = FeatureExtractor(PluggedNetwork(module, ("2", "0"), shown, "two"), definition, projections)
+    maps = extractor.activations([random_frame(3)])[0]
+    assert [layer.shape[:2] for layer in maps] == [(14, 22), (30, 46)]
+    made, summed = extractor.regions(maps), extract_regions(maps, definition.steps, definition.regions)
+    assert set(made.layers.tolist()) == {0, 1}
+    for index, name in enumerate(("2", "0")):
+        of_layer = made.layers == index
+        wanted = projections[name](summed.features[of_layer], 5)
+        np.testing.assert_allclose(made.features[of_layer], wanted, atol=1e-4)
+
+
+def test_layers_of_different_grids_cannot_be_compared_cell_by_cell(encoder: Encoder) -> None:
+    stage = AgreementDefinition(
+        layers=("pool1", "conv3"), values=2, weights=(0.5, 0.5), reach=(1, 1), candidates=3, share=0.5
+    )
+    definition = DEFINITION.model_copy(update={"agreement": stage})
+    channels = {"pool1": 96, "conv3": 384}
+    projections = {
+        layer: Projection(np.zeros(count, np.float32), np.eye(count, 2, dtype=np.float32))
+        for layer, count in channels.items()
+    }
+    extractor = FeatureExtractor(random_network(definition.outputs), definition, projections)
+    vocabulary = Vocabulary(encoder.centers, extractor.origin)
+    with pytest.raises(InvalidModel, match="different grids"):
+        Encoder("uneven", extractor, definition, vocabulary, CALIBRATION)
+
+
+def test_only_the_best_candidates_are_examined() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    query = encoder.encode(random_frame(1)).local
+    references = np.stack([query] * (encoder.candidates + 3))
+    scores = np.linspace(0.2, 0.1, len(references)).astype(np.float32)
+    gained = encoder.with_agreement(scores, query, references) - scores
+    assert (gained[: encoder.candidates] > 0.5).all()
+    assert (gained[encoder.candidates :] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -183,8 +260,9 @@ def test_a_plugged_network_names_real_layers() -> None:
 
 
 GOLDEN = {
-    "m-region-vlad": (112, {7396: 0.1886, 40162: -0.0880, 16997: -0.0712, 34288: 0.0592, 40016: 0.0495}),
-    "region-vlad": (45, {71908: 0.1877, 21833: 0.0783, 52589: 0.0601, 41601: -0.0468, 34912: 0.0367}),
+    "m-region-vlad": (246, {15234: -0.2090, 3919: -0.0519, 7338: -0.0412, 14742: 0.0545, 10414: 0.0921}),
+    "m-region-vlad-thesis": (246, {42150: 0.2541, 4375: -0.0423, 24308: 0.0889, 46244: 0.0606, 42030: -0.0449}),
+    "region-vlad": (119, {60865: 0.1803, 23911: -0.0350, 49472: 0.0387, 83159: -0.0639, 65559: -0.0564}),
 }
 
 
@@ -199,10 +277,24 @@ def test_packaged_encoders_reproduce_their_golden_values(name: str) -> None:
         assert encoding.descriptor[index] == pytest.approx(value, abs=0.01)
 
 
+def test_the_golden_check_leaves_nothing_to_compile_for_the_first_query(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[tuple[int, ...]] = []
+
+    def watched(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> NDArray[np.float32]:
+        compared.append(candidates.shape)
+        return agreement(query, candidates, columns, definition)
+
+    monkeypatch.setattr("core.encoder.agreement", watched)
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    encoder.check_golden()
+    assert compared == [(1, *encoder.local_shape)]
+
+
 def test_a_changed_encoder_fails_its_golden_values() -> None:
     packaged = EncoderCatalogue().get("m-region-vlad")
     vocabulary = Vocabulary(packaged.centers[::-1].copy(), packaged.extractor.origin)
-    golden = packaged.encode(canary_frame()).descriptor
+    canary = packaged.encode(canary_frame())
+    golden = (canary.descriptor, canary.local)
     changed = Encoder("m-region-vlad", packaged.extractor, packaged.definition, vocabulary, CALIBRATION, golden)
     with pytest.raises(GoldenMismatch, match="cosine"):
         changed.check_golden()

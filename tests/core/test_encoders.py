@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from core.encoder import Encoder
@@ -35,7 +36,7 @@ def test_the_packaged_encoders_are_the_presets() -> None:
         assert summaries[name].definition == definition
         assert summaries[name].damaged is None
         assert summaries[name].default == (name == DEFAULT_ENCODER)
-    assert summaries[DEFAULT_ENCODER].dimension == 128 * 384
+    assert summaries[DEFAULT_ENCODER].dimension == 128 * 128  # words, values of a projected feature
 
 
 def test_the_packaged_files_are_small() -> None:
@@ -92,6 +93,19 @@ def test_changed_contents_do_not_keep_the_identity(tmp_path: Path, packaged: Enc
     path.write_bytes(data)
     with pytest.raises(InvalidModel):
         EncoderCatalogue(tmp_path).get("forged")
+
+
+def test_a_projection_that_is_missing_or_damaged_is_named(tmp_path: Path, packaged: Encoder) -> None:
+    path = install(tmp_path, packaged, "skewed")
+    with safe_open(path, "np") as file:
+        tensors, metadata = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+    without = {name: tensor for name, tensor in tensors.items() if not name.startswith("projection.conv4")}
+    not_finite = tensors | {"projection.conv3.mean": np.full(384, np.nan, np.float32)}
+    no_mean = {name: tensor for name, tensor in tensors.items() if name != "projection.pool2.mean"}
+    for damaged, said in ((without, "projection of conv4"), (not_finite, "of conv3"), (no_mean, "of pool2")):
+        save_file(damaged, path, metadata)
+        with pytest.raises(InvalidModel, match=said):
+            EncoderCatalogue(tmp_path).get("skewed")
 
 
 def test_another_kind_of_safetensors_is_refused(tmp_path: Path) -> None:

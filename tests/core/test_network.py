@@ -203,10 +203,20 @@ def test_only_the_layers_in_use_are_built() -> None:
     assert [layer.name for layer in LITTLE.truncated(["conv1"]).layers] == ["conv1", "relu1"]
 
 
-@pytest.mark.parametrize("outputs", [[], ["conv9"], ["relu1"], ["conv1", "pool1"]])
-def test_only_convolutions_can_be_outputs(outputs: list[str]) -> None:
+@pytest.mark.parametrize("outputs", [[], ["conv9"], ["relu1"], ["conv1", "norm1"]])
+def test_only_convolutions_and_poolings_can_be_outputs(outputs: list[str]) -> None:
     with pytest.raises(InvalidModel):
         ShallowNetwork(LITTLE, outputs)
+
+
+def test_a_pooling_is_what_its_convolution_is_shrunk_to() -> None:
+    torch.manual_seed(0)
+    network = ShallowNetwork(LITTLE, ["pool1", "conv2", "conv1"]).eval()
+    shown = LITTLE.input
+    with torch.no_grad():
+        pooled, _, convolved = network(torch.rand(1, 3, shown.height, shown.width))
+        torch.testing.assert_close(pooled, network.stages["pool1"](convolved))
+    assert list(ShallowNetwork(LITTLE, ["pool1"]).stages) == ["conv1", "relu1", "pool1"]
 
 
 def test_the_weights_of_deeper_layers_are_not_needed() -> None:

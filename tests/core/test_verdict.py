@@ -111,3 +111,20 @@ def test_equal_scores_everywhere_are_unknown_not_a_division_by_zero() -> None:
     judgement = judge(np.full(40, 0.2, np.float32), in_sequence(40), CALIBRATION, NEARBY)
     assert judgement.verdict == "unknown"
     assert np.isfinite(judgement.decision or 0)
+
+
+def test_after_a_second_stage_the_lead_over_the_examined_counts() -> None:
+    scores = falling(0.6, 0.2, 0.2, 0.2, 0.2, 0.2)
+    one = judge(scores, in_sequence(6, [0, 10, 20, 30, 40, 50]), CALIBRATION, NEARBY, examined=30)
+    assert one.decision == pytest.approx((0.6 * 0.4) ** 0.5, abs=1e-5)
+    # What was not examined has a lower score by nature and says nothing.
+    unexamined = np.concatenate([scores, np.full(50, -0.5, np.float32)])
+    places = in_sequence(56, [10 * n for n in range(56)])
+    assert judge(unexamined, places, CALIBRATION, NEARBY, examined=6).decision == pytest.approx(one.decision)
+
+
+def test_a_twin_of_the_best_place_leaves_it_ambiguous_and_not_unknown() -> None:
+    rest = [0.1] * 10
+    places = in_sequence(12, [20 * n for n in range(12)])
+    calibration = CALIBRATION.model_copy(update={"threshold": 0.4, "margin": 0.02})
+    assert judge(falling(0.6, 0.6, *rest), places, calibration, NEARBY, examined=30).verdict == "ambiguous"

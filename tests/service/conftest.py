@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from tests.service.encoders import install_coarse_encoder
+from tests.service.encoders import install_coarse_encoder, install_two_stage_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -32,6 +32,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """The service with its default settings."""
     folder = tmp_path_factory.mktemp("server")
     install_coarse_encoder(folder / "models")
+    install_two_stage_encoder(folder / "models")
     running = Server(folder).wait()
     yield running
     assert running.stop() == 0

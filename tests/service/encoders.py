@@ -1,4 +1,4 @@
-"""A second encoder, made for the tests: few regions, few words, another normalization."""
+"""Encoders made for the tests: one with few regions, few words, another normalization, and one with a second stage."""
 
 from __future__ import annotations
 
@@ -6,38 +6,79 @@ from pathlib import Path
 
 import numpy as np
 
+from core.agreement import AgreementDefinition
+from core.backbone import Backbone
 from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
 from core.network import load_network
+from core.projection import Projection, fit_projection
+from core.regions import unit_length
 from core.verdict import Calibration
 from core.vocabulary import train_vocabulary
-from tests.service.scenes import scene
+from tests.service.scenes import scene, seen_again
 
 COARSE = "coarse"
+TWO_STAGES = "two-stages"
+
+LAYERS = ("conv3", "conv4")
+COARSE_DEFINITION = EncoderDefinition(
+    layers=LAYERS,
+    regions=50,
+    steps=(0.5, 0.5),
+    unit_features=True,
+    words=8,
+    gamma=0.5,
+    normalization="global",
+)
+SECOND_STAGE = AgreementDefinition(
+    layers=("pool2", "conv4"), values=8, weights=(0.5, 0.5), reach=(1, 1), candidates=3, share=0.6
+)
 
 
 def install_coarse_encoder(folder: Path) -> str:
     """Put the encoder into a models directory; returns its identity."""
+    return _install(folder, COARSE, FeatureExtractor(_packaged_backbone(LAYERS), COARSE_DEFINITION), COARSE_DEFINITION)
+
+
+def install_two_stage_encoder(folder: Path) -> str:
+    """The same with a second stage that examines the best three places; returns its identity."""
+    definition = COARSE_DEFINITION.model_copy(update={"agreement": SECOND_STAGE})
+    extractor = FeatureExtractor(_packaged_backbone(definition.outputs), definition, _projections())
+    return _install(folder, TWO_STAGES, extractor, definition)
+
+
+def _packaged_network() -> str:
+    (network,) = (summary.network for summary in EncoderCatalogue().describe() if summary.name == DEFAULT_ENCODER)
+    return network
+
+
+def _packaged_backbone(layers: tuple[str, ...]) -> Backbone:
+    return load_network(EncoderCatalogue().network_file(_packaged_network()), layers)
+
+
+def _projections() -> dict[str, Projection]:
+    """For the second stage, fitted on scenes and the same scenes seen again."""
+    layers = SECOND_STAGE.layers
+    extractor = FeatureExtractor(_packaged_backbone(layers), COARSE_DEFINITION.model_copy(update={"layers": layers}))
+    clear = extractor.activations([scene(seed) for seed in range(6)])
+    again = extractor.activations([seen_again(scene(seed), seed) for seed in range(6)])
+    projections = {}
+    for index, layer in enumerate(layers):
+        a, b = (
+            unit_length(np.concatenate([maps[index].reshape(-1, maps[index].shape[2]) for maps in frames]))
+            for frames in (clear, again)
+        )
+        projections[layer] = fit_projection(a, b, SECOND_STAGE.values)
+    return projections
+
+
+def _install(folder: Path, name: str, extractor: FeatureExtractor, definition: EncoderDefinition) -> str:
     folder.mkdir(parents=True, exist_ok=True)
-    catalogue = EncoderCatalogue()
-    (network,) = (summary.network for summary in catalogue.describe() if summary.name == DEFAULT_ENCODER)
-    layers = ("conv3", "conv4")
-    backbone = load_network(catalogue.network_file(network), layers)
-    definition = EncoderDefinition(
-        layers=layers,
-        regions=50,
-        steps=(0.5, 0.5),
-        unit_features=True,
-        words=8,
-        gamma=0.5,
-        normalization="global",
-    )
-    extractor = FeatureExtractor(backbone, definition)
     features = [extractor.regions(extractor.activations([scene(seed)])[0]).features for seed in range(6)]
-    vocabulary = train_vocabulary(np.concatenate(features), 8, 0, extractor.origin)
+    vocabulary = train_vocabulary(np.concatenate(features), definition.words, 0, extractor.origin)
     calibration = Calibration(
         source="encoder-default", threshold=1.0, margin=0.01, background_mean=0.3, background_deviation=0.1
     )
-    encoder = Encoder(COARSE, extractor, definition, vocabulary, calibration)
-    save_encoder(folder, encoder, vocabulary, network, {"images": 6})
+    encoder = Encoder(name, extractor, definition, vocabulary, calibration)
+    save_encoder(folder, encoder, vocabulary, _packaged_network(), {"images": 6})
     return encoder.identity

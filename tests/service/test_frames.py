@@ -11,7 +11,7 @@ import pytest
 
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.images import decode
-from tests.service.encoders import COARSE
+from tests.service.encoders import COARSE, LAYERS, TWO_STAGES
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import assert_problem
 
@@ -67,6 +67,13 @@ def test_regions_as_json(client: httpx.Client) -> None:
     fewer = client.post("/v1/regions", params={"limit": 5}, content=jpeg(1, 640, 480), headers=JPEG).json()
     strongest = sorted((region["energy"] for region in answer["regions"]), reverse=True)[:5]
     assert sorted((region["energy"] for region in fewer["regions"]), reverse=True) == strongest
+
+
+def test_layers_that_only_the_second_stage_compares_have_no_regions(client: httpx.Client) -> None:
+    answer = client.post("/v1/regions", params={"encoder": TWO_STAGES}, content=jpeg(1), headers=JPEG).json()
+    assert answer["found"] > 0
+    assert [layer["name"] for layer in answer["layers"]] == list(LAYERS)
+    assert {region["layer"] for region in answer["regions"]} <= set(LAYERS)
 
 
 def test_regions_drawn(client: httpx.Client) -> None:

@@ -7,6 +7,7 @@ import json
 import httpx
 import pytest
 
+from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 
@@ -253,7 +254,9 @@ def test_verifying(server: Server, map_id: str) -> None:
     server.enrol(map_id, "p1", jpeg(1))
     report = server.client.post(f"/v1/maps/{map_id}/verify").json()
     assert report["ok"] and report["places"] == 1 and report["problems"] == []
-    assert report["checked_bytes"] > 49152 * 4
+    cells, values = EncoderCatalogue().get(DEFAULT_ENCODER).local_shape
+    dimension = server.client.get(f"/v1/maps/{map_id}").json()["dimension"]
+    assert report["checked_bytes"] > 4 * dimension + cells * values
 
 
 def test_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
-from tests.service.encoders import COARSE
+from core.encoders import EncoderCatalogue
+from core.images import Limits, decode
+from tests.service.encoders import COARSE, SECOND_STAGE, TWO_STAGES
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
@@ -83,6 +86,30 @@ def test_a_frame_without_regions(server: Server) -> None:
     assert (answer["verdict"], answer["reason"], answer["score"]) == ("unknown", "no-regions", None)
     assert answer["place"] is None and answer["matches"] == []
     assert server.query("coarse-queries", jpeg(1))["score"] == pytest.approx(1, abs=1e-5)
+
+
+def test_the_best_places_are_examined_by_the_second_stage(server: Server) -> None:
+    frames = {f"p{seed}": jpeg(seed) for seed in range(20, 26)}
+    server.create_map("two-stages", encoder=TWO_STAGES)
+    for place_id, data in frames.items():
+        assert server.enrol("two-stages", place_id, data).status_code == 201
+    question = encoded(seen_again(scene(22)))
+    answer = server.query("two-stages", question, k=100)
+
+    encoder = EncoderCatalogue(server.folder / "models").get(TWO_STAGES)
+    limits = Limits(max_bytes=1 << 20, max_pixels=1 << 20, min_side=1)
+    query = encoder.encode(decode(question, limits))
+    places = {place_id: encoder.encode(decode(data, limits)) for place_id, data in frames.items()}
+    rest = 1 - SECOND_STAGE.share
+    scores = {place_id: rest * float(place.descriptor @ query.descriptor) for place_id, place in places.items()}
+    for place_id in sorted(scores, key=lambda name: -scores[name])[: SECOND_STAGE.candidates]:
+        scores[place_id] += float(encoder.agreement(query.local, places[place_id].local[np.newaxis])[0])
+    expected = sorted(scores, key=lambda name: -scores[name])
+    assert expected[0] == "p22"
+    assert [match["place"]["id"] for match in answer["matches"]] == expected
+    for match in answer["matches"]:
+        assert match["score"] == pytest.approx(scores[match["place"]["id"]], abs=0.01)
+    assert answer["score"] > rest, "that from the descriptors, at most, and something from where things are"
 
 
 @pytest.mark.parametrize("k", [1, 3, 8, 100])

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from core.storage import Atlas, Map, MapSettings
-from tests.core.storage.frames import DIMENSION, ENCODER
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 
 ROWS = 4
 
@@ -26,4 +26,4 @@ def atlas(directory: Path) -> Iterator[Atlas]:
 
 @pytest.fixture
 def lab(atlas: Atlas) -> Map:
-    return atlas.create("lab", ENCODER, DIMENSION, MapSettings())
+    return atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE)

@@ -13,6 +13,10 @@ from core.storage import Enrolment
 
 ENCODER = "made-up@" + "0" * 64
 DIMENSION = 16
+LOCAL_SHAPE = (3, 5)
+"""An odd number of bytes, so that nothing behind them in a record lies where a processor would want it."""
+
+RECORD_BYTES = DIMENSION * 4 + 15 + 16
 
 
 def descriptor_of(name: str, dimension: int = DIMENSION) -> NDArray[np.float32]:
@@ -22,13 +26,25 @@ def descriptor_of(name: str, dimension: int = DIMENSION) -> NDArray[np.float32]:
     return np.asarray(vector / np.linalg.norm(vector), dtype=np.float32)
 
 
+def local_of(name: str, shape: tuple[int, int] = LOCAL_SHAPE) -> NDArray[np.int8]:
+    """Local descriptors, int8 [C, L] of any values."""
+    seed = int.from_bytes(hashlib.sha256(f"local of {name}".encode()).digest()[:8], "big")
+    return np.random.default_rng(seed).integers(-128, 128, shape, dtype=np.int8)
+
+
 def digest_of(name: str) -> bytes:
     """SHA-256 of the image's bytes, for which the name stands."""
     return hashlib.sha256(f"image of {name}".encode()).digest()
 
 
 def frame(
-    place_id: str, picture: str | None = None, *, dimension: int = DIMENSION, x: float | None = None, **fields: Any
+    place_id: str,
+    picture: str | None = None,
+    *,
+    dimension: int = DIMENSION,
+    local_shape: tuple[int, int] = LOCAL_SHAPE,
+    x: float | None = None,
+    **fields: Any,
 ) -> Enrolment:
     """An enrolment of ``place_id`` that shows ``picture`` (by default the place's own)."""
     shown = picture or place_id
@@ -37,6 +53,7 @@ def frame(
         id=place_id,
         fields=PlaceFields(pose=pose, **fields),
         descriptor=descriptor_of(shown, dimension),
+        local=local_of(shown, local_shape),
         regions=len(shown),
         digest=digest_of(shown),
         thumbnail=f"thumbnail of {shown}".encode(),

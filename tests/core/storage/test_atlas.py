@@ -21,7 +21,7 @@ from core.errors import (
     UnknownMap,
 )
 from core.storage import Atlas, Map, MapSettings
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[3]
 
@@ -41,20 +41,38 @@ def test_the_directory_is_made_with_all_above_it(tmp_path: Path) -> None:
 
 def test_a_map_is_made_whole(atlas: Atlas, directory: Path) -> None:
     settings = MapSettings(description="the lab", keep="none", same_place_radius=2.5, same_place_frames=0)
-    lab = atlas.create("lab", ENCODER, DIMENSION, settings)
+    lab = atlas.create("lab", ENCODER, DIMENSION, settings, local_shape=LOCAL_SHAPE)
     assert atlas.get("lab") is lab
     assert lab.record.settings() == settings
     assert (lab.record.id, lab.record.encoder, lab.record.dimension) == ("lab", ENCODER, DIMENSION)
     assert names(directory / "maps") == ["lab"]
     assert lab.verify().ok
     with pytest.raises(MapExists):
-        atlas.create("lab", ENCODER, DIMENSION)
+        atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+
+
+def test_the_shape_of_the_local_descriptors_is_the_maps_for_life(directory: Path) -> None:
+    atlas = Atlas(directory)
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=(7, 2)).enrol([frame("p", local_shape=(7, 2))])
+    atlas.create("hall", ENCODER, DIMENSION).enrol([frame("p", local_shape=(0, 0))])
+    with pytest.raises(ValueError, match="no sense"):
+        atlas.create("none", ENCODER, DIMENSION, local_shape=(7, 0))
+    atlas.close()
+    atlas = Atlas(directory)
+    assert [atlas.get(name).record.local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
+    assert [atlas.get(name).snapshot().local_shape for name in ("lab", "hall")] == [(7, 2), (0, 0)]
+    for name in ("lab", "hall"):
+        with pytest.raises(ValueError, match="local descriptors"):
+            atlas.get(name).enrol([frame("q", local_shape=(2, 7))])
+        assert atlas.get(name).verify().ok
+    assert names(directory / "maps") == ["hall", "lab"]
+    atlas.close()
 
 
 @pytest.mark.parametrize("name", ["import", "Lab", "", "../lab", ".making-x", "a/b", "x" * 65])
 def test_what_cannot_name_a_map(atlas: Atlas, directory: Path, name: str) -> None:
     with pytest.raises(InvalidIdentifier):
-        atlas.create(name, ENCODER, DIMENSION)
+        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     assert names(directory / "maps") == []
     for call in (atlas.get, atlas.delete, atlas.verify):
         with pytest.raises(UnknownMap):
@@ -63,7 +81,7 @@ def test_what_cannot_name_a_map(atlas: Atlas, directory: Path, name: str) -> Non
 
 def test_maps_are_listed_page_by_page(atlas: Atlas) -> None:
     for name in ("b", "a", "d", "c"):
-        atlas.create(name, ENCODER, DIMENSION)
+        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     first, cursor = atlas.records(None, 3)
     assert [record.id for record in first] == ["a", "b", "c"]
     second, last = atlas.records(cursor, 3)
@@ -75,13 +93,13 @@ def test_maps_are_listed_page_by_page(atlas: Atlas) -> None:
 
 
 def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Atlas, directory: Path) -> None:
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame("p")])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     atlas.delete("lab")
     assert names(directory / "maps") == []
     for call in (atlas.get, atlas.delete):
         with pytest.raises(UnknownMap):
             call("lab")
-    again = atlas.create("lab", ENCODER, DIMENSION + 1)
+    again = atlas.create("lab", ENCODER, DIMENSION + 1, local_shape=LOCAL_SHAPE)
     again.enrol([frame("q", dimension=DIMENSION + 1)])
     assert (again.count_places(), again.verify().ok) == (1, True)
 
@@ -89,7 +107,9 @@ def test_a_deleted_map_is_gone_and_its_name_is_free(atlas: Atlas, directory: Pat
 def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path) -> None:
     with_places = Atlas(directory, rows_per_segment=4)
     for name in ("hall", "lab"):
-        with_places.create(name, ENCODER, DIMENSION).enrol([frame(f"{name}{i}") for i in range(6)])
+        with_places.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol(
+            [frame(f"{name}{i}") for i in range(6)]
+        )
     with_places.close()
     atlas = Atlas(directory, rows_per_segment=100)  # the maps there are keep theirs
     assert [record.id for record in atlas.records(None, 10)[0]] == ["hall", "lab"]
@@ -106,7 +126,7 @@ def test_maps_are_found_at_the_next_start_and_read_on_first_use(directory: Path)
 
 def test_what_a_crash_left_half_done_is_cleared_away(directory: Path) -> None:
     atlas = Atlas(directory)
-    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     maps = directory / "maps"
     shutil.copytree(maps / "lab", maps / ".making-hall-0123")
@@ -140,9 +160,13 @@ def test_a_second_atlas_in_this_process_is_refused_too(atlas: Atlas, directory: 
 
 def test_a_closed_atlas_answers_no_more(directory: Path) -> None:
     atlas = Atlas(directory)
-    lab = atlas.create("lab", ENCODER, DIMENSION)
+    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
-    for call in (lambda: atlas.get("lab"), lambda: atlas.create("x", ENCODER, DIMENSION), atlas.check_writable):
+    for call in (
+        lambda: atlas.get("lab"),
+        lambda: atlas.create("x", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE),
+        atlas.check_writable,
+    ):
         with pytest.raises(StorageFailure, match="closed"):
             call()
     with pytest.raises(StorageFailure, match="closed"):
@@ -160,7 +184,7 @@ def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
         Atlas(directory)
     (directory / "FORMAT").unlink()
     atlas = Atlas(directory)
-    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     edit(directory, "PRAGMA user_version = 99")
     with pytest.raises(DataDirectoryTooNew, match="schema 99"):
@@ -241,7 +265,7 @@ def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
 ) -> None:
     atlas = Atlas(directory, rows_per_segment=4)
     for name in ("hall", "lab"):
-        atlas.create(name, ENCODER, DIMENSION).enrol([frame(f"{name}{i}") for i in range(6)])
+        atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"{name}{i}") for i in range(6)])
     atlas.close()
     spoil(directory / "maps" / "lab")
     atlas = Atlas(directory)
@@ -253,13 +277,13 @@ def test_a_map_whose_database_is_damaged_is_quarantined_and_the_others_serve(
         assert [record.id for record in atlas.records(None, 10)[0]] == ["hall"]
         assert atlas.get("hall").snapshot().search(descriptor_of("hall3"))[0][0] == 3
         with pytest.raises(MapExists):
-            atlas.create("lab", ENCODER, DIMENSION)
+            atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
         report = atlas.verify("lab")
         assert not report.ok
         assert report.problems[0] == f"out of service: {atlas.quarantined()['lab']}"
         atlas.delete("lab")
         assert atlas.quarantined() == {}
-        assert atlas.create("lab", ENCODER, DIMENSION).count_places() == 0
+        assert atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).count_places() == 0
     finally:
         atlas.close()
 

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
+
 from core.errors import MapExists, StorageFailure, UnknownMap, UnknownPlace
 from core.storage import Atlas, Map
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 
 
 def run_together(*works: Callable[[], None]) -> None:
@@ -34,6 +36,7 @@ def test_writers_and_searchers(lab: Map) -> None:
                 for name in names:
                     rows, products = snapshot.search(descriptor_of(name))
                     assert products[0] > 0.999
+                    np.testing.assert_array_equal(snapshot.locals_at(rows[:1])[0], local_of(name))
                     (found,) = lab.places_at(rows[:1].tolist())
                     assert found is not None
                     assert found.id == name
@@ -60,6 +63,10 @@ def test_writers_and_searchers(lab: Map) -> None:
             rows, products = snapshot.search(descriptor_of("w0-0"))
             assert len(rows) == len(products) == len(snapshot)
             assert len(snapshot.whereabouts) == snapshot.rows
+            best = rows[:3]
+            for found, local in zip(lab.places_at(best.tolist()), snapshot.locals_at(best), strict=True):
+                if found is not None:  # not forgotten since
+                    np.testing.assert_array_equal(local, local_of(found.id))
 
     def read() -> None:
         while not writing.is_set():
@@ -80,7 +87,7 @@ def test_writers_and_searchers(lab: Map) -> None:
 
 def test_a_map_is_deleted_under_its_users(atlas: Atlas, directory: Path) -> None:
     for _ in range(5):
-        lab = atlas.create("lab", ENCODER, DIMENSION)
+        lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
         lab.enrol([frame("p")])
         started = threading.Barrier(4)
 
@@ -108,7 +115,7 @@ def test_one_of_many_makes_a_map(atlas: Atlas) -> None:
 
     def make() -> None:
         try:
-            made.append(atlas.create("lab", ENCODER, DIMENSION))
+            made.append(atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE))
         except MapExists:
             assert atlas.get("lab").record.id == "lab"
 
@@ -118,7 +125,7 @@ def test_one_of_many_makes_a_map(atlas: Atlas) -> None:
 
 def test_a_map_is_opened_once_by_many(directory: Path) -> None:
     atlas = Atlas(directory, rows_per_segment=4)
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame(f"p{i}") for i in range(9)])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(9)])
     atlas.close()
     atlas = Atlas(directory)
     seen: list[object] = []
@@ -135,7 +142,7 @@ def test_a_map_is_opened_once_by_many(directory: Path) -> None:
 
 def test_closing_under_load(directory: Path) -> None:
     atlas = Atlas(directory, rows_per_segment=4)
-    lab = atlas.create("lab", ENCODER, DIMENSION)
+    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     taken: list[str] = []
     started = threading.Barrier(3)
 

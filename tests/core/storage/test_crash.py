@@ -14,7 +14,7 @@ import pytest
 
 from core.storage import Atlas, Map, ledger
 from core.storage.snapshot import vectors
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, digest_of
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, local_of
 from tests.syscalls import strace
 
 REPOSITORY = Path(__file__).parents[3]
@@ -55,6 +55,7 @@ def stored(lab: Map) -> Pictures:
             (picture,) = [name for name in candidates if digest_of(name) == lab.digest(place.id)]
             segment = segments[row // 4]
             np.testing.assert_array_equal(vectors(segment.index)[row % 4], descriptor_of(picture))
+            np.testing.assert_array_equal(segment.local[row % 4], local_of(picture))
             assert lab.thumbnail(place.id) == f"thumbnail of {picture}".encode()
             found[place.id] = picture
         if cursor is None:
@@ -98,7 +99,7 @@ def test_killed_within_a_system_call_nothing_acknowledged_is_lost(directory: Pat
     """At calls that follow each other, so that every gap between two steps of a write is met."""
     Atlas(directory).close()
     atlas = Atlas(directory, rows_per_segment=4)
-    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     known: Pictures = {}
     # Opening files and writing to them happens while Python starts, too; those are not interesting.

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +23,25 @@ from core.storage.descriptors import (
     segment_name,
 )
 from core.storage.disk import Damage
-from tests.core.storage.frames import descriptor_of
+from tests.core.storage.frames import descriptor_of, local_of
 
-LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)
-RECORD_BYTES = 8 * 4 + 16
+LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4, local_shape=(3, 5))
+WITHOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)
+RECORD_BYTES = 8 * 4 + 15 + 16
 
 
 def rows(count: int, start: int = 0) -> list[NDArray[np.float32]]:
     return [descriptor_of(f"row {start + i}", LAYOUT.dimension) for i in range(count)]
+
+
+def local(count: int, start: int = 0) -> list[NDArray[np.int8]]:
+    return [local_of(f"row {start + i}") for i in range(count)]
+
+
+def write(folder: Path, first_row: int, count: int, start: int | None = None) -> list[int]:
+    """Rows behind the first ones; they show ``start`` and those that follow, by default what their number says."""
+    shown = first_row if start is None else start
+    return append(folder, LAYOUT, first_row, rows(count, shown), local(count, shown))
 
 
 def stored(folder: Path, number: int, count: int, checksum: int) -> NDArray[np.float32]:
@@ -41,47 +55,57 @@ def flip(path: Path, offset: int) -> None:
 
 
 def test_what_was_appended_is_read_over_several_segments(tmp_path: Path) -> None:
-    checksums = append(tmp_path, LAYOUT, 0, rows(3)) + append(tmp_path, LAYOUT, 3, rows(7, 3))
+    checksums = write(tmp_path, 0, 3) + write(tmp_path, 3, 7)
     assert len(checksums) == 10
     assert sorted(os.listdir(tmp_path)) == [segment_name(number) for number in range(3)]
     for number, count in ((0, 4), (1, 4), (2, 2)):
         part = checksums[4 * number : 4 * number + count]
         np.testing.assert_array_equal(stored(tmp_path, number, count, chain(part)), rows(count, 4 * number))
+        found = [records["local"] for records in read_checked(tmp_path, LAYOUT, number, count, chain(part))]
+        np.testing.assert_array_equal(np.concatenate(found), local(count, 4 * number))
     assert (tmp_path / segment_name(2)).stat().st_size == HEADER_BYTES + 2 * RECORD_BYTES
 
 
 def test_the_checksum_of_a_segment_can_be_continued() -> None:
     assert chain([1, 2, 3]) == chain([3], chain([1, 2]))
     assert chain([1, 2]) != chain([2, 1])
-    assert row_checksum(rows(1)[0], 0) != row_checksum(rows(1)[0], 1)
+
+
+def test_the_checksum_of_a_row_is_of_all_that_it_holds() -> None:
+    (descriptor,), (cells,) = rows(1), local(1)
+    others = [(rows(1, 1)[0], cells, 0), (descriptor, local(1, 1)[0], 0), (descriptor, cells, 1)]
+    assert row_checksum(descriptor, cells, 0) not in [row_checksum(*other) for other in others]
+    by_hand = zlib.crc32(descriptor.tobytes() + cells.tobytes() + struct.pack("<Q", 7))
+    assert row_checksum(descriptor, cells, 7) == by_hand
 
 
 def test_records_can_be_mapped_into_memory(tmp_path: Path) -> None:
-    append(tmp_path, LAYOUT, 0, rows(4))
+    write(tmp_path, 0, 4)
     mapped = map_records(tmp_path, LAYOUT, 0, 4)
     assert mapped["row"].tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(mapped["descriptor"], rows(4))
+    np.testing.assert_array_equal(mapped["local"], local(4))
     assert not mapped.flags.writeable
     assert mapped.dtype.itemsize == RECORD_BYTES
 
 
 def test_only_the_rows_asked_for_count(tmp_path: Path) -> None:
-    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    checksums = write(tmp_path, 0, 3)
     with (tmp_path / segment_name(0)).open("ab") as file:
         file.write(b"half a record")
     assert len(stored(tmp_path, 0, 3, chain(checksums))) == 3
 
 
 def test_rows_behind_are_overwritten(tmp_path: Path) -> None:
-    first = append(tmp_path, LAYOUT, 0, rows(3))
-    second = append(tmp_path, LAYOUT, 2, rows(1, 77))
+    first = write(tmp_path, 0, 3)
+    second = write(tmp_path, 2, 1, 77)
     found = stored(tmp_path, 0, 3, chain([*first[:2], *second]))
     np.testing.assert_array_equal(found[2], descriptor_of("row 77", LAYOUT.dimension))
 
 
 @pytest.mark.parametrize(("kept", "files", "size"), [(0, 0, 0), (2, 1, 2), (4, 1, 4), (5, 2, 1), (9, 3, 1), (10, 3, 2)])
 def test_rewinding_cuts_and_removes(tmp_path: Path, kept: int, files: int, size: int) -> None:
-    append(tmp_path, LAYOUT, 0, rows(10))
+    write(tmp_path, 0, 10)
     (tmp_path / "map.sqlite").touch()
     rewind(tmp_path, LAYOUT, kept)
     left = sorted(tmp_path.glob("*.seg"))
@@ -91,9 +115,9 @@ def test_rewinding_cuts_and_removes(tmp_path: Path, kept: int, files: int, size:
     assert (tmp_path / "map.sqlite").exists()
 
 
-@pytest.mark.parametrize("offset", [0, 8, 12, 31, 60, HEADER_BYTES - 1])
+@pytest.mark.parametrize("offset", [0, 8, 12, 31, 44, 60, HEADER_BYTES - 1])
 def test_a_damaged_header_is_found(tmp_path: Path, offset: int) -> None:
-    checksums = append(tmp_path, LAYOUT, 0, rows(2))
+    checksums = write(tmp_path, 0, 2)
     flip(tmp_path / segment_name(0), offset)
     with pytest.raises(Damage, match=r"descriptors-000001\.seg: the header"):
         stored(tmp_path, 0, 2, chain(checksums))
@@ -101,14 +125,14 @@ def test_a_damaged_header_is_found(tmp_path: Path, offset: int) -> None:
 
 @pytest.mark.parametrize("offset", range(RECORD_BYTES - 4))
 def test_every_flipped_bit_of_a_record_is_found(tmp_path: Path, offset: int) -> None:
-    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    checksums = write(tmp_path, 0, 3)
     flip(tmp_path / segment_name(0), HEADER_BYTES + RECORD_BYTES + offset)
     with pytest.raises(Damage, match="row 1 does not match"):
         stored(tmp_path, 0, 3, chain(checksums))
 
 
 def test_records_that_changed_places_are_found(tmp_path: Path) -> None:
-    checksums = append(tmp_path, LAYOUT, 0, rows(3))
+    checksums = write(tmp_path, 0, 3)
     path = tmp_path / segment_name(0)
     content = path.read_bytes()
     a, b = (content[HEADER_BYTES + i * RECORD_BYTES : HEADER_BYTES + (i + 1) * RECORD_BYTES] for i in (0, 1))
@@ -118,8 +142,8 @@ def test_records_that_changed_places_are_found(tmp_path: Path) -> None:
 
 
 def test_good_records_that_are_not_the_named_ones_are_found(tmp_path: Path) -> None:
-    append(tmp_path, LAYOUT, 0, rows(3, 50))
-    checksum = chain([row_checksum(descriptor, i) for i, descriptor in enumerate(rows(3))])
+    write(tmp_path, 0, 3, 50)
+    checksum = chain([row_checksum(*both, i) for i, both in enumerate(zip(rows(3), local(3), strict=True))])
     with pytest.raises(Damage, match="not those that map"):
         stored(tmp_path, 0, 3, checksum)
 
@@ -127,7 +151,7 @@ def test_good_records_that_are_not_the_named_ones_are_found(tmp_path: Path) -> N
 def test_a_file_that_is_missing_or_short(tmp_path: Path) -> None:
     with pytest.raises(Damage, match="missing"):
         stored(tmp_path, 0, 1, 0)
-    append(tmp_path, LAYOUT, 0, rows(3))
+    write(tmp_path, 0, 3)
     path = tmp_path / segment_name(0)
     os.truncate(path, path.stat().st_size - 1)
     with pytest.raises(Damage, match="ends after 2 of 3 rows"):
@@ -140,18 +164,51 @@ def test_a_file_that_is_missing_or_short(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        Layout(dimension=9, identity="encoder@1", rows_per_segment=4),
-        Layout(dimension=8, identity="encoder@2", rows_per_segment=4),
-        Layout(dimension=8, identity="encoder@1", rows_per_segment=5),
+        replace(LAYOUT, dimension=9),
+        replace(LAYOUT, identity="encoder@2"),
+        replace(LAYOUT, rows_per_segment=5),
+        replace(LAYOUT, local_shape=(5, 3)),
+        WITHOUT,
     ],
 )
 def test_a_segment_of_another_map_is_refused(tmp_path: Path, other: Layout) -> None:
-    append(tmp_path, LAYOUT, 0, rows(4))
+    write(tmp_path, 0, 4)
     with pytest.raises(Damage, match="another map, encoder, segment or version"):
         list(read_records(tmp_path, other, 0, 1))
     (tmp_path / segment_name(0)).rename(tmp_path / segment_name(1))
     with pytest.raises(Damage, match="another"):
         list(read_records(tmp_path, LAYOUT, 1, 1))
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (3, 0), (-3, -5), (-1, 0)])
+def test_local_descriptors_of_no_shape(shape: tuple[int, int]) -> None:
+    with pytest.raises(ValueError, match="no sense"):
+        replace(LAYOUT, local_shape=shape)
+
+
+def test_every_frame_has_both_kinds_of_descriptors(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="shorter"):
+        append(tmp_path, LAYOUT, 0, rows(3), local(2))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_local_descriptors_a_file_is_as_it_always_was(tmp_path: Path) -> None:
+    """Version 1, written out by its rules."""
+    append(tmp_path, WITHOUT, 4, rows(2, 4), [local_of("", (0, 0))] * 2)
+    head = struct.pack("<8sI8sIIQH", b"PLRCSEG\x00", 1, b"<f4", 8, 4, 4, 9) + b"encoder@1"
+    expected = head.ljust(4092, b"\x00") + struct.pack("<I", zlib.crc32(head.ljust(4092, b"\x00")))
+    for row in (4, 5):
+        values = rows(1, row)[0].tobytes()
+        checksum = zlib.crc32(values + struct.pack("<Q", row))
+        expected += values + struct.pack("<QII", row, checksum, 0)
+    assert (tmp_path / segment_name(1)).read_bytes() == expected
+
+
+def test_the_header_says_what_is_in_a_record(tmp_path: Path) -> None:
+    write(tmp_path, 0, 1)
+    header = (tmp_path / segment_name(0)).read_bytes()[:HEADER_BYTES]
+    head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 2, b"<f4", 8, 4, 0, 9, 3, 5) + b"encoder@1"
+    assert header[:-4] == head.ljust(HEADER_BYTES - 4, b"\x00")
 
 
 def test_an_identity_has_its_limit() -> None:

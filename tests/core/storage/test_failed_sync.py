@@ -12,7 +12,7 @@ import pytest
 
 from core.storage import Atlas
 from core.storage.snapshot import vectors
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
 from tests.syscalls import strace
 
 REPOSITORY = Path(__file__).parents[3]
@@ -45,7 +45,7 @@ def run(action: str, directory: Path, call: str, error: str, when: str) -> subpr
 )
 def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call: str, error: str, when: str) -> None:
     atlas = Atlas(directory, rows_per_segment=4)
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame(f"p{i}") for i in range(2)])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(2)])
     atlas.close()
 
     finished = run("keep-trying", directory, call, error, when)
@@ -63,7 +63,9 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
     lab = atlas.get("lab")
     assert [place.id for place in lab.places(None, 100)[0]] == ["p0", "p1", *taken]
     for row, name in enumerate(["p0", "p1", *taken]):
-        np.testing.assert_array_equal(vectors(lab.snapshot().segments[row // 4].index)[row % 4], descriptor_of(name))
+        segment = lab.snapshot().segments[row // 4]
+        np.testing.assert_array_equal(vectors(segment.index)[row % 4], descriptor_of(name))
+        np.testing.assert_array_equal(segment.local[row % 4], local_of(name))
     assert lab.verify().ok
     atlas.close()
 
@@ -72,7 +74,7 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
 def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Path, when: str) -> None:
     """Its frames are in SQLite's log, whole: only their sync failed."""
     atlas = Atlas(directory, rows_per_segment=4)
-    atlas.create("lab", ENCODER, DIMENSION)
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     finished = run("die-at-refusal", directory, "fdatasync", "EIO", when)
     assert finished.returncode in (-9, 137), finished.stderr.decode()

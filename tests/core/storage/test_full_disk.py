@@ -17,10 +17,11 @@ import pytest
 from core.errors import StorageFailure, StorageFull
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from core.storage.descriptors import HEADER_BYTES
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.storage.worker import LARGE
 
 REPOSITORY = Path(__file__).parents[3]
+LOCAL_BYTES = LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
 
 
 @pytest.fixture
@@ -75,7 +76,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
 ) -> None:
     directory = small_disk / "data"
     atlas = Atlas(directory, rows_per_segment=8)
-    lab = atlas.create("lab", ENCODER, dimension, MapSettings(keep="image"))
+    lab = atlas.create("lab", ENCODER, dimension, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     lab.enrol([large_frame("first", dimension, image_bytes)])
     ballast = fill_up(small_disk, left)
 
@@ -94,7 +95,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     assert found.id == ids[-1]
     stored = sum(path.stat().st_size for path in (directory / "maps" / "lab").glob("*.seg"))
     segments = -(-len(ids) // 8)
-    assert stored == segments * HEADER_BYTES + len(ids) * (dimension * 4 + 16)
+    assert stored == segments * HEADER_BYTES + len(ids) * (dimension * 4 + LOCAL_BYTES + 16)
     assert lab.verify().ok
 
     ballast.unlink()
@@ -111,10 +112,10 @@ def test_nothing_is_half_written_and_the_map_goes_on(
 
 def test_a_map_that_finds_no_room_is_not_made(small_disk: Path) -> None:
     atlas = Atlas(small_disk / "data")
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame("p")])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     ballast = fill_up(small_disk, 0)
     with pytest.raises(StorageFull):
-        atlas.create("hall", ENCODER, DIMENSION)
+        atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     with pytest.raises(StorageFull):
         atlas.check_writable()
     assert os.listdir(small_disk / "data" / "maps") == ["lab"]
@@ -123,13 +124,13 @@ def test_a_map_that_finds_no_room_is_not_made(small_disk: Path) -> None:
     atlas.delete("lab")  # making room is always possible
     ballast.unlink()
     atlas.check_writable()
-    atlas.create("hall", ENCODER, DIMENSION)
+    atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
 
 
 def test_a_start_on_a_full_disk_is_made_up_for_when_there_is_room(small_disk: Path) -> None:
     atlas = Atlas(small_disk / "data")
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame("p")])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])
     atlas.close()
     ballast = fill_up(small_disk, 0)
     atlas = Atlas(small_disk / "data")
@@ -149,5 +150,5 @@ def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
     answer = json.loads(finished.stdout)
     assert answer["error"] == "StorageFull"
     assert answer["places"] > 20
-    assert answer["size"] == HEADER_BYTES + answer["places"] * (LARGE * 4 + 16)
+    assert answer["size"] == HEADER_BYTES + answer["places"] * (LARGE * 4 + LOCAL_BYTES + 16)
     assert (answer["after"], answer["ok"]) == (answer["places"] + 1, True)

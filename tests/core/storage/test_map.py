@@ -24,7 +24,7 @@ from core.images import decode, encode_png
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map, MapSettings
 from core.verdict import Calibration
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, digest_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
 
@@ -81,6 +81,7 @@ def test_the_four_changes(lab: Map) -> None:
     after = lab.place("p")
     assert (after.created_at, after.regions) == (before.created_at, len("another picture"))
     assert lab.thumbnail("p") == b"thumbnail of another picture"
+    np.testing.assert_array_equal(lab.snapshot().locals_at(np.array([0, 1]))[1], local_of("another picture"))
     assert lab.count_places() == 1
     assert lab.snapshot().rows == 2
     assert lab.verify().ok
@@ -126,6 +127,9 @@ def test_a_batch_over_several_segments_is_searched(lab: Map) -> None:
         (replace(frame("q"), descriptor=np.full(DIMENSION, np.nan, np.float32)), ValueError),
         (replace(frame("q"), descriptor=np.full(DIMENSION, 1e30, np.float32)), ValueError),
         (replace(frame("q"), descriptor=np.zeros(DIMENSION, np.float32)), NoRegions),
+        (replace(frame("q"), local=local_of("q", (5, 3))), ValueError),
+        (replace(frame("q"), local=local_of("q", (0, 0))), ValueError),
+        (replace(frame("q"), local=local_of("q").astype(np.uint8)), ValueError),
         (replace(frame("q"), digest=b"short"), ValueError),
         (replace(frame("q"), regions=-1), ValueError),
         (frame("q", metadata={"a": float("nan")}), InvalidField),
@@ -310,7 +314,7 @@ def photograph() -> bytes:
 
 
 def test_what_is_kept_of_a_frame(atlas: Atlas) -> None:
-    hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"))
+    hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     hall.enrol([frame("a")])
     assert hall.place("a").picture == "none"
     with pytest.raises(NoThumbnail):
@@ -352,6 +356,8 @@ def test_all_of_it_is_there_after_a_restart(lab: Map, atlas: Atlas, directory: P
             ):
                 np.testing.assert_array_equal(mine, theirs)
         living = after.search(descriptor_of("p1"))[0]
+        np.testing.assert_array_equal(after.locals_at(living), before.locals_at(living))
+        np.testing.assert_array_equal(after.locals_at(after.search(descriptor_of("other"))[0])[0], local_of("other"))
         for mine, theirs in zip(
             vars(after.whereabouts.take(living)).values(), vars(before.whereabouts.take(living)).values(), strict=True
         ):

@@ -15,7 +15,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from core.errors import UnknownPlace, UnknownSequence
 from core.places import PlaceFields, Pose
 from core.storage import Atlas
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, digest_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 IDS = st.sampled_from([f"p{i}" for i in range(7)])
 PICTURES = st.sampled_from([f"picture {i}" for i in range(5)])
@@ -36,7 +36,7 @@ class MapHistory(RuleBasedStateMachine):
     def start(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="placerec-history-"))
         self.atlas = Atlas(self.folder / "data", rows_per_segment=3)
-        self.lab = self.atlas.create("lab", ENCODER, DIMENSION)
+        self.lab = self.atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
         self.model: dict[str, Known] = {}
         self.count = 0
 
@@ -130,10 +130,11 @@ class MapHistory(RuleBasedStateMachine):
         found = self.lab.places_at(rows.tolist())
         assert len(snapshot) == len(rows) == len(self.model)
         assert sorted(place.id for place in found if place) == sorted(self.model)
-        there = snapshot.whereabouts.take(rows)
+        there, local = snapshot.whereabouts.take(rows), snapshot.locals_at(rows)
         for i, place in enumerate(found):
             assert place is not None
             known = self.model[place.id]
+            np.testing.assert_array_equal(local[i], local_of(known.picture))
             assert abs(products[i] - float(descriptor_of(known.picture) @ query)) < 1e-5
             assert self.lab.digest(place.id) == digest_of(known.picture)
             assert (place.pose.x if place.pose else None, place.sequence) == (known.x, known.sequence)

@@ -14,9 +14,8 @@ import pytest
 from core.errors import MapQuarantined
 from core.storage import Atlas
 from core.storage.descriptors import HEADER_BYTES
-from tests.core.storage.frames import DIMENSION, ENCODER, descriptor_of, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, descriptor_of, frame, local_of
 
-RECORD_BYTES = DIMENSION * 4 + 16
 PLACES = 10  # two full segments of four rows and a tail of two
 
 
@@ -24,8 +23,8 @@ PLACES = 10  # two full segments of four rows and a tail of two
 def folder(directory: Path) -> Path:
     """Of a map of ten places, closed; beside it a map that must always serve."""
     atlas = Atlas(directory, rows_per_segment=4)
-    atlas.create("hall", ENCODER, DIMENSION).enrol([frame("h")])
-    atlas.create("lab", ENCODER, DIMENSION).enrol([frame(f"p{i}") for i in range(PLACES)])
+    atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("h")])
+    atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame(f"p{i}") for i in range(PLACES)])
     atlas.close()
     return directory / "maps" / "lab"
 
@@ -40,6 +39,7 @@ def check(directory: Path) -> None:
             rows, products = lab.snapshot().search(descriptor_of(f"p{i}"))
             assert (rows[0], rows.size) == (i, PLACES)
             assert products[0] == pytest.approx(1, abs=1e-5)
+            np.testing.assert_array_equal(lab.snapshot().locals_at(rows[:1]), [local_of(f"p{i}")])
         report = lab.verify()
         assert (report.ok, report.problems, report.stale_caches) == (True, [], [])
     finally:
@@ -70,11 +70,16 @@ def garbage(path: Path) -> None:
     path.write_bytes(os.urandom(path.stat().st_size))
 
 
+def flip_local(path: Path) -> None:
+    """The trailer of 32 bytes is last, the local descriptors of four rows are before it."""
+    flip(path, path.stat().st_size - 32 - 4 * 15)
+
+
 def of_another_segment(path: Path) -> None:
     path.write_bytes(path.with_name("index-000002.faiss").read_bytes())
 
 
-@pytest.mark.parametrize("spoil", [remove, cut, flip_middle, garbage, of_another_segment])
+@pytest.mark.parametrize("spoil", [remove, cut, flip_middle, flip_local, garbage, of_another_segment])
 def test_a_cache_that_is_no_good_is_made_again(
     directory: Path, folder: Path, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -91,7 +96,9 @@ def test_a_good_cache_saves_reading_the_descriptors(directory: Path, folder: Pat
     flip(folder / "descriptors-000001.seg", HEADER_BYTES + 5)
     atlas = Atlas(directory)
     lab = atlas.get("lab")
-    assert lab.snapshot().search(descriptor_of("p0"))[0][0] == 0
+    rows = lab.snapshot().search(descriptor_of("p0"))[0]
+    assert rows[0] == 0
+    np.testing.assert_array_equal(lab.snapshot().locals_at(rows[:1]), [local_of("p0")])
     report = lab.verify()  # which reads all the same
     assert not report.ok
     assert report.problems == [
@@ -134,6 +141,10 @@ def test_a_write_that_ended_before_its_commit_is_as_if_it_had_not_been(directory
 
 def damage_row(folder: Path) -> None:
     flip(folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES + 7)
+
+
+def damage_local(folder: Path) -> None:
+    flip(folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES + DIMENSION * 4 + 7)
 
 
 def damage_header(folder: Path) -> None:
@@ -186,6 +197,7 @@ def spoil_a_pose(folder: Path) -> None:
     ("spoil", "reason"),
     [
         (damage_row, r"descriptors-000003\.seg: row 9 does not match"),
+        (damage_local, r"descriptors-000003\.seg: row 9 does not match"),
         (damage_header, r"descriptors-000003\.seg: the header"),
         (cut_tail, r"descriptors-000003\.seg: the file ends after 1 of 2 rows"),
         (remove_tail, r"descriptors-000003\.seg: the file is missing"),

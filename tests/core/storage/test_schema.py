@@ -43,10 +43,22 @@ def test_an_empty_file_gets_the_newest_schema(connection: sqlite3.Connection) ->
 def test_an_older_file_becomes_newer_and_keeps_what_it_holds(connection: sqlite3.Connection) -> None:
     migrate(connection, create=True)
     connection.execute(PLACE)
-    assert migrate(connection, LATER) == 2
+    assert migrate(connection, LATER) == len(LATER) - len(MIGRATIONS)
     assert version(connection) == len(LATER)
     assert connection.execute("SELECT id, regions, floor FROM places").fetchall() == [("p", 3, 1)]
     check_schema(connection, LATER)
+
+
+def test_maps_of_the_first_schema_have_no_local_descriptors(connection: sqlite3.Connection) -> None:
+    migrate(connection, MIGRATIONS[:1], create=True)
+    columns = "only, id, encoder, dimension, rows_per_segment, description, keep, same_place_radius, same_place_frames"
+    values = "1, 'lab', 'e@1', 16, 4, '', 'none', 5.0, 3, 1, 'then', 'then'"
+    connection.execute(f"INSERT INTO map ({columns}, revision, created_at, updated_at) VALUES ({values})")
+    assert migrate(connection) == len(MIGRATIONS) - 1
+    assert connection.execute("SELECT dimension, local_cells, local_values FROM map").fetchall() == [(16, 0, 0)]
+    check_schema(connection)
+    with pytest.raises(sqlite3.IntegrityError):
+        connection.execute("UPDATE map SET local_cells = -1")
 
 
 def test_a_migration_that_fails_leaves_the_file_as_it_was(connection: sqlite3.Connection) -> None:

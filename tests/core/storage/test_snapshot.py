@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from core.storage import Snapshot
 from core.storage import snapshot as module
 from core.storage.snapshot import Spot, flat_index, vectors
-from tests.core.storage.frames import descriptor_of
+from tests.core.storage.frames import descriptor_of, local_of
 
-DIMENSION, ROWS = 8, 4
+DIMENSION, ROWS, SHAPE = 8, 4, (2, 3)
 
 
 def spot(row: int, kind: int = 1) -> Spot:
@@ -24,8 +24,19 @@ def descriptors(count: int, start: int = 0) -> list[NDArray[np.float32]]:
     return [descriptor_of(f"row {start + i}", DIMENSION) for i in range(count)]
 
 
+def local(count: int, start: int = 0) -> list[NDArray[np.int8]]:
+    return [local_of(f"row {start + i}", SHAPE) for i in range(count)]
+
+
+def grown(snapshot: Snapshot, count: int) -> Snapshot:
+    """With so many rows more."""
+    start = snapshot.rows
+    spots = [spot(start + row) for row in range(count)]
+    return snapshot.appended(descriptors(count, start), spots, local(count, start))
+
+
 def snapshot_of(count: int) -> Snapshot:
-    return Snapshot(DIMENSION, ROWS).appended(descriptors(count), [spot(row) for row in range(count)])
+    return grown(Snapshot(DIMENSION, ROWS, local_shape=SHAPE), count)
 
 
 QUERY = descriptor_of("query", DIMENSION)
@@ -82,7 +93,7 @@ def test_whereabouts_are_those_of_the_rows() -> None:
 
 def test_a_later_write_does_not_change_an_earlier_snapshot() -> None:
     first = snapshot_of(6)
-    second = first.appended(descriptors(5, 6), [spot(row) for row in range(6, 11)])
+    second = grown(first, 5)
     third = second.without([0, 7]).moved({1: spot(99, kind=2)})
     assert first.search(QUERY)[0].tolist() == expected(list(range(6)))
     assert second.search(QUERY)[0].tolist() == expected(list(range(11)))
@@ -90,33 +101,76 @@ def test_a_later_write_does_not_change_an_earlier_snapshot() -> None:
     assert (second.whereabouts.kind[1], third.whereabouts.kind[1]) == (1, 2)
     assert third.whereabouts.position[1].tolist() == [99.0, 0.5, -1.0]
     assert (len(first), len(second), len(third)) == (6, 11, 9)
+    for snapshot in (first, second, third):
+        every = np.arange(snapshot.rows)
+        np.testing.assert_array_equal(snapshot.locals_at(every), local(snapshot.rows))
 
 
 def test_a_write_copies_no_full_segment_and_not_the_tail_it_still_fits() -> None:
-    snapshot = Snapshot(DIMENSION, 64).appended(descriptors(65), [spot(row) for row in range(65)])
-    after = snapshot.appended(descriptors(1, 65), [spot(65)])
+    snapshot = grown(Snapshot(DIMENSION, 64, local_shape=SHAPE), 65)
+    after = grown(snapshot, 1)
     assert [a.index is b.index for a, b in zip(snapshot.segments, after.segments, strict=True)] == [True, True]
+    assert [a.local is b.local for a, b in zip(snapshot.segments, after.segments, strict=True)] == [True, True]
     edited = after.moved({65: spot(1)}).without([65])
     assert edited.segments[0] is after.segments[0]
     assert edited.segments[1].index is after.segments[1].index
+    assert edited.segments[1].local is after.segments[1].local
 
 
 def test_a_growing_tail_is_seldom_copied() -> None:
-    snapshot, indexes = Snapshot(DIMENSION, 256), set()
+    snapshot, tails, locals_ = Snapshot(DIMENSION, 256, local_shape=SHAPE), set(), set()
     kept = []
-    for row in range(256):
-        snapshot = snapshot.appended(descriptors(1, row), [spot(row)])
-        kept.append(snapshot.segments[-1].index)  # or an address might be used again
-        indexes.add(id(kept[-1]))
-    assert len(indexes) == 6  # 8, 16, … 256
+    for _ in range(256):
+        snapshot = grown(snapshot, 1)
+        kept.append(snapshot.segments[-1])  # or an address might be used again
+        tails.add(id(kept[-1].index))
+        locals_.add(id(kept[-1].local))
+        assert len(kept[-1].local) == kept[-1].index.ntotal
+    assert len(tails) == len(locals_) == 6  # 8, 16, … 256
     assert snapshot.search(QUERY)[0].tolist() == expected(list(range(256)))
+    np.testing.assert_array_equal(snapshot.locals_at(np.arange(256)), local(256))
 
 
 def test_a_write_that_was_given_up_is_overwritten() -> None:
     snapshot = snapshot_of(5)
-    snapshot.appended(descriptors(1, 77), [spot(77)])
-    after = snapshot.appended(descriptors(1, 5), [spot(5)])
+    snapshot.appended(descriptors(1, 77), [spot(77)], local(1, 77))
+    after = grown(snapshot, 1)
     assert after.search(QUERY)[0].tolist() == expected(list(range(6)))
+    np.testing.assert_array_equal(after.locals_at(np.array([5])), local(1, 5))
+
+
+def test_local_descriptors_come_in_the_order_of_the_rows_and_are_a_copy() -> None:
+    snapshot = snapshot_of(11)
+    rows = np.array([10, 0, 4, 0, 7])
+    found = snapshot.locals_at(rows)
+    assert (str(found.dtype), found.shape, found.flags.c_contiguous) == ("int8", (5, *SHAPE), True)
+    np.testing.assert_array_equal(found, [local(1, row)[0] for row in rows])
+    found[:] = 0
+    np.testing.assert_array_equal(snapshot.locals_at(np.array([4]))[0], local(1, 4)[0])
+    assert snapshot.locals_at(np.empty(0, np.int64)).shape == (0, *SHAPE)
+
+
+@pytest.mark.parametrize("row", [-1, 6, 7, 8])
+def test_room_that_later_snapshots_use_is_nobodys(row: int) -> None:
+    """Row 6 and 7 are there already, in memory that is shared with the later snapshot."""
+    snapshot = snapshot_of(6)
+    grown(snapshot, 3)
+    with pytest.raises(IndexError, match="rows 0 to 5"):
+        snapshot.locals_at(np.array([0, row]))
+
+
+def test_without_local_descriptors_there_is_nothing_of_them() -> None:
+    snapshot = Snapshot(DIMENSION, ROWS).appended(descriptors(6), [spot(row) for row in range(6)])
+    assert snapshot.search(QUERY)[0].tolist() == expected(list(range(6)))
+    assert snapshot.locals_at(np.array([5, 1])).shape == (2, 0, 0)
+    assert [segment.local.nbytes for segment in snapshot.segments] == [0, 0]
+
+
+def test_every_place_has_its_local_descriptors() -> None:
+    with pytest.raises(ValueError, match="every place"):
+        snapshot_of(3).appended(descriptors(2, 3), [spot(3), spot(4)], local(1, 3))
+    with pytest.raises(ValueError, match="every place"):
+        snapshot_of(3).appended(descriptors(1, 3), [spot(3)])
 
 
 def test_a_segment_of_the_dead_is_not_searched() -> None:
@@ -183,15 +237,18 @@ def test_searches_while_a_writer_appends() -> None:
     def search() -> None:
         while not done.is_set():
             snapshot = newest[0]
-            rows = snapshot.search(QUERY)[0].tolist()
-            if rows != expected(list(range(len(snapshot)))):
+            rows = snapshot.search(QUERY)[0]
+            if rows.tolist() != expected(list(range(len(snapshot)))):
                 faults.append(str(rows))
+            if not np.array_equal(snapshot.locals_at(rows[:5]), [local(1, row)[0] for row in rows[:5].tolist()]):
+                faults.append("local descriptors")
 
     threads = [threading.Thread(target=search) for _ in range(3)]
     for thread in threads:
         thread.start()
     for row in range(1, 60):
-        newest[0] = newest[0].appended(descriptors(1, row), [spot(row)])
+        assert newest[0].rows == row
+        newest[0] = grown(newest[0], 1)
     done.set()
     for thread in threads:
         thread.join()
@@ -210,12 +267,12 @@ def test_searches_while_a_writer_appends() -> None:
     )
 )
 def test_any_history_is_searched_as_by_brute_force(steps: list[tuple[str, int]]) -> None:
-    snapshot, alive, moved = Snapshot(DIMENSION, ROWS), list[int](), dict[int, int]()
+    snapshot, alive, moved = Snapshot(DIMENSION, ROWS, local_shape=SHAPE), list[int](), dict[int, int]()
     total = 0
     for action, number in steps:
         if action == "append":
             fresh = list(range(total, total + number))
-            snapshot = snapshot.appended(descriptors(number, total), [spot(row) for row in fresh])
+            snapshot = grown(snapshot, number)
             alive, total = alive + fresh, total + number
         elif number in alive and action == "bury":
             snapshot = snapshot.without([number])
@@ -227,4 +284,5 @@ def test_any_history_is_searched_as_by_brute_force(steps: list[tuple[str, int]])
     assert snapshot.rows == total
     rows, _ = snapshot.search(QUERY)
     assert rows.tolist() == expected(alive)
+    assert snapshot.locals_at(rows).tolist() == [local(1, row)[0].tolist() for row in rows.tolist()]
     assert snapshot.whereabouts.take(rows).ordinal.tolist() == [moved.get(row, row) for row in rows.tolist()]

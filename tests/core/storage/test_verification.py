@@ -9,16 +9,14 @@ import pytest
 from core.storage import Atlas, Map, MapSettings
 from core.storage.descriptors import HEADER_BYTES
 from core.storage.snapshot import vectors
-from tests.core.storage.frames import DIMENSION, ENCODER, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
-
-RECORD_BYTES = DIMENSION * 4 + 16
 
 
 @pytest.fixture
 def hall(atlas: Atlas) -> Map:
     """Ten places, one of them forgotten, in segments of four rows; images are kept."""
-    hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="image"))
+    hall = atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     images = [f"image {i}".encode() for i in range(10)]
     hall.enrol(
         [
@@ -58,9 +56,19 @@ def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:
     assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in problems
 
 
+def test_a_flipped_bit_of_any_part_of_a_row_is_found(hall: Map, folder: Path) -> None:
+    path, start = folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES
+    local = DIMENSION * 4
+    for offset in (0, local - 1, local, local + 7, local + 14, local + 15):
+        flip(path, start + offset)
+        assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in hall.verify().problems
+        flip(path, start + offset)
+    assert hall.verify().ok
+
+
 def test_many_damaged_rows_are_counted(atlas: Atlas, directory: Path) -> None:
     atlas._rows_per_segment = 64
-    lab = atlas.create("lab", ENCODER, DIMENSION)
+    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     lab.enrol([frame(f"p{i}") for i in range(30)])
     for row in range(30):
         flip(directory / "maps" / "lab" / "descriptors-000001.seg", HEADER_BYTES + row * RECORD_BYTES)
@@ -107,6 +115,11 @@ def test_a_damaged_cache_is_told_but_is_no_damage(hall: Map, folder: Path) -> No
 def test_what_is_searched_must_be_what_is_stored(hall: Map) -> None:
     vectors(hall.snapshot().segments[1].index)[0, 0] += 1
     assert hall.verify().problems == ["descriptors-000002.seg: row 4 (place 'p4') is not what is searched"]
+
+
+def test_what_is_compared_after_the_search_must_be_what_is_stored(hall: Map) -> None:
+    hall.snapshot().segments[2].local[1, 2, 4] ^= 1
+    assert hall.verify().problems == ["descriptors-000003.seg: row 9 (place 'p9') is not what is searched"]
 
 
 @pytest.mark.parametrize(

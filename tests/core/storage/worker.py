@@ -18,7 +18,7 @@ from pathlib import Path
 from core.errors import PlacerecError
 from core.places import PlaceFields
 from core.storage import Atlas, Map, MapSettings
-from tests.core.storage.frames import DIMENSION, ENCODER, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 LARGE = 4096
 """Dimension with which the descriptors are by far the most that is written."""
@@ -32,7 +32,7 @@ def everything(directory: Path) -> None:
     """Every kind of write once or more."""
     atlas = Atlas(directory, rows_per_segment=4)
     acknowledge("opened")
-    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"))
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
     acknowledge("created map")
     lab.enrol([frame("p0", sequence="monday")])
     acknowledge("enrolled one")
@@ -52,7 +52,7 @@ def everything(directory: Path) -> None:
     acknowledge("forgot")
     lab.forget_sequence("monday")
     acknowledge("forgot sequence")
-    atlas.create("hall", ENCODER, DIMENSION).enrol([frame("h")])
+    atlas.create("hall", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("h")])
     acknowledge("created another")
     atlas.delete("hall")
     acknowledge("deleted")
@@ -70,7 +70,11 @@ def everything(directory: Path) -> None:
 def enrol_for_ever(directory: Path) -> None:
     """Enrols two new places, replaces one and forgets one, over and over; tells of each step before and after it."""
     atlas = Atlas(directory, rows_per_segment=4)
-    lab = atlas.get("lab") if atlas.records(None, 1)[0] else atlas.create("lab", ENCODER, DIMENSION)
+    lab = (
+        atlas.get("lab")
+        if atlas.records(None, 1)[0]
+        else atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    )
     for i in itertools.count(lab.snapshot().rows):
         fresh, twin = f"new{i}", f"pair{i}"
         steps: list[tuple[dict[str, str | None], Callable[[], object]]] = [
@@ -87,7 +91,7 @@ def enrol_for_ever(directory: Path) -> None:
 def fill(directory: Path) -> None:
     """Enrols until a limit on the size of files stops it; then shows that the map still works."""
     atlas = Atlas(directory, rows_per_segment=1024)
-    lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"))
+    lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))
     refused = _until_refused(lab)
     size = (directory / "maps" / "lab" / "descriptors-000001.seg").stat().st_size

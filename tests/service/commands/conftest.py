@@ -26,6 +26,7 @@ def placerec(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Placer
     for name in [name for name in os.environ if name.startswith("PLACEREC_")]:
         monkeypatch.delenv(name)
     monkeypatch.setenv("PLACEREC_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     runner = CliRunner()
 
     def run(*words: object, status: int = 0, stdin: str | None = None) -> Result:

@@ -63,7 +63,7 @@ def test_options_reach_the_definition_and_a_map_uses_it(
     assert made.stdout.startswith("raw@")
     assert "broken.jpg is left out" in made.stderr
     definition = EncoderCatalogue(tmp_path / "models").get("raw").definition
-    assert definition.model_dump() == {
+    assert definition.model_dump(exclude_none=True) == {
         "layers": ("conv3", "conv4"),
         "regions": 30,
         "steps": (0.1, 0.2),
@@ -103,7 +103,7 @@ def test_names_are_guarded(placerec: Placerec, pictures: Path, tmp_path: Path) -
 
 def test_what_is_refused(placerec: Placerec, pictures: Path, tmp_path: Path) -> None:
     train = ("vocabulary", "train", pictures, "--name", "mine", "--models-dir", tmp_path)
-    assert "no convolution named conv9" in placerec(*train, "--layers", "conv9", status=1).stderr
+    assert "no convolution or pooling named conv9" in placerec(*train, "--layers", "conv9", status=1).stderr
     assert "no network named 'hybridnet'" in placerec(*train, "--network", "hybridnet", status=1).stderr
     placerec(*train, "--step", "small", status=2)
     assert "one positive quantisation step" in placerec(*train, "--step", "1,2,3", status=1).stderr
