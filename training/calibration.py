@@ -7,6 +7,7 @@ left out, webcams over months, and webcams by night shifted sideways.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from core.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
 from core.verdict import Calibration, Neighborhood, Whereabouts, judge
-from training.validation import Cameras, Walk
+from training.validation import Cameras
 
 Array = NDArray[np.float32]
 
@@ -31,12 +32,13 @@ class Trials:
     right: NDArray[np.bool_]
 
 
-def trials(scores: Array, truth: NDArray[np.bool_], calibration: Calibration) -> Trials:
+def trials(scores: Array, truth: NDArray[np.bool_], calibration: Calibration, examined: int) -> Trials:
     """Judge every query against one map whose places are consecutive frames.
 
     Args:
         scores: float32 [Q, R].
         truth: bool [Q, R].
+        examined: candidates of the encoder's second stage; 0 without one.
     """
     rows = []
     places = scores.shape[1]
@@ -45,7 +47,7 @@ def trials(scores: Array, truth: NDArray[np.bool_], calibration: Calibration) ->
     )
     for query, true in zip(scores, truth, strict=True):
         order = np.argsort(-query, kind="stable")
-        judgement = judge(query[order], frames.take(order), calibration, NEIGHBORHOOD)
+        judgement = judge(query[order], frames.take(order), calibration, NEIGHBORHOOD, examined)
         rows.append((judgement.decision, judgement.margin, true.any(), true[order[0]]))
     decision, margin, known, right = (np.array(column) for column in zip(*rows, strict=True))
     return Trials(decision.astype(float), margin.astype(float), known.astype(bool), right.astype(bool))
@@ -57,14 +59,14 @@ def joined(parts: list[Trials]) -> Trials:
     return Trials(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
 
-def walk_trials(task: Walk, scores: Array, calibration: Calibration) -> Trials:
-    """Both halves of the references left out in turn; scores float32 [Q, R]."""
-    middle = scores.shape[1] // 2
-    halves = (slice(None, middle), slice(middle, None))
-    return joined([trials(scores[:, half], task.truth[:, half], calibration) for half in halves])
+def walk_trials(
+    truth: NDArray[np.bool_], halves: Sequence[tuple[slice, Array]], calibration: Calibration, examined: int
+) -> Trials:
+    """A walk against maps of parts of its references: bool [Q, R], and of each part the scores, float32 [Q, part]."""
+    return joined([trials(scores, truth[:, part], calibration, examined) for part, scores in halves])
 
 
-def camera_trials(task: Cameras, scores: Array, distractors: Array, calibration: Calibration) -> Trials:
+def camera_trials(task: Cameras, scores: Array, distractors: Array, calibration: Calibration, examined: int) -> Trials:
     """One reference a camera among the distractors, and the same map without it.
 
     Args:
@@ -79,10 +81,10 @@ def camera_trials(task: Cameras, scores: Array, distractors: Array, calibration:
         others = [first[c] for c in cameras if c != camera]
         without = np.hstack([distractors[asked], scores[np.ix_(asked, np.array(others))]])
         nothing = np.zeros(without.shape, np.bool_)
-        parts.append(trials(without, nothing, calibration))
+        parts.append(trials(without, nothing, calibration, examined))
         whole = np.hstack([without, scores[asked, first[camera]][:, None]])
         truth = np.hstack([nothing, np.ones((len(asked), 1), np.bool_)])
-        parts.append(trials(whole, truth, calibration))
+        parts.append(trials(whole, truth, calibration, examined))
     return joined(parts)
 
 

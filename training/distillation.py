@@ -29,6 +29,7 @@ from training.student import Student
 from training.teacher import Teacher
 
 SIDE = 227
+HEADS_ALONE = 0.02
 AVERAGING = 0.999  # decay of the running average of the weights, which is what is exported
 
 
@@ -91,6 +92,7 @@ def distill(
     workers: int = 1,
     checkpoint_every: int = 500,
     stop_after: int | None = None,
+    start: Path | None = None,
 ) -> Path:
     """Train for ``crops`` crops, resuming from ``output`` if a checkpoint lies there.
 
@@ -100,6 +102,8 @@ def distill(
 
     Args:
         stop_after: end this sitting after that many steps (the schedule stays that of ``crops``).
+        start: folded weights of an earlier run to go on from; the first HEADS_ALONE of the steps
+            then move nothing but the heads.
 
     Returns:
         The path of the folded weights.
@@ -138,6 +142,13 @@ def distill(
     sample = [targets(clean, None) for clean, _ in itertools.islice(crops_of(split.train, 0, 8 * batch, seed + 1), 8)]
     standards = tuple(Standardization.of(torch.cat(maps)) for maps in zip(*sample, strict=True))
 
+    if start is not None and first == 0:
+        pixels = torch.cat([clean for clean, _ in itertools.islice(crops_of(split.train, 0, 8 * batch, seed + 3), 8)])
+        student.take_up(load_file(start), pixels)
+        average.load_state_dict(student.state_dict())
+    backbone = list(student.stages.parameters())
+    heads_alone = 0 if start is None else int(HEADS_ALONE * steps)
+
     def loss_of(network: Student, clean: Tensor, disturbed: Tensor) -> Tensor:
         goal = targets(clean, standards)
         with autocast():
@@ -155,6 +166,8 @@ def distill(
     for step, pair in enumerate(crops_of(split.train, first * batch, last * batch, seed), start=first):
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, steps, peak_rate)
+        for parameter in backbone:
+            parameter.requires_grad_(step >= heads_alone)
         loss = loss_of(student, *pair)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
@@ -229,6 +242,8 @@ def main(
     output: Annotated[Path, typer.Option(help="Folder for checkpoints, log and weights.")] = Path("runs/distillation"),
     crops: Annotated[int, typer.Option(min=64, help="Length of the whole schedule in crops.")] = 200_000,
     batch: Annotated[int, typer.Option(min=2)] = 32,
+    peak_rate: Annotated[float, typer.Option(help="Highest learning rate.")] = 2e-3,
+    start: Annotated[Path | None, typer.Option(help="Folded weights of an earlier run to go on from.")] = None,
     seed: int = 0,
     workers: Annotated[int, typer.Option(min=0)] = 1,
     stop_after: Annotated[int | None, typer.Option(help="End this sitting after that many steps.")] = None,
@@ -236,7 +251,16 @@ def main(
     """Distil the default backbone; run it again to resume."""
     torch.set_num_threads(max(1, (os.cpu_count() or 2)))
     weights = distill(
-        photographs, teacher, output, crops=crops, batch=batch, seed=seed, workers=workers, stop_after=stop_after
+        photographs,
+        teacher,
+        output,
+        crops=crops,
+        batch=batch,
+        peak_rate=peak_rate,
+        seed=seed,
+        workers=workers,
+        stop_after=stop_after,
+        start=start,
     )
     typer.echo(f"weights: {weights}")
 

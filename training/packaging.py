@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
@@ -18,15 +20,30 @@ from torch import Tensor
 
 from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
 from core.encoders import NETWORK_SUFFIX, PACKAGED, save_encoder
+from core.evaluation import auc_roc
 from core.network import ShallowNetwork, save_network
 from core.preprocessing import Pixels
 from core.presets import NETWORK, PRESETS
 from core.verdict import Calibration
 from core.vocabulary import Vocabulary, pool_features, train_vocabulary
 from training.calibration import Trials, camera_trials, choose, rates, walk_trials
-from training.photographs import split_photographs
+from training.photographs import read, split_photographs
+from training.projection import fit_projections
 from training.student import student_definition
-from training.validation import DISTRACTORS, Cameras, Walk, camera_recall, read, shifted_night, walk, webcams
+from training.validation import (
+    DISTRACTORS,
+    Cameras,
+    Shown,
+    Walk,
+    camera_recall,
+    camera_scores,
+    describe,
+    realigned,
+    scores,
+    shifted_night,
+    walk,
+    webcams,
+)
 
 Array = NDArray[np.float32]
 
@@ -38,18 +55,20 @@ UNCALIBRATED = Calibration(
 
 @dataclass(frozen=True)
 class Tasks:
-    """The three validation tasks."""
+    """The three validation tasks; of lip6 with the truth as it is stated, too."""
 
     lip6: Walk
+    lip6_as_stated: Walk
     webcams: Cameras
     night: Cameras
 
 
 def load_tasks(datasets: Path) -> Tasks:
     """Read the validation pictures into memory."""
-    lip6 = walk(datasets / "eval/lip6_outdoor", "query", "reference")
-    distractors = lip6.references[:DISTRACTORS]
-    return Tasks(lip6, webcams(datasets / "eval/webcams", distractors), shifted_night(datasets / "train", distractors))
+    stated = walk(datasets / "eval/lip6_outdoor", "query", "reference")
+    distractors = stated.references[:DISTRACTORS]
+    fixed = webcams(datasets / "eval/webcams", distractors), shifted_night(datasets / "train", distractors)
+    return Tasks(realigned(stated), stated, *fixed)
 
 
 def vocabulary_pictures(datasets: Path, count: int, seed: int) -> list[Pixels]:
@@ -59,18 +78,29 @@ def vocabulary_pictures(datasets: Path, count: int, seed: int) -> list[Pixels]:
     return [read(paths[index]) for index in sorted(chosen)]
 
 
-def network_of(weights: dict[str, Tensor], layers: Sequence[str]) -> ShallowNetwork:
-    """The distilled backbone as deep as ``layers`` needs."""
-    network = ShallowNetwork(student_definition(), layers)
+def network_of(weights: dict[str, Tensor], layers: Sequence[str], side: int | None = None) -> ShallowNetwork:
+    """The distilled backbone as deep as ``layers`` needs; ``side`` makes its input another size than its own."""
+    definition = student_definition()
+    if side is not None:
+        shown = definition.input.model_copy(update={"height": side, "width": side})
+        definition = definition.model_copy(update={"input": shown})
+    network = ShallowNetwork(definition, layers)
     network.load_weights(weights)
     return network.eval().requires_grad_(False)
 
 
 def build(
-    name: str, definition: EncoderDefinition, weights: dict[str, Tensor], pictures: Sequence[Pixels], seed: int
+    name: str,
+    definition: EncoderDefinition,
+    weights: dict[str, Tensor],
+    photographs: Path,
+    pictures: Sequence[Pixels],
+    seed: int,
 ) -> tuple[Encoder, Vocabulary]:
-    """An encoder with a vocabulary trained on ``pictures``, not yet calibrated."""
-    extractor = FeatureExtractor(network_of(weights, definition.layers), definition)
+    """An encoder, not yet calibrated: projections fitted to ``photographs``, a vocabulary trained on ``pictures``."""
+    network, wanted = network_of(weights, definition.outputs), definition.projected()
+    projections = fit_projections(network, wanted, photographs, seed=seed) if wanted else {}
+    extractor = FeatureExtractor(network, definition, projections)
     frames = (
         extractor.regions(extractor.activations([picture])[0]).features
         for picture in track(pictures, f"features for {name}")
@@ -79,35 +109,23 @@ def build(
     return Encoder(name, extractor, definition, vocabulary, UNCALIBRATED), vocabulary
 
 
-def descriptors(encoder: Encoder, frames: Sequence[Pixels]) -> Array:
-    """float32 [n, D], eight frames at a time."""
-    batches = [frames[start : start + 8] for start in range(0, len(frames), 8)]
-    made = [encoding.descriptor for batch in batches for encoding in encoder.encode_batch(batch)]
-    return np.stack(made) if made else np.zeros((0, encoder.dimension), np.float32)
-
-
 def assess(encoder: Encoder, tasks: Tasks) -> tuple[Calibration, dict[str, Any]]:
     """The calibration measured on the tasks, and the figures on them."""
-    queries, references = descriptors(encoder, tasks.lip6.queries), descriptors(encoder, tasks.lip6.references)
-    cameras = {
-        "webcams": (tasks.webcams, descriptors(encoder, tasks.webcams.pictures)),
-        "night": (tasks.night, descriptors(encoder, tasks.night.pictures)),
-    }
-    score = encoder.scores_from_inner_products
-    walked = score(queries @ references.T)
-    far = references[:DISTRACTORS]
-    unrelated = score(cameras["webcams"][1] @ references.T)
-    start = UNCALIBRATED.model_copy(
-        update={
-            "background_mean": round(float(unrelated.mean()), 5),
-            "background_deviation": round(float(unrelated.std()), 5),
-        }
-    )
+    queries, references = describe(encoder, tasks.lip6.queries), describe(encoder, tasks.lip6.references)
+    far = references.part(slice(0, DISTRACTORS))
+    walked = scores(encoder, queries, references)
+    middle, end = len(references.local) // 2, len(references.local)
+    parts = [slice(0, middle), slice(middle, end)]
+    halves = [(part, scores(encoder, queries, references.part(part))) for part in parts]
+    cameras = {}
+    for name, task in (("webcams", tasks.webcams), ("night", tasks.night)):
+        cameras[name] = (task, *camera_scores(encoder, describe(encoder, task.pictures), far))
+    start = UNCALIBRATED.model_copy(update=background(encoder, describe(encoder, tasks.webcams.pictures), far))
 
     def all_trials(calibration: Calibration) -> dict[str, Trials]:
-        made = {"lip6": walk_trials(tasks.lip6, walked, calibration)}
-        for name, (task, shown) in cameras.items():
-            made[name] = camera_trials(task, score(shown @ shown.T), score(shown @ far.T), calibration)
+        made = {"lip6": walk_trials(tasks.lip6.truth, halves, calibration, encoder.candidates)}
+        for name, (task, among, apart) in cameras.items():
+            made[name] = camera_trials(task, among, apart, calibration, encoder.candidates)
         return made
 
     outcomes = all_trials(start)
@@ -115,11 +133,26 @@ def assess(encoder: Encoder, tasks: Tasks) -> tuple[Calibration, dict[str, Any]]
     best = walked.argmax(axis=1)
     figures: dict[str, Any] = {
         "lip6_recall_at_1": float(tasks.lip6.truth[np.arange(len(best)), best].mean()),
+        "lip6_recall_at_1_as_stated": float(tasks.lip6_as_stated.truth[np.arange(len(best)), best].mean()),
         "verdicts": {name: rates(outcome, calibration) for name, outcome in outcomes.items()},
+        "decision_auc_roc": {
+            name: auc_roc(outcome.decision, outcome.known & outcome.right) for name, outcome in outcomes.items()
+        },
     }
-    for name, (task, shown) in cameras.items():
-        figures[f"{name}_recall_at_1"] = camera_recall(task, shown, far)
+    for name, (task, among, apart) in cameras.items():
+        figures[f"{name}_recall_at_1"] = camera_recall(task, among, apart)
     return calibration, figures
+
+
+def background(encoder: Encoder, frames: Shown, unrelated: Shown) -> dict[str, float]:
+    """How unrelated frames score when the second stage has examined them: what a map of a few places is filled with."""
+    first = encoder.scores_from_inner_products(frames.descriptors @ unrelated.descriptors.T)
+    gains = np.stack([encoder.agreement(cells, unrelated.local) for cells in frames.local])
+    examined = first + gains
+    return {
+        "background_mean": round(float(examined.mean()), 5),
+        "background_deviation": round(float(examined.std()), 5),
+    }
 
 
 def main(
@@ -135,17 +168,21 @@ def main(
     torch.manual_seed(seed)
     output.mkdir(parents=True, exist_ok=True)
     tensors = load_file(weights)
-    save_network(output / f"{NETWORK}{NETWORK_SUFFIX}", student_definition(), tensors)
     pictures, tasks = vocabulary_pictures(datasets, images, seed), load_tasks(datasets)
-    for name, definition in PRESETS.items():
-        encoder, vocabulary = build(name, definition, tensors, pictures, seed)
-        calibration, figures = assess(encoder, tasks)
-        encoder.calibration = calibration
-        training = {"images": len(pictures), "seed": seed, "source": "training photographs, see MODEL_CARD.md"}
-        save_encoder(output, encoder, vocabulary, NETWORK, training)
-        typer.echo(
-            json.dumps({"encoder": encoder.identity, "calibration": calibration.model_dump(), **figures}, indent=2)
-        )
+    # The encoders of one network go with it, so all files change together, at the end.
+    with TemporaryDirectory(dir=output, prefix="unfinished-") as unfinished:
+        folder = Path(unfinished)
+        save_network(folder / f"{NETWORK}{NETWORK_SUFFIX}", student_definition(), tensors)
+        for name, definition in PRESETS.items():
+            encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
+            calibration, figures = assess(encoder, tasks)
+            encoder.calibration = calibration
+            training = {"images": len(pictures), "seed": seed, "source": "training photographs, see MODEL_CARD.md"}
+            save_encoder(folder, encoder, vocabulary, NETWORK, training)
+            made = {"encoder": encoder.identity, "calibration": calibration.model_dump(), **figures}
+            typer.echo(json.dumps(made, indent=2))
+        for path in sorted(folder.iterdir()):
+            os.replace(path, output / path.name)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The encoder's constants, compared on the validation tasks over several vocabularies each.
 
-Prints a Markdown table: one row a configuration, the mean over the seeds of k-means and the largest
-difference between two of them.  The corridor traverse stands last, for the reader; nothing is
+Prints a Markdown table: one row a configuration, the mean over the seeds of k-means and half the
+largest difference between two of them.  The corridor traverse stands last, for the reader; nothing is
 chosen by it.
 """
 
@@ -13,53 +13,86 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import torch
 import typer
 from numpy.typing import NDArray
 from rich.progress import track
 from safetensors.torch import load_file
 
-from core.encoder import EncoderDefinition, FeatureExtractor
+from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
 from core.evaluation import auc_pr
+from core.network import ShallowNetwork
 from core.preprocessing import Pixels
 from core.presets import PRESETS
-from core.vlad import aggregate
+from core.projection import Projection
 from core.vocabulary import pool_features, train_vocabulary
-from training.packaging import Tasks, load_tasks, network_of, vocabulary_pictures
-from training.validation import DISTRACTORS, Walk, camera_recall, walk
+from training.contrast import refine
+from training.packaging import UNCALIBRATED, Tasks, load_tasks, network_of, vocabulary_pictures
+from training.projection import fit_projections, paired_cells
+from training.validation import DISTRACTORS, Shown, camera_recall, camera_scores, scores, walk
 
 Array = NDArray[np.float32]
 
-LAYERS = ("conv3", "conv4")
 DEFAULT = PRESETS["m-region-vlad"]
+assert DEFAULT.agreement is not None
+STAGE = DEFAULT.agreement
+OUTPUTS = DEFAULT.outputs
+WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
+"""Directions fitted of each layer; every configuration takes the first so many."""
+THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None}
+
+
+def _stage(**change: Any) -> dict[str, Any]:
+    return {"agreement": STAGE.model_copy(update=change)}
+
+
 CHANGES: dict[str, dict[str, Any]] = {
     "packaged": {},
-    "raw sums": {"unit_features": False},
+    "without the second stage": {"agreement": None},
+    "without second stage and projection": {"agreement": None, "projection": None},
+    "as the thesis (raw sums)": THESIS,
+    "as the thesis's code (raw sums, global)": {**THESIS, "normalization": "global"},
     "global": {"normalization": "global"},
-    "raw sums, global (as the thesis's code)": {"unit_features": False, "normalization": "global"},
-    "step 0.1": {"steps": (0.1, 0.1)},
     "step 0.5": {"steps": (0.5, 0.5)},
     "step 1.0": {"steps": (1.0, 1.0)},
-    "step 1.5": {"steps": (1.5, 1.5)},
     "step 3.0": {"steps": (3.0, 3.0)},
     "N = 150": {"regions": 150},
     "N = 600": {"regions": 600},
     "V = 64": {"words": 64},
-    "V = 256": {"words": 256},
+    "V = 256, 64 values": {"words": 256, "projection": 64},
     "γ = 0.2": {"gamma": 0.2},
     "γ = 1": {"gamma": 1.0},
+    "projection to 64": {"projection": 64},
+    "projection to 256": {"projection": 256},
     "conv3 alone, N = 600": {"layers": ("conv3",), "steps": (2.0,), "regions": 600},
     "conv4 alone, N = 600": {"layers": ("conv4",), "steps": (2.0,), "regions": 600},
+    "second stage: conv3 alone": _stage(layers=("conv3",), weights=(1.0,)),
+    "second stage: pool2 and conv3": _stage(layers=("pool2", "conv3"), weights=(0.5, 0.5)),
+    "second stage: three layers alike": _stage(weights=(0.34, 0.33, 0.33)),
+    "second stage: 32 values": _stage(values=32),
+    "second stage: reach 1, 3": _stage(reach=(1, 3)),
+    "second stage: reach 3, 7": _stage(reach=(3, 7)),
+    "second stage: 10 candidates": _stage(candidates=10),
+    "second stage: 60 candidates": _stage(candidates=60),
+    "second stage: share 0.5": _stage(share=0.5),
+    "second stage: share 0.85": _stage(share=0.85),
 }
-COLUMNS = ("lip6 recall@1", "lip6 AUC-PR", "webcams recall@1", "night recall@1", "corridor recall@1", "corridor AUC-PR")
+CONTRAST = "projections refined by contrast"
+CONTRAST_CROPS, CONTRAST_STEPS = 800, 400
+COLUMNS = (
+    "lip6 recall@1", "lip6 AUC-PR", "lip6 as stated, recall@1", "webcams recall@1", "night recall@1",
+    "corridor recall@1", "corridor AUC-PR",
+)  # fmt: skip
 
 
 class Study:
     """Activations of all pictures, computed once, and the figures of any configuration on them."""
 
-    def __init__(self, weights: Path, datasets: Path, images: int) -> None:
-        tensors = load_file(weights)
-        self.extractor = FeatureExtractor(network_of(tensors, LAYERS), DEFAULT)
-        self.network = tensors
+    def __init__(self, weights: Path, datasets: Path, images: int, side: int | None = None) -> None:
+        self.weights, self.side = load_file(weights), side
+        network = self._network(DEFAULT)
+        self.projections = fit_projections(network, WIDEST, datasets / "train")
+        self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
         self.tasks: Tasks = load_tasks(datasets)
         self.corridor = walk(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
@@ -71,44 +104,68 @@ class Study:
             "webcams": self.tasks.webcams.pictures,
             "night": self.tasks.night.pictures,
         }
-        self.activations = {
-            name: [self.extractor.activations([picture])[0] for picture in track(pictures, f"activations, {name}")]
-            for name, pictures in shown.items()
-        }
+        self.activations = {name: self._activations(name, pictures) for name, pictures in shown.items()}
 
-    def features(self, definition: EncoderDefinition) -> dict[str, list[Array]]:
-        """Regional features, T x K a picture, of every picture set."""
-        extractor = FeatureExtractor(network_of(self.network, definition.layers), definition)
-        chosen = [LAYERS.index(layer) for layer in definition.layers]
-        return {
-            name: [extractor.regions([maps[index] for index in chosen]).features for maps in pictures]
-            for name, pictures in self.activations.items()
-        }
+    def _activations(self, name: str, pictures: Sequence[Pixels]) -> list[dict[str, NDArray[np.float16]]]:
+        made = []
+        for picture in track(pictures, f"activations, {name}"):
+            maps = self.extractor.activations([picture])[0]
+            made.append({layer: values.astype(np.float16) for layer, values in zip(OUTPUTS, maps, strict=True)})
+        return made
 
-    def figures(self, definition: EncoderDefinition, features: dict[str, list[Array]], seed: int) -> list[float]:
+    def maps(self, name: str, definition: EncoderDefinition) -> list[list[Array]]:
+        """What the definition's outputs give for every picture of a set."""
+        return [[frame[layer].astype(np.float32) for layer in definition.outputs] for frame in self.activations[name]]
+
+    def describe(self, encoder: Encoder, name: str) -> Shown:
+        """What the encoder makes of every picture of a set."""
+        made = [encoder.describe(maps) for maps in self.maps(name, encoder.definition)]
+        return Shown(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
+
+    def refine(self, datasets: Path) -> None:
+        """From now on with the projections as ``training.contrast`` leaves them, in both stages."""
+        network = network_of(self.weights, STAGE.layers)
+        pairs = paired_cells(network, datasets / "train", CONTRAST_CROPS)
+        refined, losses = refine(self.projections, STAGE, pairs, CONTRAST_STEPS)
+        typer.echo(f"contrast: loss {np.mean(losses[:20]):.3f} at first, {np.mean(losses[-20:]):.3f} at last")
+        for layer, projection in refined.items():
+            further = self.projections[layer].matrix[:, STAGE.values :]
+            self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
+
+    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
         """One number for each of COLUMNS."""
-        vocabulary = train_vocabulary(pool_features(features["vocabulary"], seed), definition.words, seed, "study")
-        vlads = {
-            name: np.stack(
-                [aggregate(f, vocabulary.centers, definition.gamma, definition.normalization) for f in frames]
-            )
-            for name, frames in features.items()
-            if name != "vocabulary"
-        }
-        far = vlads["lip6 references"][:DISTRACTORS]
+        extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
+        frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
+        vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
+        encoder = Encoder("study", extractor, definition, vocabulary, UNCALIBRATED)
+        references = self.describe(encoder, "lip6 references")
+        far = references.part(slice(0, DISTRACTORS))
+        lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)
+        corridor = scores(
+            encoder, self.describe(encoder, "corridor queries"), self.describe(encoder, "corridor references")
+        )
         return [
-            *_walked(self.tasks.lip6, vlads["lip6 queries"] @ vlads["lip6 references"].T),
-            camera_recall(self.tasks.webcams, vlads["webcams"], far),
-            camera_recall(self.tasks.night, vlads["night"], far),
-            *_walked(self.corridor, vlads["corridor queries"] @ vlads["corridor references"].T),
+            *_walked(self.tasks.lip6.truth, lip6),
+            _walked(self.tasks.lip6_as_stated.truth, lip6)[0],
+            *(
+                camera_recall(task, *camera_scores(encoder, self.describe(encoder, name), far))
+                for name, task in (("webcams", self.tasks.webcams), ("night", self.tasks.night))
+            ),
+            *_walked(self.corridor.truth, corridor),
         ]
 
+    def _network(self, definition: EncoderDefinition) -> ShallowNetwork:
+        return network_of(self.weights, definition.outputs, self.side)
 
-def _walked(task: Walk, products: Array) -> tuple[float, float]:
+    def _projections(self, definition: EncoderDefinition) -> dict[str, Projection]:
+        return {layer: self.projections[layer] for layer in definition.projected()}
+
+
+def _walked(truth: NDArray[np.bool_], answers: Array) -> tuple[float, float]:
     """recall@1 and AUC-PR of a traverse pair."""
-    best = products.argmax(axis=1)
-    matched = task.truth[np.arange(len(best)), best]
-    return float(matched.mean()), auc_pr(products.max(axis=1), matched)
+    best = answers.argmax(axis=1)
+    matched = truth[np.arange(len(best)), best]
+    return float(matched.mean()), auc_pr(answers.max(axis=1), matched)
 
 
 def table(rows: dict[str, Sequence[Sequence[float]]]) -> str:
@@ -128,22 +185,27 @@ def main(
     ),
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     output: Annotated[Path, typer.Option(help="JSON with every run.")] = Path("runs/selection.json"),
-    images: Annotated[int, typer.Option(min=1, help="Photographs for each vocabulary.")] = 800,
+    images: Annotated[int, typer.Option(min=1, help="Photographs for each vocabulary.")] = 600,
+    side: Annotated[int | None, typer.Option(min=67, help="Another input size than the network's own.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Vocabularies a configuration.")] = 3,
     only: Annotated[list[str] | None, typer.Option(help="Just these configurations.")] = None,
 ) -> None:
     """Compare the configurations of CHANGES."""
-    study = Study(weights, datasets, images)
+    torch.manual_seed(0)
+    study = Study(weights, datasets, images, side)
     rows: dict[str, Sequence[Sequence[float]]] = {}
     for name, change in CHANGES.items():
         if only and name not in only:
             continue
-        definition = DEFAULT.model_copy(update=change)
-        features = study.features(definition)
-        rows[name] = [study.figures(definition, features, seed) for seed in range(seeds)]
+        definition = EncoderDefinition.model_validate({**DEFAULT.model_dump(), **change})
+        rows[name] = [study.figures(definition, seed) for seed in range(seeds)]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
         typer.echo(table({name: rows[name]}).splitlines()[-1])
+    if not only or CONTRAST in only:
+        study.refine(datasets)
+        rows[CONTRAST] = [study.figures(DEFAULT, seed) for seed in range(seeds)]
+        output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
     typer.echo(table(rows))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -51,6 +53,34 @@ class Student(nn.Module):
         """The two features as the teacher would see them, each B x 512 x 13 x 13."""
         conv3, conv4 = self.features(pixels)
         return self.head_conv3(conv3), self.head_conv4(conv4)
+
+    @torch.no_grad()
+    def take_up(self, weights: dict[str, Tensor], pixels: Tensor) -> None:
+        """Go on from ``folded_weights``: the same features on ``pixels``, with batch norm to learn through again.
+
+        Each filter gets the length it would be drawn with; its batch norm gets the statistics of what the filter
+        gives for ``pixels`` (B x 3 x 227 x 227) and the gain and shift that undo them.  The heads stay as they are.
+        """
+        x = (pixels - self.mean) * SCALE
+        for name, module in self.stages.items():
+            if isinstance(module, nn.BatchNorm2d):
+                continue
+            if not isinstance(module, nn.Conv2d):
+                x = module(x)
+                continue
+            weight, bias = weights[f"{name}.weight"].to(x.device), weights[f"{name}.bias"].to(x.device)
+            length = weight.flatten(1).norm(dim=1).clamp_min(1e-12) / math.sqrt(2)
+            norm = self.stages[f"{name}_bn"]
+            assert isinstance(norm, nn.BatchNorm2d) and norm.running_mean is not None and norm.running_var is not None
+            assert module.bias is not None
+            module.weight.copy_(weight / length.view(-1, 1, 1, 1))
+            module.bias.zero_()
+            x = module(x)
+            norm.running_mean.copy_(x.mean((0, 2, 3)))
+            norm.running_var.copy_(x.var((0, 2, 3)))
+            norm.weight.copy_(length * torch.sqrt(norm.running_var + norm.eps))
+            norm.bias.copy_(bias + length * norm.running_mean)
+            x = x * length.view(1, -1, 1, 1) + bias.view(1, -1, 1, 1)
 
     @torch.no_grad()
     def folded_weights(self) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from core.network import ShallowNetwork
 from training.distillation import cosine_loss, distill, learning_rate
 from training.disturbance import STEPS, disturb
-from training.photographs import DisturbedCrops, split_photographs
+from training.photographs import DisturbedCrops, day_and_night, random_crop, split_photographs
 from training.student import SCALE, Student
 from training.teacher import BLOCKS, Teacher
 
@@ -76,6 +76,38 @@ def test_the_loss_falls(photographs: Path, teacher_weights: Path, tmp_path: Path
     assert losses[-1] < losses[0] - 0.1
 
 
+def test_a_run_goes_on_from_earlier_weights(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
+    first = distill(photographs, teacher_weights, tmp_path / "one", crops=64, batch=8, workers=0)
+    second = distill(
+        photographs, teacher_weights, tmp_path / "two", crops=4000, batch=8, workers=0, start=first, stop_after=5
+    )
+    before, after = load_file(first), load_file(second)
+    # The heads learn alone at first, so the backbone's features are still those that it started with.
+    pixels = torch.rand(1, 3, 227, 227) * 255
+    maps = []
+    for weights in (before, after):
+        network = ShallowNetwork(Student().definition, ("conv4",))
+        network.load_weights(weights)
+        with torch.no_grad():
+            maps.append(network((pixels - 115) * SCALE)[0].flatten())
+    assert torch.nn.functional.cosine_similarity(maps[0], maps[1], dim=0) > 0.98
+
+
+def test_taking_up_weights_keeps_the_features() -> None:
+    torch.manual_seed(1)
+    student, other = Student(), Student()
+    student.train()
+    pixels = torch.rand(2, 3, 227, 227) * 255
+    with torch.no_grad():
+        student.features(pixels)
+    student.eval()
+    other.take_up(student.folded_weights(), pixels)
+    other.eval()
+    with torch.no_grad():
+        for taken, original in zip(other.features(pixels), student.features(pixels), strict=True):
+            torch.testing.assert_close(taken, original, rtol=1e-2, atol=1e-3)
+
+
 def test_folding_keeps_the_features() -> None:
     torch.manual_seed(0)
     student = Student()
@@ -124,6 +156,36 @@ def test_a_crop_depends_on_seed_and_number_alone(photographs: Path) -> None:
     for a, b in zip(early[15], late[5], strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(early[15][0], early[16][0])
+
+
+def test_a_fixed_camera_shows_the_same_crop_by_day_and_by_night(photographs: Path) -> None:
+    paths = tuple(path for path in split_photographs(photographs).train if "day_night" in path.parts)
+    cameras = day_and_night(paths, photographs)
+    assert {path.name for path in cameras} == {"b", "c"}
+    for days, nights in cameras.values():
+        assert {path.name.split("_")[0] for path in days} == {"day"}
+        assert {path.name.split("_")[0] for path in nights} == {"night"}
+
+
+def test_mostly_the_teacher_sees_a_day_and_the_student_a_night(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    for light, brightness in (("day", 190), ("night", 20)):
+        for n in range(3):
+            path = tmp_path / "day_night" / "yard" / f"{light}_{n}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), generator.integers(brightness - 15, brightness + 15, (72, 96, 3), np.uint8))
+    crops = DisturbedCrops(tuple(sorted(tmp_path.rglob("*.png"))), tmp_path, 64, seed=5, start=0, stop=80)
+    pairs = [(clean.mean() > 150, shown.mean() < 100) for clean, shown in (crops[item] for item in range(80))]
+    # Did each picture make a pair with itself alone, half of the clean crops would be nights.
+    assert sum(day and night for day, night in pairs) > 0.65 * len(pairs)
+
+
+def test_a_crop_is_the_same_window_of_each_picture() -> None:
+    y, x = np.mgrid[0:60, 0:80].astype(np.uint8)
+    first = np.stack([x, y, x], axis=2)
+    for seed in range(5):
+        one, other = random_crop([first, 255 - first], 32, np.random.default_rng(seed))
+        np.testing.assert_allclose(one.astype(int) + other, 255, atol=1)
 
 
 @pytest.mark.parametrize("step", [step for _, step in STEPS], ids=lambda step: step.__name__)
