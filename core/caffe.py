@@ -36,7 +36,11 @@ MAX_CHANNELS = 65_536
 
 
 def import_caffe(
-    model: Path, mean: Path | None = None, *, name: str | None = None, input_size: tuple[int, int] | None = None
+    model: Path,
+    mean: Path | tuple[float, float, float] | None = None,
+    *,
+    name: str | None = None,
+    input_size: tuple[int, int] | None = None,
 ) -> tuple[NetworkDefinition, dict[str, Tensor]]:
     """The convolutional trunk of a Caffe network in our format.
 
@@ -45,7 +49,8 @@ def import_caffe(
 
     Args:
         model: the ``.caffemodel``.
-        mean: its mean file, ``.npy`` or ``.binaryproto``; without one the model must name its mean values.
+        mean: its mean file, ``.npy`` or ``.binaryproto``, or the mean of each channel as the network sees them;
+            without one the model must name its mean values.
         name: of the definition; without one made of the file's name.
         input_size: height and width in pixels, if the model does not say them or others are wanted.
 
@@ -59,7 +64,7 @@ def import_caffe(
     network = read_caffemodel(model)
     trunk = _find_trunk(network)
     height, width = _input_size(network) if input_size is None else input_size
-    means = _named_mean(network.layers) if mean is None else read_mean(mean)
+    means = _named_mean(network.layers) if mean is None else read_mean(mean) if isinstance(mean, Path) else mean
     try:
         shown = InputDefinition(height=height, width=width, mean=means, scale=(_named_scale(network.layers),) * 3)
         definition = NetworkDefinition(

@@ -57,6 +57,10 @@ class InvalidModel(PlacerecError):
     """A network definition, a weights file or a vocabulary cannot be used."""
 
 
+class MissingWeights(InvalidModel):
+    """A system needs a weights file that the user has not given, or that is not there."""
+
+
 class WrongVocabulary(InvalidModel):
     """A vocabulary was trained for other weights, layers, regions or step than it is used with."""
 
@@ -144,3 +148,7 @@ class InvalidTraverse(PlacerecError):
 
 class InvalidGroundTruth(PlacerecError):
     """A file that says which references are true, or kept, cannot be used."""
+
+
+class InvalidResults(PlacerecError):
+    """A file of results, or of similarities, cannot be used."""

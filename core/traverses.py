@@ -32,15 +32,41 @@ def find_images(directory: Path) -> list[Path]:
     Raises:
         InvalidTraverse: it is no directory, cannot be read, or holds no image.
     """
+    images, _ = _entries(directory)
+    _check_not_empty(images, directory)
+    return sorted(images, key=lambda path: natural_key(path.name))
+
+
+def find_images_below(directory: Path) -> list[Path]:
+    """The images of a directory and of all folders below it in natural order; hidden ones are left out.
+
+    Raises:
+        InvalidTraverse: it is no directory, one cannot be read, or there is no image.
+    """
+    found, folders = _entries(directory)
+    while folders:
+        images, deeper = _entries(folders.pop())
+        found, folders = found + images, folders + deeper
+    _check_not_empty(found, directory)
+    return sorted(found, key=lambda path: [natural_key(part) for part in path.relative_to(directory).parts])
+
+
+def _entries(directory: Path) -> tuple[list[Path], list[Path]]:
+    """The images and the folders of a directory."""
+    # Hidden ones are left out, and links to folders, which may run in circles.
     suffixes = SUPPORTED_SUFFIXES | OTHER_SUFFIXES
     try:
         entries = [path for path in directory.iterdir() if not path.name.startswith(".")]
         images = [path for path in entries if path.suffix.lower() in suffixes and path.is_file()]
+        folders = [path for path in entries if path.is_dir() and not path.is_symlink()]
     except OSError as error:
         raise InvalidTraverse(f"{directory} cannot be read as a directory: {error.strerror}.") from error
+    return images, folders
+
+
+def _check_not_empty(images: list[Path], directory: Path) -> None:
     if not images:
         raise InvalidTraverse(f"{directory} holds no image ({', '.join(sorted(SUPPORTED_SUFFIXES))}).")
-    return sorted(images, key=lambda path: natural_key(path.name))
 
 
 def tolerance_truth(queries: int, references: int, tolerance: int) -> Truth:

@@ -70,6 +70,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.NoRegions: Kind(422, "no-regions", "The frame shows nothing to remember"),
     # Models
     errors.InvalidModel: Kind(503, "invalid-model", "A model cannot be used"),
+    errors.MissingWeights: Kind(503, "missing-weights", "A model lacks its weights"),
     errors.WrongVocabulary: Kind(503, "wrong-vocabulary", "A vocabulary belongs to another network"),
     errors.GoldenMismatch: Kind(503, "golden-mismatch", "The encoder does not reproduce its golden values"),
     errors.UnknownEncoder: Kind(422, "unknown-encoder", "No such encoder is installed"),
@@ -94,6 +95,7 @@ KINDS: dict[type[Exception], Kind] = {
     # Traverses on disk: the command line's own, which no request reaches
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is no traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
+    errors.InvalidResults: Kind(422, "invalid-results", "The results cannot be used"),
     # The request itself
     faults.MalformedBody: MALFORMED_BODY,
     faults.InvalidRequest: INVALID_REQUEST,

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from core.errors import InvalidGroundTruth, InvalidTraverse
-from core.traverses import find_images, natural_key, read_ground_truth, read_kept_references, tolerance_truth
+from core.traverses import (
+    find_images,
+    find_images_below,
+    natural_key,
+    read_ground_truth,
+    read_kept_references,
+    tolerance_truth,
+)
 
 
 def test_images_come_in_natural_order_without_subfolders(tmp_path: Path) -> None:
@@ -18,6 +25,22 @@ def test_images_come_in_natural_order_without_subfolders(tmp_path: Path) -> None
 
     # The BMP cannot be decoded and will stop the run: left out, it would shift the indices.
     assert found == ["1.JPEG", "2.jpg", "3.bmp", "10.jpg", "frame9.webp", "frame10.png"]
+
+
+def test_images_below_a_directory_come_in_natural_order(tmp_path: Path) -> None:
+    for name in ["b/2.jpg", "b/10.jpg", "a10/1.jpg", "a9/deep/1.png", "3.jpg", ".hidden/1.jpg", "b/notes.txt"]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    (tmp_path / "b" / "again").symlink_to(tmp_path)  # followed, this would never end
+
+    found = [path.relative_to(tmp_path).as_posix() for path in find_images_below(tmp_path)]
+
+    assert found == ["3.jpg", "a9/deep/1.png", "a10/1.jpg", "b/2.jpg", "b/10.jpg"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InvalidTraverse, match="holds no image"):
+        find_images_below(tmp_path / "empty")
+    with pytest.raises(InvalidTraverse, match="cannot be read"):
+        find_images_below(tmp_path / "missing")
 
 
 def test_equal_numbers_are_ordered_by_spelling() -> None:

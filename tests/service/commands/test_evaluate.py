@@ -133,10 +133,95 @@ def test_what_is_refused(placerec: Placerec, traverses: tuple[Path, Path], tmp_p
     placerec("evaluate", *both, "--tolerance", 1, "--ground-truth", tmp_path / "truth.csv", status=2)
     placerec("evaluate", *both, "--tolerance", -1, status=2)
     assert "cannot be read" in placerec("evaluate", *both, "--ground-truth", tmp_path / "no.csv", status=1).stderr
-    unknown = placerec("evaluate", *both, "--tolerance", 0, "--encoder", "netvlad", status=1)
-    assert "no encoder 'netvlad'" in unknown.stderr
+    unknown = placerec("evaluate", *both, "--tolerance", 0, "--encoder", "nowhere", status=1)
+    assert "no system 'nowhere' is known; there are " in unknown.stderr
+    assert all(f" {name}," in unknown.stderr for name in ("m-region-vlad", "region-vlad", "hog"))
+    placerec("evaluate", *both, "--tolerance", 0, "--cache", tmp_path, "--no-cache", status=2)
+    placerec("evaluate", *both, "--tolerance", 0, "--transposed", status=2)
     empty = placerec("evaluate", "--reference", tmp_path, "--query", queries, "--tolerance", 0, status=1)
     assert "holds no image" in empty.stderr
+
+
+def test_a_second_run_takes_what_was_measured(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
+    words = ("--tolerance", 0, "--encoder", "hog")
+    first, rows = evaluated(placerec, traverses, tmp_path, *words)
+    assert not first["cached"]
+    kept = list((tmp_path / "cache/placerec/evaluations").iterdir())
+    assert len(kept) == 1
+
+    second, again = evaluated(placerec, traverses, tmp_path, *words, "--encoder", "seqslam")
+    assert again == rows
+    assert [one["cached"] for one in second["encoders"]] == [True, False]
+    assert second["milliseconds"] == first["milliseconds"]  # the times of the first run
+    both = ("--reference", traverses[0], "--query", traverses[1])
+    said = placerec("evaluate", *both, *words, "--encoder", "seqslam").stderr
+    assert "Taken from the cache, times included: " in said
+    assert sorted(said.split("times included: ")[1].strip(".\n").split(", ")) == ["hog", "seqslam"]
+
+    fresh, _ = evaluated(placerec, traverses, tmp_path, *words, "--no-cache")
+    assert not fresh["cached"]
+    elsewhere, _ = evaluated(placerec, traverses, tmp_path, *words, "--cache", tmp_path / "mine")
+    assert not elsewhere["cached"] and len(list((tmp_path / "mine").iterdir())) == 1
+    kept[0].write_bytes(b"damaged")
+    mended, rows_again = evaluated(placerec, traverses, tmp_path, *words)
+    assert not mended["cached"] and rows_again == rows
+
+
+def test_a_cache_that_cannot_be_written_is_told(
+    placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    words = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--encoder", "hog")
+    assert "Nothing was kept" in placerec("evaluate", *words, "--cache", tmp_path / "file").stderr
+
+
+def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
+    words = ("--tolerance", 0, "--encoder", "fabmap")
+    own, _ = evaluated(placerec, traverses, tmp_path, *words)
+    assert own["trained_on"] == own["configuration"]["trained on"] == "the kept references"
+    lessons = tmp_path / "lessons"
+    for seed in range(6):
+        folder = lessons / f"day{seed % 2}"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / f"{seed}.jpg").write_bytes(jpeg(seed + 10))
+    other, _ = evaluated(placerec, traverses, tmp_path, *words, "--training", lessons)
+    assert other["trained_on"] == "6 pictures of lessons"
+    assert other["encoder"] != own["encoder"]
+
+
+def test_growing_traverses_and_disturbed_queries(
+    placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path
+) -> None:
+    figures, _ = evaluated(
+        placerec, traverses, tmp_path, "--tolerance", 1, "--encoder", "hog", "--scalability", "--severity"
+    )
+    assert [(point["system"], point["references"]) for point in figures["scalability"]] == [("hog", 4)]
+    curves = {curve["disturbance"]: curve for curve in figures["severity"]}
+    assert set(curves) == {"lateral shift", "scale", "darkness", "noise", "blur", "occlusion"}
+    for curve in curves.values():
+        assert len(curve["levels"]) == len(curve["auc_pr"]) == len(curve["recall_at_1"]) == 5
+        assert curve["recall_at_1"][0] == figures["recall_at"]["1"]
+        assert curve["auc_pr"][0] == pytest.approx(figures["auc_pr"])
+
+
+def test_the_report_is_written(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
+    words = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--encoder", "hog")
+    placerec("evaluate", *words, "--report", tmp_path / "report")
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "HOG" in page
+    assert list((tmp_path / "report").rglob("*.png"))
+
+
+def test_one_class_has_a_word_in_the_table(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
+    both = ("--reference", traverses[0], "--query", traverses[1], "--encoder", "hog", "--json", tmp_path / "out.json")
+    right = placerec("evaluate", *both, "--tolerance", 9)
+    assert "all right" in right.stdout and "the curve has one class only" in right.stderr
+    truth = tmp_path / "truth.csv"
+    truth.write_text("0,3\n1,3\n2,3\n3,0\n")
+    wrong = placerec("evaluate", *both, "--ground-truth", truth)
+    assert "none right" in wrong.stdout and "no best match is right" in wrong.stderr
+    figures = json.loads((tmp_path / "out.json").read_text())
+    assert (figures["auc_pr"], figures["one_class"]) == (0.0, "none right")  # a number, for those that read one
 
 
 @pytest.mark.skipif(not CORRIDOR.is_dir(), reason="the corridor traverses (../shared/datasets) are not here")

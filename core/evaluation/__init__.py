@@ -1,0 +1,37 @@
+"""How well systems recognize one traverse by another: the thesis's protocol, its data sets, its comparison."""
+
+from core.evaluation.comparison import Box, Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.figures import (
+    DEPTHS,
+    STAGES,
+    Evaluation,
+    auc_pr,
+    auc_roc,
+    extended_precision,
+    recall_at,
+    recall_at_full_precision,
+    summarize,
+)
+from core.evaluation.outcomes import Outcome, judge, judge_ranking
+from core.evaluation.results import results_csv
+
+__all__ = [
+    "DEPTHS",
+    "STAGES",
+    "Box",
+    "Comparison",
+    "Evaluation",
+    "Outcome",
+    "Run",
+    "ScalePoint",
+    "SeverityCurve",
+    "auc_pr",
+    "auc_roc",
+    "extended_precision",
+    "judge",
+    "judge_ranking",
+    "recall_at",
+    "recall_at_full_precision",
+    "results_csv",
+    "summarize",
+]

@@ -1,0 +1,142 @@
+"""What was measured before, kept by the content of all that it depends on.
+
+An entry is one file, a SHA-256 and the ``.npz`` bytes that it covers (JSON and arrays), written whole
+or not at all; one that cannot be read counts as absent.  The folder can be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidTraverse
+from core.identity import canonical_json, json_digest
+
+FORMAT = "placerec-evaluation/1"
+VALUES = "values"
+LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "torch")
+
+# What shows, keeps or transports figures but cannot change one.
+NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/datasets.py", "models", "storage")
+
+DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """What is kept under one key."""
+
+    values: dict[str, Any]
+    arrays: dict[str, NDArray[np.generic]] = field(default_factory=dict)
+
+
+def default_folder() -> Path:
+    """``$XDG_CACHE_HOME/placerec/evaluations``, by default in ``~/.cache``."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(given) if given else Path.home() / ".cache") / "placerec" / "evaluations"
+
+
+class EvaluationCache:
+    """A folder of entries; without a folder nothing is kept.
+
+    writable: turns False when an entry could not be written; the run goes on without.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder, self.writable = folder, True
+
+    def load(self, key: str) -> CacheEntry | None:
+        """The entry of a key; None where there is none, or a damaged one."""
+        if self.folder is None:
+            return None
+        try:
+            content = self._file(key).read_bytes()
+        except OSError:
+            return None
+        digest, data = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+        if hashlib.sha256(data).digest() != digest:
+            return None
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        return CacheEntry(json.loads(arrays.pop(VALUES).tobytes()), arrays)
+
+    def store(self, key: str, entry: CacheEntry) -> None:
+        """Keep an entry, whole or not at all."""
+        if self.folder is None:
+            return
+        buffer = io.BytesIO()
+        text = np.frombuffer(canonical_json(entry.values).encode(), np.uint8)
+        np.savez(buffer, allow_pickle=False, **{VALUES: text}, **entry.arrays)
+        data = buffer.getvalue()
+        # Two evaluations may store the same entry at one time: each writes a file of its own.
+        partial = self.folder / f"{key}.{secrets.token_hex(4)}.tmp"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            partial.write_bytes(hashlib.sha256(data).digest() + data)
+            os.replace(partial, self._file(key))
+        except OSError:
+            self.writable = False
+            with contextlib.suppress(OSError):
+                partial.unlink()
+
+    def _file(self, key: str) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{key}.evaluation"
+
+
+def cache_key(**parts: Any) -> str:
+    """SHA-256 over ``parts`` (JSON) and over all that computes: the code in ``core/`` and its libraries."""
+    return json_digest({"format": FORMAT, "code": code_digest(), "libraries": _libraries(), **parts})
+
+
+@cache
+def code_digest() -> str:
+    """SHA-256 over the modules of ``core/`` that can change a figure."""
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        name = path.relative_to(root).as_posix()
+        if not name.startswith(NOT_COMPUTING):
+            digest.update(f"{name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
+    return digest.hexdigest()
+
+
+def files_digest(paths: Sequence[Path]) -> str:
+    """SHA-256 over the contents of files in their order; names do not count.
+
+    Raises:
+        InvalidTraverse: one cannot be read.
+    """
+    return json_digest([_file_digest(path) for path in paths])
+
+
+def arrays_digest(arrays: Sequence[NDArray[np.int64]]) -> str:
+    """SHA-256 over lists of indices, such as a truth."""
+    return json_digest([array.tolist() for array in arrays])
+
+
+@cache
+def _file_digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InvalidTraverse(f"{path} cannot be read: {error.strerror}.") from error
+
+
+@cache
+def _libraries() -> Mapping[str, str]:
+    return {name: version(name) for name in LIBRARIES}

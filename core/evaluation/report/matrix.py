@@ -1,0 +1,178 @@
+"""The similarity of every query to every reference as a picture, and what is true over it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.evaluation.report.drawing import SHARPNESS, Margins, Sheet, paint_png
+from core.evaluation.report.text import counted
+from core.evaluation.report.theme import LIGHT, Theme, rgb
+from core.traverses import Truth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from core.evaluation import Outcome
+
+Picture = NDArray[np.uint8]
+TRUTH, RIGHT, WRONG = "#F5C400", "#35B6FF", "#FF6A3D"
+"""On greys: outline of the true references; the best matches that are right, and wrong."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """One picture of a matrix: rows are queries from the top, columns kept references from the left.
+
+    heat: uint8 [H, W], the brighter the more alike.
+    truth: uint8 [H, W, 4] RGBA, the outline of the true references, transparent elsewhere.
+    matches: uint8 [H, W, 4] RGBA, a square for each query's best match.
+    shrunk: a pixel is less than a cell.
+    """
+
+    heat: Picture
+    truth: Picture
+    matches: Picture
+    shrunk: bool
+
+
+def true_cells(truth: Truth, kept: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which kept reference is true of which query; bool [Q, R']."""
+    return np.stack([np.isin(kept, true) for true in truth])
+
+
+def layers(
+    scores: NDArray[np.float32],
+    true: NDArray[np.bool_],
+    kept: NDArray[np.int64],
+    outcomes: Sequence[Outcome],
+    longest: int = 640,
+) -> Layers:
+    """The picture of a similarity matrix; a large one is shrunk, a small one has several pixels a cell.
+
+    Args:
+        scores: float32 [Q, R'].
+        true: bool [Q, R'].
+        kept: int64 [R'], index of each column in the full list of references, ascending.
+        outcomes: Q of them.
+        longest: pixels of the picture's longer side, at most.
+    """
+    height, width = scores.shape
+    factor = longest / max(height, width)
+    factor = float(max(1, int(factor))) if factor >= 1 else factor
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    return Layers(_heat(scores, size), _outline(true, size), _matches(kept, outcomes, size, factor), shrunk=factor < 1)
+
+
+def _heat(scores: NDArray[np.float32], size: tuple[int, int]) -> Picture:
+    """Greys from the 1st to the 99.8th percentile, so that one odd score does not take all the contrast."""
+    shrinks = size[0] < scores.shape[1]
+    values = cv2.resize(scores, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
+    low, high = np.percentile(values, [1, 99.8])
+    span = float(high - low) or 1.0
+    return np.asarray(np.clip((values - low) / span, 0, 1) * 255, np.uint8)
+
+
+def _outline(true: NDArray[np.bool_], size: tuple[int, int]) -> Picture:
+    """The edge, one or two pixels wide, of the cells that are true; no true cell is lost in shrinking."""
+    width, height = size
+    mask = np.zeros((height, width), np.uint8)
+    if width < true.shape[1]:
+        rows, columns = np.nonzero(true)
+        mask[rows * height // true.shape[0], columns * width // true.shape[1]] = 1
+    else:
+        mask = np.asarray(cv2.resize(true.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    inner = cv2.erode(mask, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    drawn = np.zeros((height, width, 4), np.uint8)
+    drawn[(mask == 1) & (inner == 0)] = (*rgb(TRUTH), 255)
+    return drawn
+
+
+def _matches(kept: NDArray[np.int64], outcomes: Sequence[Outcome], size: tuple[int, int], factor: float) -> Picture:
+    """A square for each best match, within its cell where that is large enough; the wrong ones over the right ones."""
+    drawn = np.zeros((size[1], size[0], 4), np.uint8)
+    for wanted, color in ((True, RIGHT), (False, WRONG)):
+        for query, outcome in enumerate(outcomes):
+            if outcome.matched == wanted:
+                column = int(np.searchsorted(kept, outcome.retrieved))
+                drawn[_cell(query, factor), _cell(column, factor)] = (*rgb(color), 255)
+    return drawn
+
+
+def _cell(place: int, factor: float) -> slice:
+    """Pixels of a row or column of cells: those inside it or, where cells are tiny, three around its middle."""
+    if factor >= 4:
+        edge = int(factor >= 8)
+        return slice(round(place * factor) + edge, round((place + 1) * factor) - edge)
+    middle = int((place + 0.5) * factor)
+    return slice(max(0, middle - 1), middle + 2)
+
+
+def png(picture: Picture) -> bytes:
+    """A grey or RGBA picture as a PNG file."""
+    shown = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA) if picture.ndim == 3 else picture
+    done, encoded = cv2.imencode(".png", shown, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    assert done, "any uint8 picture can be written as PNG"
+    return encoded.tobytes()
+
+
+def heat_file(drawn: Layers) -> tuple[bytes, str]:
+    """The greys as a file, and its media type: sharp cells as PNG, what was shrunk as the smaller JPEG."""
+    if not drawn.shrunk:
+        return png(drawn.heat), "image/png"
+    done, encoded = cv2.imencode(".jpg", drawn.heat, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    assert done, "any uint8 picture of this size can be written as JPEG"
+    return encoded.tobytes(), "image/jpeg"
+
+
+def describe_matrix(system: str, shape: tuple[int, int]) -> str:
+    """What the picture shows, for who cannot see it."""
+    return (
+        f"Similarity matrix of {system}, {counted(shape[0], 'query')} by {counted(shape[1], 'reference')}, "
+        "with the true references outlined and the best matches as squares."
+    )
+
+
+def _key(axes: Axes) -> None:
+    """What the colours mean, under the axes."""
+    for x, filled, color, text in (
+        (0, False, TRUTH, "true"),
+        (52, True, RIGHT, "found, right"),
+        (142, True, WRONG, "wrong"),
+    ):
+        at = (x * SHARPNESS, -54 * SHARPNESS)
+        axes.annotate("\N{BLACK SQUARE}" if filled else "\N{WHITE SQUARE}", at, color=color, xycoords="axes pixels")
+        axes.annotate(text, (at[0] + 14 * SHARPNESS, at[1]), xycoords="axes pixels")
+
+
+def matrix_file(system: str, drawn: Layers, shape: tuple[int, int]) -> bytes:
+    """The three layers with axes, as a PNG file.
+
+    Args:
+        shape: Q, R'.
+    """
+    height, width = drawn.heat.shape
+    longest = 400
+    inner = (round(longest * width / max(height, width)), round(longest * height / max(height, width)))
+    sheet = Sheet(f"Similarity, {system}", inner[0] + 74, inner[1] + 98, Margins(bottom=64), full_color=True)
+
+    def paint(axes: Axes, theme: Theme) -> None:
+        from matplotlib.ticker import MaxNLocator
+
+        axes.grid(False)
+        extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
+        grey = cv2.cvtColor(drawn.heat, cv2.COLOR_GRAY2RGB)
+        for layer in (grey, drawn.truth, drawn.matches):
+            axes.imshow(layer, extent=extent, aspect="auto", interpolation="antialiased")
+        axes.set(xlabel="kept references", ylabel="queries")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
+        axes.spines[["right", "top"]].set_visible(True)
+        _key(axes)
+
+    return paint_png(sheet, LIGHT, paint)

@@ -1,0 +1,89 @@
+"""Accuracy as the queries are disturbed more and more (thesis, section 5.2, item 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
+from core.evaluation.comparison import SeverityCurve
+from core.evaluation.disturbances import DISTURBANCES, Disturbance
+from core.evaluation.figures import auc_pr, recall_at
+from core.evaluation.outcomes import judge
+from core.evaluation.subjects import Described, Subject
+from core.systems.system import Index
+
+
+def severity(
+    subject: Subject,
+    cache: EvaluationCache,
+    disturbances: Sequence[Disturbance] = DISTURBANCES,
+    seed: int = 0,
+) -> list[SeverityCurve]:
+    """One curve for each disturbance of the query traverse; the references stay as they are."""
+    curves = []
+    for disturbance in disturbances:
+        key = subject.key(
+            "severity",
+            disturbance=disturbance.name,
+            levels=disturbance.levels,
+            seed=seed,
+            truth=arrays_digest(subject.pair.truth),
+            kept=subject.pair.kept.tolist(),
+        )
+        curve = _loaded(cache.load(key), disturbance, subject)
+        if curve is None:
+            curve = _curve(subject, disturbance, seed)
+            cache.store(key, CacheEntry({"recall_at_1": curve.recall_at_1, "auc_pr": curve.auc_pr}))
+        curves.append(curve)
+    return curves
+
+
+def severity_steps(subject: Subject, disturbances: Sequence[Disturbance] = DISTURBANCES) -> int:
+    """Pictures that are described and compared for the curves; the undisturbed ones are compared only."""
+    return len(subject.pair.queries) * sum(2 * len(disturbance.levels) - 1 for disturbance in disturbances)
+
+
+def _curve(subject: Subject, disturbance: Disturbance, seed: int) -> SeverityCurve:
+    index = subject.system.index(subject.references.descriptions)
+    points = [_point(subject, index, _disturbed(subject, disturbance, level, seed)) for level in disturbance.levels]
+    recalls, areas = zip(*points, strict=True)
+    return SeverityCurve(
+        disturbance=disturbance.name,
+        system=subject.about.name,
+        levels=list(disturbance.levels),
+        unit=disturbance.unit,
+        recall_at_1=list(recalls),
+        auc_pr=list(areas),
+    )
+
+
+def _disturbed(subject: Subject, disturbance: Disturbance, level: float, seed: int) -> Described:
+    if level == disturbance.levels[0]:
+        return subject.queries
+    return subject.describe(
+        subject.pair.queries, lambda pixels, number: disturbance.changed(pixels, level, seed, number)
+    )
+
+
+def _point(subject: Subject, index: Index, queries: Described) -> tuple[float, float]:
+    """recall@1 (0 where no query has a true reference) and AUC-PR."""
+    scores = subject.compare(index, queries.descriptions).scores
+    outcomes = judge(scores, subject.pair.kept, subject.pair.truth)
+    area = auc_pr([outcome.score for outcome in outcomes], [outcome.matched for outcome in outcomes])
+    return recall_at(outcomes, 1) or 0.0, area
+
+
+def _loaded(entry: CacheEntry | None, disturbance: Disturbance, subject: Subject) -> SeverityCurve | None:
+    if entry is None:
+        return None
+    try:
+        return SeverityCurve(
+            disturbance=disturbance.name,
+            system=subject.about.name,
+            levels=list(disturbance.levels),
+            unit=disturbance.unit,
+            recall_at_1=entry.values["recall_at_1"],
+            auc_pr=entry.values["auc_pr"],
+        )
+    except KeyError:
+        return None

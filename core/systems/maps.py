@@ -1,0 +1,71 @@
+"""What systems on a network's activations share: reading the maps, and one pooled vector a frame.
+
+Maps are float32 [X, Y, K] of one frame, rectified, as ``FeatureExtractor.activations`` gives them;
+those of a blank frame are zero.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.preprocessing import Pixels
+from core.systems.entry import Entry, Ingredients, system_identity
+from core.systems.system import About, Description, Index, InnerProducts, stack
+
+if TYPE_CHECKING:
+    from core.encoder import FeatureExtractor
+
+Array = NDArray[np.float32]
+Pool = Callable[..., Array]
+"""Maps of one or more layers to float32 [D], of any length."""
+
+
+def read_maps(extractor: FeatureExtractor, pixels: Pixels) -> tuple[list[Array], float]:
+    """The maps of each layer of one frame, and the milliseconds of the forward pass."""
+    began = time.perf_counter()
+    maps = extractor.activations([pixels])[0]
+    return maps, 1e3 * (time.perf_counter() - began)
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors along the last axis, each divided by its length; zero stays zero."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
+
+
+def power(vectors: Array, gamma: float) -> Array:
+    """sign(v)·|v|^γ, element by element."""
+    return np.copysign(np.abs(vectors) ** np.float32(gamma), vectors)
+
+
+class PooledSystem:
+    """Maps pooled to one vector of unit length; scores are cosines."""
+
+    sequential = False
+
+    def __init__(self, about: About, extractor: FeatureExtractor, pool: Pool) -> None:
+        self.about, self.extractor, self.pool = about, extractor, pool
+        self.identity = system_identity(about, features=extractor.origin)
+
+    def describe(self, pixels: Pixels) -> Description:
+        maps, forward = read_maps(self.extractor, pixels)
+        began = time.perf_counter()
+        vector = unit(self.pool(*maps))
+        return Description({"descriptor": vector}, {"forward": forward, "pool": 1e3 * (time.perf_counter() - began)})
+
+    def index(self, references: Sequence[Description]) -> Index:
+        return InnerProducts(stack(references))
+
+
+def pooled(about: About, pool: Pool, *layers: str) -> Entry:
+    """The entry of a system that pools ``layers`` of the packaged network."""
+
+    def build(ingredients: Ingredients) -> PooledSystem:
+        return PooledSystem(about, ingredients.extractor(*layers), pool)
+
+    return Entry(about, build)
