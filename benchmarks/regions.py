@@ -12,8 +12,8 @@ import typer
 
 from benchmarks.reference_regions import reference_regions
 from benchmarks.report import report, verdict
-from core.encoder import FeatureExtractor
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.features import FeatureExtractor
 from core.regions import extract_regions
 from service.measurement import medians, sample_picture
 

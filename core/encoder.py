@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field
 
 from core.agreement import AgreementDefinition, Cells, agreement, local_descriptors
-from core.backbone import Backbone
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
+from core.features import FeatureDefinition, FeatureExtractor, content_of
 from core.identity import json_digest, tensors_digest
 from core.matching import scores
-from core.preprocessing import Pixels, contrast, prepare
-from core.projection import Projection
-from core.regions import Regions, box_sums, extract_regions, unit_length
-from core.threads import keep_numpy_single_threaded
+from core.preprocessing import Pixels
+from core.regions import Regions
 from core.verdict import Calibration
 from core.vlad import Normalization, aggregate
 from core.vocabulary import Vocabulary
@@ -29,43 +27,6 @@ Array = NDArray[np.float32]
 
 GOLDEN_COSINE = 0.999
 """How close a machine's or a faster path's descriptors must come to the golden ones."""
-
-
-class FeatureDefinition(BaseModel):
-    """Which regions are taken from which layers (method, sections 3 and 4).
-
-    ``steps`` are the quantisation steps, one a layer, in units of its activations.
-    ``unit_features`` scales each regional feature to unit length before anything else.
-    ``projection`` is to how many values regional features are projected (``projection.py``); None: not at all.
-    ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
-    network through its biases alone, and what looks like regions says nothing of the scene.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    layers: tuple[str, ...] = Field(min_length=1)
-    regions: int = Field(ge=1, le=10_000, description="N, per layer")
-    steps: tuple[float, ...]
-    unit_features: bool
-    projection: int | None = Field(default=None, ge=1)
-    least_contrast: float = Field(default=2.0, ge=0, le=255, allow_inf_nan=False)
-
-    @model_validator(mode="after")
-    def _one_step_a_layer(self) -> FeatureDefinition:
-        if len(self.steps) != len(self.layers) or not all(0 < step < float("inf") for step in self.steps):
-            raise ValueError("each layer needs one positive quantisation step")
-        if self.projection is not None and not self.unit_features:
-            raise ValueError("projected features are of unit length")
-        return self
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """The layers that the backbone must return: first those whose regions are fused."""
-        return self.layers
-
-    def projected(self) -> dict[str, int]:
-        """How many values of each layer's projection are in use."""
-        return {} if self.projection is None else dict.fromkeys(self.layers, self.projection)
 
 
 class EncoderDefinition(FeatureDefinition):
@@ -105,103 +66,6 @@ class Encoding:
     local: Cells
     regions: Regions
     milliseconds: dict[str, float]
-
-
-class FeatureExtractor:
-    """Frames to regions of interest with their features, T x K.
-
-    Args:
-        projections: by layer; as many as the definition asks for.
-
-    Raises:
-        InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or short.
-    """
-
-    def __init__(
-        self, backbone: Backbone, definition: FeatureDefinition, projections: Mapping[str, Projection] | None = None
-    ) -> None:
-        if backbone.outputs != definition.outputs:
-            raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
-        keep_numpy_single_threaded()
-        self.backbone, self.definition = backbone, definition
-        self.projections = dict(projections or {})
-        for layer, values in definition.projected().items():
-            if layer not in self.projections or self.projections[layer].matrix.shape[1] < values:
-                raise InvalidModel(f"the encoder needs a projection of {layer} to {values} values.")
-        parts: dict[str, Any] = {
-            "network": backbone.describe(),
-            "weights": tensors_digest(backbone.weights()),
-            "features": _content(definition, set(FeatureDefinition.model_fields)),
-        }
-        if definition.projected():
-            parts["projections"] = tensors_digest(projection_tensors(self.projections))
-        self.origin = json_digest(parts)
-        """Identity of the features: what a vocabulary must have been trained on."""
-
-    def activations(self, frames: Sequence[Pixels]) -> list[list[Array]]:
-        """For each frame the rectified maps of each output, float32 [X, Y, K]; zeros for a blank frame."""
-        batch = np.stack([prepare(frame, self.backbone.input) for frame in frames])  # B x H x W x 3
-        with torch.inference_mode():
-            outputs = self.backbone(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
-        maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
-        for index, frame in enumerate(frames):
-            if contrast(frame) < self.definition.least_contrast:
-                for layer in maps:
-                    layer[index] = 0
-        return [[layer[index] for layer in maps] for index in range(len(frames))]
-
-    def products(self, activations: Sequence[Array]) -> dict[str, Array]:
-        """Of each projected layer what its projection makes of its cells; float32 [C, d] by layer."""
-        maps = zip(self.definition.outputs, activations, strict=True)
-        used = self.definition.projected()
-        return {name: self.projections[name].products(_cells(layer)) for name, layer in maps if name in used}
-
-    def regions(self, activations: Sequence[Array], products: Mapping[str, Array] | None = None) -> Regions:
-        """The regions of all layers of one frame, fused (eqs. 4.4, 4.5).
-
-        Args:
-            products: as :meth:`products` gives them, if they are known.
-        """
-        definition = self.definition
-        fused = activations[: len(definition.layers)]
-        found = extract_regions(fused, definition.steps, definition.regions)
-        if definition.projection is not None:
-            features = self._projected(found, fused, products or self.products(activations), definition.projection)
-        elif definition.unit_features:
-            features = unit_length(found.features)
-        else:
-            return found
-        return Regions(found.boxes, found.energies, found.channels, found.layers, features)
-
-    def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
-        """The regional features projected, float32 [T, values]: a projection of sums is a sum of projections."""
-        lengths = np.sqrt(np.einsum("tk,tk->t", found.features, found.features))
-        ends = np.searchsorted(found.layers, np.arange(len(fused) + 1))  # regions come layer by layer
-        parts = []
-        for name, layer, start, stop in zip(self.definition.layers, fused, ends, ends[1:], strict=False):
-            grid = products[name].reshape(*layer.shape[:2], -1)
-            sums = box_sums(grid, found.boxes[start:stop])
-            parts.append(self.projections[name].finish(sums, lengths[start:stop], values))
-        return np.concatenate(parts)
-
-    def projected_cells(
-        self, activations: Sequence[Array], products: Mapping[str, Array], layers: Sequence[str], values: int
-    ) -> list[Array]:
-        """The projected local descriptors D^L of some layers of one frame, float32 [C, values] each."""
-        maps = dict(zip(self.definition.outputs, activations, strict=True))
-        made = []
-        for name in layers:
-            cells = _cells(maps[name])
-            lengths = np.sqrt(np.einsum("ck,ck->c", cells, cells))
-            made.append(self.projections[name].finish(products[name], lengths, values))
-        return made
-
-    def layer_grids(self) -> dict[str, tuple[int, int]]:
-        """Cells (rows, columns) of each layer's maps at the network's input size."""
-        shown = self.backbone.input
-        blank = np.zeros((shown.height, shown.width, 3), np.uint8)
-        maps = self.activations([blank])[0]
-        return {name: layer.shape[:2] for name, layer in zip(self.definition.outputs, maps, strict=True)}
 
 
 class Encoder:
@@ -357,11 +221,6 @@ class Encoder:
         self.agreement(made.local, made.local[np.newaxis])  # compiled now, as all else is, and not by the first query
 
 
-def _cells(layer: Array) -> Array:
-    """Maps, float32 [X, Y, K], as C local descriptors, [C, K]."""
-    return layer.reshape(-1, layer.shape[2])
-
-
 def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
     """Of two arrays of one shape, flattened; 1 where both are empty."""
     if found.shape != golden.shape:
@@ -370,24 +229,10 @@ def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
     return float(a @ b / max(1e-12, float(np.linalg.norm(a) * np.linalg.norm(b)))) if a.size else 1.0
 
 
-def _content(definition: BaseModel, fields: set[str] | None = None) -> dict[str, Any]:
-    """What a definition says; choices that came with later versions are left out where not made."""
-    return definition.model_dump(mode="json", include=fields, exclude_none=True)
-
-
-def projection_tensors(projections: Mapping[str, Projection]) -> dict[str, torch.Tensor]:
-    """``<layer>.mean`` and ``<layer>.matrix`` of each."""
-    tensors: dict[str, torch.Tensor] = {}
-    for layer, projection in projections.items():
-        tensors[f"{layer}.mean"] = torch.from_numpy(projection.mean)
-        tensors[f"{layer}.matrix"] = torch.from_numpy(projection.matrix)
-    return tensors
-
-
 def encoder_identity(name: str, definition: EncoderDefinition, vocabulary: Vocabulary) -> str:
     """``<name>@<sha256>`` over every field that can change a descriptor, tensors by content."""
     centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
-    fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": _content(definition)}
+    fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": content_of(definition)}
     return f"{name}@{json_digest(fields)}"
 
 

@@ -21,8 +21,9 @@ from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame, projection_tensors
+from core.encoder import Encoder, EncoderDefinition, canary_frame
 from core.errors import InvalidModel, UnknownEncoder
+from core.features import FeatureExtractor, projection_tensors
 from core.identity import canonical_json
 from core.network import NAME, load_network
 from core.projection import Projection

@@ -18,9 +18,10 @@ from rich.progress import track
 from safetensors.torch import load_file
 from torch import Tensor
 
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
+from core.encoder import Encoder, EncoderDefinition
 from core.encoders import NETWORK_SUFFIX, PACKAGED, save_encoder
 from core.evaluation import auc_roc
+from core.features import FeatureExtractor
 from core.network import ShallowNetwork, save_network
 from core.preprocessing import Pixels
 from core.presets import NETWORK, PRESETS

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from rich.progress import track
 from safetensors.torch import load_file
 
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
+from core.encoder import Encoder, EncoderDefinition
 from core.evaluation import auc_pr
+from core.features import FeatureExtractor
 from core.network import ShallowNetwork
 from core.preprocessing import Pixels
 from core.presets import PRESETS

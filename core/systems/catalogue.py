@@ -28,8 +28,8 @@ ENTRIES: tuple[Entry, ...] = (
 
 
 def systems(models: EncoderCatalogue) -> list[About]:
-    """All that ``build`` knows: the installed encoders, then the systems of other authors; no weights are read."""
-    own = [about_encoder(summary) for summary in models.describe()]
+    """All that ``build`` knows: the installed encoders, the default first, then other authors'; no weights are read."""
+    own = [about_encoder(summary) for summary in sorted(models.describe(), key=lambda summary: not summary.default)]
     return own + [entry.about for entry in ENTRIES]
 
 

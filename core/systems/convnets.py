@@ -24,9 +24,9 @@ from torch import Tensor, nn
 
 from core.caffe import import_caffe
 from core.caffemodel import CaffeLayer, read_caffemodel
-from core.encoder import FeatureDefinition, FeatureExtractor
 from core.encoders import NETWORK_SUFFIX
 from core.errors import InvalidModel, MissingWeights
+from core.features import FeatureDefinition, FeatureExtractor
 from core.network import NetworkDefinition, Relu, ShallowNetwork, build_layer, load_network
 from core.preprocessing import Pixels, prepare
 from core.systems.entry import Constants, Entry, Ingredients, system_identity

@@ -26,7 +26,7 @@ from core.systems.system import About, Description, Index, InnerProducts, stack
 from core.systems.words import nearest_words, train_words
 
 if TYPE_CHECKING:
-    from core.encoder import FeatureExtractor
+    from core.features import FeatureExtractor
 
 N = 200
 EARLY, LATE = "conv3", "conv4"

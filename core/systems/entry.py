@@ -14,8 +14,8 @@ from core.errors import InvalidModel
 from core.systems.system import About, System
 
 if TYPE_CHECKING:
-    from core.encoder import FeatureExtractor
     from core.encoders import EncoderCatalogue
+    from core.features import FeatureExtractor
 
 Constants = Mapping[str, str | int | float | bool | tuple[int | float | str, ...]]
 """A system's constants by their names in its paper, as ``About.configuration`` wants them."""
@@ -41,7 +41,7 @@ class Ingredients:
         Raises:
             InvalidModel: the network has no such layer, or its file cannot be used.
         """
-        from core.encoder import FeatureDefinition, FeatureExtractor
+        from core.features import FeatureDefinition, FeatureExtractor
         from core.network import load_network
 
         network = self.weights

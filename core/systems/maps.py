@@ -18,7 +18,7 @@ from core.systems.entry import Entry, Ingredients, system_identity
 from core.systems.system import About, Description, Index, InnerProducts, stack
 
 if TYPE_CHECKING:
-    from core.encoder import FeatureExtractor
+    from core.features import FeatureExtractor
 
 Array = NDArray[np.float32]
 Pool = Callable[..., Array]

@@ -22,7 +22,7 @@ from core.systems.mutual import MutualRegions
 from core.systems.system import About, Description, Index
 
 if TYPE_CHECKING:
-    from core.encoder import FeatureExtractor
+    from core.features import FeatureExtractor
 
 L = 3
 OVERLAP = 0.4

@@ -21,7 +21,8 @@ from service.commands.console import Commands, Failure, messages, output, progre
 from service.commands.models import ModelsDir, check_free_name, models_directory
 
 if TYPE_CHECKING:
-    from core.encoder import EncoderDefinition, FeatureExtractor
+    from core.encoder import EncoderDefinition
+    from core.features import FeatureExtractor
     from core.preprocessing import Pixels
     from core.verdict import Calibration
     from core.vocabulary import Vocabulary
@@ -92,8 +93,9 @@ def train(
     # Imported here because they take a second.
     from pydantic import ValidationError
 
-    from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
+    from core.encoder import Encoder, EncoderDefinition
     from core.encoders import save_encoder
+    from core.features import FeatureExtractor
     from core.network import load_network
     from core.vocabulary import pool_features, train_vocabulary
 

@@ -10,9 +10,10 @@ from torch import nn
 
 from core.agreement import AgreementDefinition, Cells, agreement
 from core.backbone import PluggedNetwork
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor, canary_frame
+from core.encoder import Encoder, EncoderDefinition, canary_frame
 from core.encoders import EncoderCatalogue
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
+from core.features import FeatureExtractor
 from core.network import ShallowNetwork, caffenet_definition
 from core.preprocessing import InputDefinition
 from core.projection import Projection

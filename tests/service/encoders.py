@@ -8,8 +8,9 @@ import numpy as np
 
 from core.agreement import AgreementDefinition
 from core.backbone import Backbone
-from core.encoder import Encoder, EncoderDefinition, FeatureExtractor
+from core.encoder import Encoder, EncoderDefinition
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
+from core.features import FeatureExtractor
 from core.network import load_network
 from core.projection import Projection, fit_projection
 from core.regions import unit_length
