@@ -30,7 +30,7 @@ from core.features import FeatureDefinition, FeatureExtractor
 from core.network import NetworkDefinition, Relu, ShallowNetwork, build_layer, load_network
 from core.preprocessing import Pixels, prepare
 from core.systems.entry import Constants, Entry, Ingredients, system_identity
-from core.systems.maps import Array, PooledSystem, read_maps, unit
+from core.systems.maps import Array, MapsSystem, PooledSystem, unit
 from core.systems.spp import LEVELS, spatial_pyramid_pool
 from core.systems.system import About, Description, Index, InnerProducts, stack
 
@@ -157,20 +157,11 @@ class Differences:
         return np.asarray(1 - torch.cdist(asked, known, p=1).numpy() / SCALE, np.float32)
 
 
-class Pyramid:
+class Pyramid(MapsSystem):
     """conv5 pooled to 30 maxima a channel."""
 
-    sequential = False
-
-    def __init__(self, about: About, extractor: FeatureExtractor) -> None:
-        self.about, self.extractor = about, extractor
-        self.identity = system_identity(about, features=extractor.origin)
-
-    def describe(self, pixels: Pixels) -> Description:
-        (maps,), forward = read_maps(self.extractor, pixels)
-        began = time.perf_counter()
-        vector = spatial_pyramid_pool(maps)
-        return Description({"descriptor": vector}, {"forward": forward, "pool": 1e3 * (time.perf_counter() - began)})
+    def keep(self, maps: list[Array]) -> dict[str, Array]:
+        return {"descriptor": spatial_pyramid_pool(*maps)}
 
     def index(self, references: Sequence[Description]) -> Index:
         return Differences(stack(references))

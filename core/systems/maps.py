@@ -38,25 +38,39 @@ def unit(vectors: Array) -> Array:
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
-def power(vectors: Array, gamma: float) -> Array:
-    """sign(v)·|v|^γ, element by element."""
-    return np.copysign(np.abs(vectors) ** np.float32(gamma), vectors)
+class MapsSystem:
+    """What such systems share: identity, and a description made of the maps alone, with its times.
 
-
-class PooledSystem:
-    """Maps pooled to one vector of unit length; scores are cosines."""
+    Args:
+        extractor: gives the maps of the layers that :meth:`keep` gets.
+    """
 
     sequential = False
 
-    def __init__(self, about: About, extractor: FeatureExtractor, pool: Pool) -> None:
-        self.about, self.extractor, self.pool = about, extractor, pool
+    def __init__(self, about: About, extractor: FeatureExtractor) -> None:
+        self.about, self.extractor = about, extractor
         self.identity = system_identity(about, features=extractor.origin)
 
     def describe(self, pixels: Pixels) -> Description:
         maps, forward = read_maps(self.extractor, pixels)
         began = time.perf_counter()
-        vector = unit(self.pool(*maps))
-        return Description({"descriptor": vector}, {"forward": forward, "pool": 1e3 * (time.perf_counter() - began)})
+        arrays = self.keep(maps)
+        return Description(arrays, {"forward": forward, "pool": 1e3 * (time.perf_counter() - began)})
+
+    def keep(self, maps: list[Array]) -> dict[str, Array]:
+        """What is kept of a frame, by name, from the maps of each layer."""
+        raise NotImplementedError
+
+
+class PooledSystem(MapsSystem):
+    """Maps pooled to one vector of unit length; scores are cosines."""
+
+    def __init__(self, about: About, extractor: FeatureExtractor, pool: Pool) -> None:
+        super().__init__(about, extractor)
+        self.pool = pool
+
+    def keep(self, maps: list[Array]) -> dict[str, Array]:
+        return {"descriptor": unit(self.pool(*maps))}
 
     def index(self, references: Sequence[Description]) -> Index:
         return InnerProducts(stack(references))

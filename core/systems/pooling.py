@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from core.systems.entry import Entry
-from core.systems.maps import Array, pooled, power
+from core.systems.maps import Array, pooled
 from core.systems.system import About
+from core.vlad import power
 
 GAMMA = 0.5
 LAYER, NEXT_LAYER = "conv3", "conv4"

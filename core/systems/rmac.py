@@ -9,20 +9,19 @@ are kept apart.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.preprocessing import Pixels
-from core.systems.entry import Constants, Entry, Ingredients, system_identity
-from core.systems.maps import Array, pooled, power, read_maps, unit
+from core.systems.entry import Constants, Entry, Ingredients
+from core.systems.maps import Array, MapsSystem, pooled, unit
 from core.systems.mutual import MutualRegions
 from core.systems.system import About, Description, Index
+from core.vlad import power
 
 if TYPE_CHECKING:
-    from core.features import FeatureExtractor
+    pass
 
 L = 3
 OVERLAP = 0.4
@@ -70,21 +69,12 @@ def rmac(maps: Array) -> Array:
     return regional_vectors(maps).sum(axis=0)
 
 
-class MutualRmac:
+class MutualRmac(MapsSystem):
     """The regions of R-MAC compared one with another: the sum of the cosines of mutual ones."""
 
-    sequential = False
-
-    def __init__(self, about: About, extractor: FeatureExtractor) -> None:
-        self.about, self.extractor = about, extractor
-        self.identity = system_identity(about, features=extractor.origin)
-
-    def describe(self, pixels: Pixels) -> Description:
-        (maps,), forward = read_maps(self.extractor, pixels)
-        began = time.perf_counter()
-        vectors = regional_vectors(maps)
-        arrays = {"regions": vectors, "weights": np.ones(len(vectors), np.float32)}
-        return Description(arrays, {"forward": forward, "pool": 1e3 * (time.perf_counter() - began)})
+    def keep(self, maps: list[Array]) -> dict[str, Array]:
+        vectors = regional_vectors(*maps)
+        return {"regions": vectors, "weights": np.ones(len(vectors), np.float32)}
 
     def index(self, references: Sequence[Description]) -> Index:
         return MutualRegions(references, scale=1 / len(references[0].arrays["weights"]))

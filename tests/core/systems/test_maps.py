@@ -7,8 +7,9 @@ import pytest
 
 from core.encoders import EncoderCatalogue
 from core.systems.catalogue import build
-from core.systems.maps import PooledSystem, power, unit
+from core.systems.maps import PooledSystem, unit
 from core.systems.system import stack
+from core.vlad import power
 
 LENGTHS = {
     "sum-pool": 384,
