@@ -184,19 +184,20 @@ class Encoder:
         product = np.array(a.descriptor @ b.descriptor, np.float32)
         return float(self.scores_from_inner_products(product) + self.agreement(a.local, b.local[np.newaxis])[0])
 
-    def with_agreement(self, scores: Array, query: Cells, references: Cells) -> Array:
-        """The scores of one query after the second stage: those of the best ``candidates`` have gained.
+    def with_agreement(self, scores: Array, queries: Cells, references: Cells) -> Array:
+        """The scores after the second stage: of each query those of the best ``candidates`` have gained.
 
         Args:
-            scores: float32 [R], in any order.
-            query: int8 [C, L], its local descriptors.
-            references: int8 [R, C, L], in the order of ``scores``.
+            scores: float32 [Q, R].
+            queries: int8 [Q, C, L], their local descriptors.
+            references: int8 [R, C, L].
         """
         if not self.candidates:
             return scores
-        best = np.argsort(-scores, kind="stable")[: self.candidates]
         raised = scores.copy()
-        raised[best] += self.agreement(query, references[best])
+        for row, query in zip(raised, queries, strict=True):
+            best = np.argsort(-row, kind="stable")[: self.candidates]
+            row[best] += self.agreement(query, references[best])
         return raised
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:

@@ -8,6 +8,7 @@ matter; features are whitened by their covariance, and of what is then left the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,13 +38,18 @@ class Projection:
         """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
         return np.asarray(features @ self.matrix, np.float32)
 
+    @cached_property
+    def _shift(self) -> Array:
+        """m W, float32 [d]."""
+        return np.asarray(self.mean @ self.matrix, np.float32)
+
     def finish(self, products: Array, lengths: Array, values: int) -> Array:
         """Unit-length projections from the products and lengths of n features; float32 [n, values].
 
         (f/|f| - m) W = f W / |f| - m W.
         """
         projected = products[:, :values] * _inverse(lengths)[:, None]
-        projected -= (self.mean @ self.matrix)[:values]
+        projected -= self._shift[:values]
         projected *= (_inverse(np.sqrt(np.einsum("nd,nd->n", projected, projected))) * (lengths > 0))[:, None]
         return projected
 

@@ -116,10 +116,7 @@ def describe(encoder: Encoder, frames: Sequence[Pixels]) -> Shown:
 def scores(encoder: Encoder, queries: Shown, references: Shown) -> Array:
     """What a map of all the references answers, second stage included; float32 [Q, R]."""
     first = encoder.scores_from_inner_products(queries.descriptors @ references.descriptors.T)
-    rows = [
-        encoder.with_agreement(row, cells, references.local) for row, cells in zip(first, queries.local, strict=True)
-    ]
-    return np.stack(rows)
+    return encoder.with_agreement(first, queries.local, references.local)
 
 
 def camera_scores(encoder: Encoder, pictures: Shown, distractors: Shown) -> tuple[Array, Array]:

@@ -77,8 +77,7 @@ class EncoderSystem:
         first = InnerProducts(stack(references), finish=self.encoder.scores_from_inner_products)
         if not self.encoder.candidates:
             return first
-        local = np.stack([reference.arrays["local"] for reference in references]).astype(np.int8, copy=False)
-        return TwoStages(first, local, self.encoder)
+        return TwoStages(first, local_of(references), self.encoder)
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,9 @@ class TwoStages:
 
     def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
         ranked = self.first.compare(queries)
-        asked = [query.arrays["local"].astype(np.int8, copy=False) for query in queries]
-        return np.stack(
-            [self.encoder.with_agreement(row, cells, self.local) for row, cells in zip(ranked, asked, strict=True)]
-        )
+        return self.encoder.with_agreement(ranked, local_of(queries), self.local)
+
+
+def local_of(descriptions: Sequence[Description]) -> NDArray[np.int8]:
+    """The local descriptors of n descriptions, int8 [n, C, L]."""
+    return np.stack([description.arrays["local"] for description in descriptions]).astype(np.int8, copy=False)

@@ -55,8 +55,8 @@ def truth() -> NDArray[np.bool_]:
 def answers(encoder: Encoder, queries: list[Encoding], references: list[Encoding]) -> NDArray[np.float32]:
     """The scores of both stages, Q x R."""
     products = np.stack([one.descriptor for one in queries]) @ np.stack([one.descriptor for one in references]).T
-    scores, cells = encoder.scores_from_inner_products(products), np.stack([one.local for one in references])
-    return np.stack([encoder.with_agreement(row, one.local, cells) for row, one in zip(scores, queries, strict=True)])
+    asked, known = (np.stack([one.local for one in side]) for side in (queries, references))
+    return encoder.with_agreement(encoder.scores_from_inner_products(products), asked, known)
 
 
 def test_the_default_is_ahead_of_every_published_technique(

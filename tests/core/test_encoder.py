@@ -184,7 +184,7 @@ def test_only_the_best_candidates_are_examined() -> None:
     query = encoder.encode(random_frame(1)).local
     references = np.stack([query] * (encoder.candidates + 3))
     scores = np.linspace(0.2, 0.1, len(references)).astype(np.float32)
-    gained = encoder.with_agreement(scores, query, references) - scores
+    gained = encoder.with_agreement(scores[np.newaxis], query[np.newaxis], references)[0] - scores
     assert (gained[: encoder.candidates] > 0.5).all()
     assert (gained[encoder.candidates :] == 0).all()
 
