@@ -8,10 +8,15 @@ thesis's Figure 3.1 shows by eye), and each such pair adds the square of its cos
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numba
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -20,6 +25,9 @@ Cells = NDArray[np.int8]
 
 RESOLUTION = 254.0
 """Quantisation of local descriptors: values of half a unit and more, which hardly occur, become 127."""
+
+_COSINE = np.float32(1 / RESOLUTION**2)
+"""What the inner product of two cells' values is multiplied by to be their cosine."""
 
 TOGETHER = 32
 """Candidates compared at a time, so that memory stays bounded."""
@@ -62,9 +70,21 @@ def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> C
     Args:
         layers: float32 [C, values] each, rows of unit length or zero.
     """
-    parts = [np.sqrt(weight) * layer for weight, layer in zip(definition.weights, layers, strict=True)]
-    scaled = np.rint(np.concatenate(parts, axis=1) * RESOLUTION)
-    return np.clip(scaled, -127, 127).astype(np.int8)
+    made = np.empty((len(layers[0]), sum(layer.shape[1] for layer in layers)), np.int8)
+    start = 0
+    for weight, layer in zip(definition.weights, layers, strict=True):
+        stop = start + layer.shape[1]
+        _quantize(layer, np.sqrt(weight), made[:, start:stop])
+        start = stop
+    return made
+
+
+@numba.njit(cache=True, nogil=True)
+def _quantize(values, factor, made):  # type: ignore[no-untyped-def]
+    """Values times a factor in steps of 1 / RESOLUTION; float32 [C, n] to int8."""
+    for c in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            made[c, i] = np.int8(min(127.0, max(-127.0, np.rint(values[c, i] * factor * RESOLUTION))))
 
 
 @dataclass(frozen=True)
@@ -97,28 +117,54 @@ def _best_within(cosines, columns, rows_apart, columns_apart, best):  # type: ig
 
 
 @numba.njit(cache=True, nogil=True)
-def _squared_sums(cosines, columns, rows_apart, columns_apart):  # type: ignore[no-untyped-def]
-    """Σ cos² over the mutual best matches of each of k candidates; cosines float32 [k, C, C]."""
-    count, cells = len(cosines), cosines.shape[1]
+def _squared_sums(products, columns, rows_apart, columns_apart):  # type: ignore[no-untyped-def]
+    """Σ cos² over the mutual best matches of each of k candidates; inner products float32 or int32 [k, C, C]."""
+    count, cells = len(products), products.shape[1]
     sums = np.zeros(count, np.float32)
     there, back = np.empty(cells, np.int64), np.empty(cells, np.int64)
     for k in range(count):
-        _best_within(cosines[k], columns, rows_apart, columns_apart, there)
-        _best_within(cosines[k].T, columns, rows_apart, columns_apart, back)
+        _best_within(products[k], columns, rows_apart, columns_apart, there)
+        _best_within(products[k].T, columns, rows_apart, columns_apart, back)
         for cell in range(cells):
             match = there[cell]
-            value = cosines[k, cell, match]
+            value = np.float32(products[k, cell, match]) * _COSINE
             if back[match] == cell and value > 0:
                 sums[k] += value * value
     return sums
 
 
-def _cosines(query: Cells, candidates: Cells) -> Array:
-    """float32 [k, C, C]: cells of each candidate down, those of the query across."""
+def _float_products(candidates: Cells, query: Cells) -> NDArray[Any]:
+    """Inner products of cells, float32 [n, C]: exact, as the sums of L products stay under 2^24 for L up to 1 040."""
+    return np.asarray(candidates.astype(np.float32) @ query.astype(np.float32).T)
+
+
+def _integer_products(candidates: Cells, query: Cells) -> NDArray[Any]:
+    """The same in int32, where the processor multiplies bytes."""
+    product: torch.Tensor = torch._int_mm(torch.from_numpy(candidates), torch.from_numpy(query.T))
+    return np.asarray(product.numpy())
+
+
+@cache
+def _products() -> Callable[[Cells, Cells], NDArray[Any]]:
+    """The faster of the two on this machine, which make no difference to the result."""
+    random = np.random.default_rng(0)
+    candidates, query = (random.integers(-127, 128, (count, 192)).astype(np.int8) for count in (2028, 169))
+    best: dict[Callable[[Cells, Cells], NDArray[Any]], float] = {}
+    for make in (_float_products, _integer_products) * 4:
+        began = time.perf_counter()
+        try:
+            make(candidates, query)
+        except (AttributeError, RuntimeError, NotImplementedError):  # not in this build of torch
+            continue
+        best[make] = min(best.get(make, np.inf), time.perf_counter() - began)
+    return min(best, key=best.__getitem__)
+
+
+def _inner_products(query: Cells, candidates: Cells) -> NDArray[Any]:
+    """float32 or int32 [k, C, C]: cells of each candidate down, those of the query across."""
     k, cells, length = candidates.shape
-    products = candidates.reshape(k * cells, length).astype(np.float32) @ query.astype(np.float32).T
-    products *= np.float32(1 / RESOLUTION**2)
-    return np.asarray(products, np.float32).reshape(k, cells, cells)
+    rows = np.ascontiguousarray(candidates).reshape(k * cells, length)
+    return _products()(rows, np.ascontiguousarray(query)).reshape(k, cells, cells)
 
 
 def agreement(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> Array:
@@ -135,7 +181,7 @@ def agreement(query: Cells, candidates: Cells, columns: int, definition: Agreeme
     if len(candidates) == 0:
         return np.zeros(0, np.float32)
     sums = [
-        _squared_sums(_cosines(query, candidates[start : start + TOGETHER]), columns, *definition.reach)
+        _squared_sums(_inner_products(query, candidates[start : start + TOGETHER]), columns, *definition.reach)
         for start in range(0, len(candidates), TOGETHER)
     ]
     return np.asarray(np.concatenate(sums) * np.float32(definition.share / len(query)), np.float32)
@@ -143,7 +189,7 @@ def agreement(query: Cells, candidates: Cells, columns: int, definition: Agreeme
 
 def correspondences(query: Cells, reference: Cells, columns: int, definition: AgreementDefinition) -> Correspondences:
     """Which cell of the query answers to which of the reference; both int8 [C, L]."""
-    cosines = _cosines(query, reference[np.newaxis])[0]  # reference x query
+    cosines = _float_products(reference, query) * _COSINE  # reference x query
     there, back = np.empty(len(query), np.int64), np.empty(len(query), np.int64)
     _best_within(cosines.T, columns, *definition.reach, there)
     _best_within(cosines, columns, *definition.reach, back)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,15 +16,22 @@ from pydantic import Field
 from core.agreement import AgreementDefinition, Cells, agreement, local_descriptors
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.features import FeatureDefinition, FeatureExtractor, content_of
+from core.forward import Device, Precision, has_bfloat16
 from core.identity import json_digest, tensors_digest
+from core.masks import Mask
 from core.matching import scores
+from core.network import ShallowNetwork
 from core.preprocessing import Pixels
 from core.regions import Regions
+from core.threads import each
 from core.verdict import Calibration
-from core.vlad import Normalization, aggregate
+from core.vlad import Normalization, Words, aggregate
 from core.vocabulary import Vocabulary
 
 Array = NDArray[np.float32]
+
+FRAMES_A_PASS = 4
+"""Frames that share a forward pass at most: more gain nothing, and their maps would not stay in the caches."""
 
 GOLDEN_COSINE = 0.999
 """How close a machine's or a faster path's descriptors must come to the golden ones."""
@@ -105,7 +113,7 @@ class Encoder:
         if len(vocabulary.centers) != definition.words:
             raise InvalidModel(f"{name} needs {definition.words} words, its vocabulary has {len(vocabulary.centers)}.")
         self.name, self.extractor, self.definition = name, extractor, definition
-        self.centers = vocabulary.centers
+        self.centers, self._words = vocabulary.centers, Words(vocabulary.centers)
         self.calibration, self._golden = calibration, golden
         self.dimension = int(self.centers.size)
         self.identity = encoder_identity(name, definition, vocabulary)
@@ -140,16 +148,36 @@ class Encoder:
             return np.zeros(len(candidates), np.float32)
         return agreement(query, candidates, self.grid[1], stage)
 
-    def encode(self, pixels: Pixels) -> Encoding:
-        """Encode one frame, H x W x 3 uint8 BGR of any size."""
-        return self.encode_batch([pixels])[0]
+    def encode(self, pixels: Pixels, mask: Mask | None = None) -> Encoding:
+        """Encode one frame, H x W x 3 uint8 BGR of any size, but for what a mask covers; its pass has all cores."""
+        return self._encode([pixels], [mask])[0]
 
-    def encode_batch(self, frames: Sequence[Pixels]) -> list[Encoding]:
+    def encode_batch(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[Encoding]:
+        """Encode frames, a few to a forward pass and a pass to a core: more frames a second than one by one.
+
+        Args:
+            frames: H x W x 3 uint8 BGR each, of any sizes.
+            masks: of each frame what not to see; None: all is seen.
+
+        Raises:
+            ValueError: there is another number of masks than of frames.
+        """
+        hidden = [None] * len(frames) if masks is None else masks
+        if len(hidden) != len(frames):
+            raise ValueError(f"{len(hidden)} masks for {len(frames)} frames")
+        threads = torch.get_num_threads()
+        passes = max(min(threads, len(frames)), -(-len(frames) // FRAMES_A_PASS))
+        cuts = [len(frames) * index // max(passes, 1) for index in range(passes + 1)]
+
+        def encode(part: tuple[int, int]) -> list[Encoding]:
+            return self._encode(frames[part[0] : part[1]], hidden[part[0] : part[1]])
+
+        return [encoding for made in each(encode, list(pairwise(cuts)), threads) for encoding in made]
+
+    def _encode(self, frames: Sequence[Pixels], masks: Sequence[Mask | None]) -> list[Encoding]:
         """Encode frames with one forward pass; ``forward`` is each frame's share of it."""
-        if not frames:
-            return []
         started = time.perf_counter()
-        activations = self.extractor.activations(frames)
+        activations = self.extractor.activations(frames, masks)
         forward = 1e3 * (time.perf_counter() - started) / len(frames)
         return [self.describe(layers, forward) for layers in activations]
 
@@ -160,15 +188,19 @@ class Encoder:
         products = self.extractor.products(activations)
         regions = self.extractor.regions(activations, products)
         between = time.perf_counter()
-        descriptor = aggregate(regions.features, self.centers, definition.gamma, definition.normalization)
-        local = self._local(activations, products, len(regions) == 0)
+        descriptor = aggregate(regions.features, self._words, definition.gamma, definition.normalization)
+        local = self.local(activations, products) if len(regions) else np.zeros(self.local_shape, np.int8)
         ended = time.perf_counter()
         times = {"forward": forward, "regions": 1e3 * (between - began), "vlad": 1e3 * (ended - between)}
         return Encoding(descriptor, local, regions, times)
 
-    def _local(self, activations: Sequence[Array], products: Mapping[str, Array], blank: bool) -> Cells:
+    def local(self, activations: Sequence[Array], products: Mapping[str, Array]) -> Cells:
+        """The local descriptors of a frame that has a region, as :attr:`Encoding.local`.
+
+        Whatever a frame without regions excites, it is like no other: its descriptors are zero.
+        """
         stage = self.definition.agreement
-        if stage is None or blank:  # whatever a frame without regions excites, it is like no other
+        if stage is None:
             return np.zeros(self.local_shape, np.int8)
         cells = self.extractor.projected_cells(activations, products, stage.layers, stage.values)
         return local_descriptors(cells, stage)
@@ -204,6 +236,43 @@ class Encoder:
         """Cells (rows, columns) of the maps of each layer in use."""
         return self.extractor.layer_grids()
 
+    def settle(self, precision: Precision | Literal["auto"] = "auto", device: Device = "cpu") -> Precision:
+        """Choose how forward passes are computed, before the first frame is encoded; the precision now in use.
+
+        A lower precision is used only where it makes no difference that counts: descriptors of one identity are
+        held against each other, whichever machine made them.
+
+        Args:
+            precision: "auto" takes bfloat16 where the processor multiplies it and the descriptors of a few frames
+                come as close to those of float32 as ``GOLDEN_COSINE``.
+            device: of the forward pass; on a GPU it is float32.
+
+        Raises:
+            InvalidModel: this machine has not what was asked for.
+            GoldenMismatch: bfloat16 was asked for, and the descriptors do not stand it.
+        """
+        self.extractor.compute("float32", device)
+        lower = has_bfloat16() and isinstance(self.extractor.backbone, ShallowNetwork)
+        if device == "cuda" or precision == "float32" or (precision == "auto" and not lower):
+            return "float32"
+        frames = [canary_frame(), canary_frame()[:, ::-1].copy(), 255 - canary_frame()]
+        exact = [self.encode(frame) for frame in frames]
+        try:
+            self.extractor.compute("bfloat16")
+            for frame, wanted in zip(frames, exact, strict=True):
+                self._hold_against(self.encode(frame), wanted.descriptor, wanted.local, "those of float32")
+        except (GoldenMismatch, InvalidModel):
+            self.extractor.compute("float32")
+            if precision == "bfloat16":
+                raise
+            return "float32"
+        return "bfloat16"
+
+    def _hold_against(self, made: Encoding, descriptor: NDArray[Any], local: Cells, what: str) -> None:
+        for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
+            if not cosine >= GOLDEN_COSINE:
+                raise GoldenMismatch(f"{self.name} gives a cosine of {cosine:.4f} to {what} on this machine.")
+
     def check_golden(self) -> None:
         """Encode the canary frame and compare.
 
@@ -213,12 +282,7 @@ class Encoder:
         if self._golden is None:
             raise GoldenMismatch(f"{self.name} has no golden values.")
         made = self.encode(canary_frame())
-        descriptor, local = self._golden
-        for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):
-            if not cosine >= GOLDEN_COSINE:
-                raise GoldenMismatch(
-                    f"{self.name} gives a cosine of {cosine:.4f} to its golden values on this machine."
-                )
+        self._hold_against(made, *self._golden, "its golden values")
         self.agreement(made.local, made.local[np.newaxis])  # compiled now, as all else is, and not by the first query
 
 

@@ -24,6 +24,7 @@ from safetensors.numpy import save_file
 from core.encoder import Encoder, EncoderDefinition, canary_frame
 from core.errors import InvalidModel, UnknownEncoder
 from core.features import FeatureExtractor, projection_tensors
+from core.forward import Device, Precision
 from core.identity import canonical_json
 from core.network import NAME, load_network
 from core.projection import Projection
@@ -105,11 +106,31 @@ def save_encoder(
     for name, tensor in projection_tensors(encoder.extractor.projections).items():
         tensors[f"{PROJECTION}{name}"] = tensor.numpy()
     path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
+    _write(path, tensors, header)
+    return path
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Give an encoder file another default calibration; nothing else of it changes, nor its identity.
+
+    Raises:
+        InvalidModel: it cannot be read.
+    """
+    header = _read_header(path).model_copy(update={"calibration": calibration})
+    try:
+        with safe_open(path, "np") as file:
+            tensors = {name: np.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise InvalidModel(f"{path.name} cannot be read: {error}") from error
+    _write(path, tensors, header)
+
+
+def _write(path: Path, tensors: Mapping[str, NDArray[Any]], header: _Header) -> None:
+    """The file of an encoder, whole or not at all."""
     partial = path.with_name(path.name + ".tmp")
-    save_file(tensors, partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
+    save_file(dict(tensors), partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
     partial.chmod(0o644)
     os.replace(partial, path)
-    return path
 
 
 def _read_header(path: Path) -> _Header:
@@ -168,9 +189,16 @@ class EncoderCatalogue:
     Args:
         models_dir: the user's directory, which need not exist; its encoders cannot take a packaged
             name.
+        precision, device: how forward passes are computed, as :meth:`core.encoder.Encoder.settle` takes them.
     """
 
-    def __init__(self, models_dir: Path | None = None) -> None:
+    def __init__(
+        self,
+        models_dir: Path | None = None,
+        precision: Precision | Literal["auto"] = "auto",
+        device: Device = "cpu",
+    ) -> None:
+        self._precision, self._device = precision, device
         self._folders = [PACKAGED] + ([models_dir] if models_dir is not None else [])
         self._loaded: dict[Path, Encoder] = {}
         self._lock = threading.Lock()
@@ -244,10 +272,13 @@ class EncoderCatalogue:
 
         Raises:
             UnknownEncoder: none has this name or identity.
-            InvalidModel: its files are missing or damaged.
+            InvalidModel: its files are missing or damaged, or this machine lacks the precision or device asked for.
+            GoldenMismatch: the precision asked for changes its descriptors.
         """
         path = self._find(name_or_identity)
         with self._lock:
             if path not in self._loaded:
-                self._loaded[path] = load_encoder(path, self.network_file(_read_header(path).network))
+                encoder = load_encoder(path, self.network_file(_read_header(path).network))
+                encoder.settle(self._precision, self._device)
+                self._loaded[path] = encoder
             return self._loaded[path]

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from torch import Tensor
 
 from core.backbone import Backbone
 from core.errors import InvalidModel
+from core.forward import CudaPass, Device, Precision, fused_pass
 from core.identity import json_digest, tensors_digest
+from core.masks import Mask
+from core.network import ShallowNetwork
 from core.preprocessing import Pixels, contrast, prepare
 from core.projection import Projection
-from core.regions import Regions, box_sums, extract_regions, unit_length
+from core.regions import Regions, box_sums, extract_regions, find_regions, unit_length
 from core.threads import keep_numpy_single_threaded
 
 Array = NDArray[np.float32]
@@ -75,6 +80,7 @@ class FeatureExtractor:
             raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
         keep_numpy_single_threaded()
         self.backbone, self.definition = backbone, definition
+        self.compute()
         self.projections = dict(projections or {})
         for layer, values in definition.projected().items():
             if layer not in self.projections or self.projections[layer].matrix.shape[1] < values:
@@ -89,16 +95,47 @@ class FeatureExtractor:
         self.origin = json_digest(parts)
         """Identity of the features: what a vocabulary must have been trained on."""
 
-    def activations(self, frames: Sequence[Pixels]) -> list[list[Array]]:
-        """For each frame the rectified maps of each output, float32 [X, Y, K]; zeros for a blank frame."""
-        batch = np.stack([prepare(frame, self.backbone.input) for frame in frames])  # B x H x W x 3
+    def compute(self, precision: Precision = "float32", device: Device = "cpu") -> None:
+        """Let forward passes be computed so from now on; a plugged network computes as it does itself.
+
+        Raises:
+            InvalidModel: this machine cannot.
+        """
+        network = self.backbone
+        self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
+        """The network as it is computed here: B x 3 x H x W to one B x K x X x Y for each output, float32 all."""
+        if isinstance(network, ShallowNetwork):
+            made = CudaPass(network) if device == "cuda" else fused_pass(network, precision)
+            if made is None and precision != "float32":
+                raise InvalidModel(f"this build of torch cannot compute {network.definition.name} in {precision}.")
+            self.forward = made or network
+        elif (precision, device) != ("float32", "cpu"):
+            raise InvalidModel("a plugged network runs on the CPU in float32, unless it takes itself elsewhere.")
+
+    def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
+        """For each frame the rectified maps of each output, float32 [X, Y, K]; zeros for a blank frame.
+
+        Args:
+            masks: of each frame what not to see: the network is shown its mean colour there, and cells that
+                are covered by half or more stay zero, so that they bear no region and no local descriptor.
+        """
+        hidden = [None] * len(frames) if masks is None else masks
+        shown = self.backbone.input
+        batch = np.empty((len(frames), shown.height, shown.width, 3), np.float32)
+        for image, frame, mask in zip(batch, frames, hidden, strict=True):
+            prepare(frame, shown, image)
+            if mask is not None:
+                image[mask.covered(shown.height, shown.width)] = 0
         with torch.inference_mode():
-            outputs = self.backbone(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
+            outputs = self.forward(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
         maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
-        for index, frame in enumerate(frames):
-            if contrast(frame) < self.definition.least_contrast:
-                for layer in maps:
+        for index, (frame, mask) in enumerate(zip(frames, hidden, strict=True)):
+            blank = contrast(frame, mask) < self.definition.least_contrast
+            for layer in maps:
+                if blank:
                     layer[index] = 0
+                elif mask is not None:
+                    layer[index][mask.covered(*layer.shape[1:3])] = 0
         return [[layer[index] for layer in maps] for index in range(len(frames))]
 
     def products(self, activations: Sequence[Array]) -> dict[str, Array]:
@@ -115,25 +152,22 @@ class FeatureExtractor:
         """
         definition = self.definition
         fused = activations[: len(definition.layers)]
-        found = extract_regions(fused, definition.steps, definition.regions)
         if definition.projection is not None:
+            found = find_regions(fused, definition.steps, definition.regions)
             features = self._projected(found, fused, products or self.products(activations), definition.projection)
-        elif definition.unit_features:
-            features = unit_length(found.features)
-        else:
-            return found
-        return Regions(found.boxes, found.energies, found.channels, found.layers, features)
+            return replace(found, features=features)
+        found = extract_regions(fused, definition.steps, definition.regions)
+        return replace(found, features=unit_length(found.features)) if definition.unit_features else found
 
     def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
         """The regional features projected, float32 [T, values]: a projection of sums is a sum of projections."""
-        lengths = np.sqrt(np.einsum("tk,tk->t", found.features, found.features))
-        ends = np.searchsorted(found.layers, np.arange(len(fused) + 1))  # regions come layer by layer
-        parts = []
-        for name, layer, start, stop in zip(self.definition.layers, fused, ends, ends[1:], strict=False):
+        features = np.empty((len(found), values), np.float32)
+        parts = found.parts(len(fused))
+        for name, layer, part in zip(self.definition.layers, fused, parts, strict=True):
+            boxes = found.boxes[part]
             grid = products[name].reshape(*layer.shape[:2], -1)
-            sums = box_sums(grid, found.boxes[start:stop])
-            parts.append(self.projections[name].finish(sums, lengths[start:stop], values))
-        return np.concatenate(parts)
+            features[part] = self.projections[name].finish(box_sums(grid, boxes), box_sums(layer, boxes), values)
+        return features
 
     def projected_cells(
         self, activations: Sequence[Array], products: Mapping[str, Array], layers: Sequence[str], values: int
@@ -143,8 +177,7 @@ class FeatureExtractor:
         made = []
         for name in layers:
             cells = _cells(maps[name])
-            lengths = np.sqrt(np.einsum("ck,ck->c", cells, cells))
-            made.append(self.projections[name].finish(products[name], lengths, values))
+            made.append(self.projections[name].finish(products[name], cells, values))
         return made
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:

@@ -10,8 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from core.products import ConstantMatrix
 
 Array = NDArray[np.float32]
 
@@ -32,31 +35,52 @@ class Projection:
 
     def __call__(self, features: Array, values: int) -> Array:
         """Unit-length projections of n features, float32 [n, K] to [n, values]; zero stays zero."""
-        return self.finish(self.products(features), np.sqrt(np.einsum("nk,nk->n", features, features)), values)
+        return self.finish(self.products(features), features, values)
 
     def products(self, features: Array) -> Array:
         """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
-        return np.asarray(features @ self.matrix, np.float32)
+        return self._product(features)
+
+    @cached_property
+    def _product(self) -> ConstantMatrix:
+        return ConstantMatrix(self.matrix)
 
     @cached_property
     def _shift(self) -> Array:
         """m W, float32 [d]."""
         return np.asarray(self.mean @ self.matrix, np.float32)
 
-    def finish(self, products: Array, lengths: Array, values: int) -> Array:
-        """Unit-length projections from the products and lengths of n features; float32 [n, values].
+    def finish(self, products: Array, features: Array, values: int) -> Array:
+        """Unit-length projections of n features whose products are known; float32 [n, values].
 
         (f/|f| - m) W = f W / |f| - m W.
+
+        Args:
+            products: float32 [n, d].
+            features: float32 [n, K].
         """
-        projected = products[:, :values] * _inverse(lengths)[:, None]
-        projected -= self._shift[:values]
-        projected *= (_inverse(np.sqrt(np.einsum("nd,nd->n", projected, projected))) * (lengths > 0))[:, None]
+        projected = np.empty((len(features), values), np.float32)
+        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self._shift, projected)
         return projected
 
 
-def _inverse(lengths: Array) -> Array:
-    """1 / x, and 0 for 0; float32 [n]."""
-    return np.divide(np.float32(1), lengths, out=np.zeros_like(lengths), where=lengths > 0)
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _finish(products, features, shift, projected):  # type: ignore[no-untyped-def]
+    """Row by row, as :meth:`Projection.finish`, into ``projected``, float32 [n, values]."""
+    values = projected.shape[1]
+    for i in range(len(features)):
+        square = np.float32(0)
+        for k in range(features.shape[1]):
+            square += features[i, k] * features[i, k]
+        inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
+        square = np.float32(0)
+        for d in range(values):
+            value = products[i, d] * inverse - shift[d]
+            projected[i, d] = value
+            square += value * value
+        again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
+        for d in range(values):
+            projected[i, d] *= again
 
 
 def fit_projection(clear: Array, changed: Array, values: int) -> Projection:

@@ -6,7 +6,7 @@ group of cells of one feature map whose activations have the same quantised leve
 
 The pass is pruned without changing its result: division and floor are monotonic, so every cell of
 a higher level exceeds every cell of a lower one, and so do the means of their regions.  Only the
-cells at or above the level where ``count`` regions are complete are ever labelled.
+cells at or above the level where ``count`` regions are complete are ever labelled (``components.py``).
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from core.components import DOUBLES, INTEGERS, SINGLES, bits_shape, strongest
+
 Activations = NDArray[np.float32]
 
-HISTOGRAM_BINS = 4096
-"""Levels of the histogram that prunes; all higher levels share its last bin."""
+SHAPES = 8
+"""Shapes of layers for which a thread keeps room to work in."""
 
-TABLES = 8
-"""Summed-area tables that a thread keeps."""
-
-FIRST_GUESS = 2
-"""Cells per wanted region in the first attempt to label few enough cells."""
+FEW = 16
+"""Cells of a box that are summed as they are; the rounding of so few is far under that of a feature's length."""
 
 
 @dataclass(frozen=True)
@@ -51,123 +51,15 @@ class Regions:
     def __len__(self) -> int:
         return len(self.energies)
 
-
-def _foreground(
-    activations: Activations, step: np.float32
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Cells of level 1 and above: flat cell index (y * width + x) and channel of each, and its level, all [F]."""
-    values = activations.reshape(-1)
-    # NumPy compares sixteen values at a time, and few pass: much quicker than a compiled loop.
-    passed = np.flatnonzero(values >= step)
-    cells, channels = np.divmod(passed, activations.shape[2])
-    return cells, channels, np.floor(values[passed] / step)
+    def parts(self, layers: int) -> list[slice]:
+        """Where the regions of each of so many layers stand."""
+        ends = np.searchsorted(self.layers, np.arange(layers + 1)).tolist()
+        return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 @numba.njit(cache=True, nogil=True)
-def _histogram(levels):  # type: ignore[no-untyped-def]
-    """How many cells each level has, int64 [HISTOGRAM_BINS]."""
-    histogram = np.zeros(HISTOGRAM_BINS, np.int64)
-    for level in levels:
-        histogram[int(min(level, np.float32(HISTOGRAM_BINS - 1)))] += 1
-    return histogram
-
-
-@numba.njit(cache=True, nogil=True)
-def _level_with(histogram, wanted):  # type: ignore[no-untyped-def]
-    """The highest level >= 1 at or above which at least ``wanted`` cells lie (1 if there are fewer)."""
-    seen, level = 0, HISTOGRAM_BINS
-    while level > 1 and seen < wanted:
-        level -= 1
-        seen += histogram[level]
-    return level
-
-
-@numba.njit(cache=True, nogil=True)
-def _by_channel(maps, levels, lowest, channels):  # type: ignore[no-untyped-def]
-    """The cells of level >= ``lowest``, sorted by channel and within it as before.
-
-    Returns their indices, and where each channel starts, int64 [K + 1].
-    """
-    starts = np.zeros(channels + 1, np.int64)
-    for i in range(len(maps)):
-        if levels[i] >= lowest:
-            starts[maps[i] + 1] += 1
-    for k in range(channels):
-        starts[k + 1] += starts[k]
-    order = np.empty(starts[channels], np.int64)
-    fill = starts[:-1].copy()
-    for i in range(len(maps)):
-        if levels[i] >= lowest:
-            order[fill[maps[i]]] = i
-            fill[maps[i]] += 1
-    return order, starts
-
-
-@numba.njit(cache=True, nogil=True)
-def _label(activations, cells, maps, levels, lowest):  # type: ignore[no-untyped-def]
-    """All regions of level >= ``lowest`` in order of their first cell (map-major, then row-major).
-
-    Returns boxes int32 [R, 4], mean activations float64 [R], channels int32 [R].
-    """
-    height, width, channels = activations.shape
-    order, starts = _by_channel(maps, levels, lowest, channels)
-    boxes = np.empty((len(order), 4), np.int32)
-    energies = np.empty(len(order), np.float64)
-    owners = np.empty(len(order), np.int32)
-    found = 0
-    grid = np.zeros((height + 2, width + 2), np.float32)  # with a rim of background
-    stack = np.empty(height * width, np.int64)
-    for k in range(channels):
-        members = order[starts[k] : starts[k + 1]]
-        for i in members:
-            grid[cells[i] // width + 1, cells[i] % width + 1] = levels[i]
-        for i in members:
-            y, x = cells[i] // width, cells[i] % width
-            level = grid[y + 1, x + 1]
-            if level == 0:  # taken by an earlier region
-                continue
-            top, left, bottom, right = y, x, y, x
-            total, size = 0.0, 0
-            grid[y + 1, x + 1] = 0
-            stack[0], depth = cells[i], 1
-            while depth > 0:
-                depth -= 1
-                y, x = stack[depth] // width, stack[depth] % width
-                total += activations[y, x, k]
-                size += 1
-                top, left, bottom, right = min(top, y), min(left, x), max(bottom, y), max(right, x)
-                for v in range(y, y + 3):
-                    for u in range(x, x + 3):
-                        if grid[v, u] == level:
-                            grid[v, u] = 0
-                            stack[depth] = (v - 1) * width + u - 1
-                            depth += 1
-            boxes[found, 0], boxes[found, 1] = top, left
-            boxes[found, 2], boxes[found, 3] = bottom + 1, right + 1
-            energies[found] = total / size
-            owners[found] = k
-            found += 1
-    return boxes[:found], energies[:found], owners[:found]
-
-
-@numba.njit(cache=True, nogil=True)
-def _strongest(activations, cells, maps, levels, count):  # type: ignore[no-untyped-def]
-    """The ``count`` regions of highest energy over all maps (eq. 3.3), ties by first occurrence."""
-    histogram = _histogram(levels)
-    wanted = FIRST_GUESS * count
-    while True:
-        lowest = _level_with(histogram, wanted)
-        boxes, energies, owners = _label(activations, cells, maps, levels, lowest)
-        if len(energies) >= count or lowest == 1:
-            break
-        wanted *= 2
-    order = np.argsort(-energies, kind="mergesort")[:count]
-    return boxes[order], energies[order], owners[order]
-
-
-@numba.njit(cache=True, nogil=True)
-def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
-    """Put the sum of the local descriptors in each box into ``sums``, float32 [T, K], by the summed-area ``table``."""
+def _fill(activations, table):  # type: ignore[no-untyped-def]
+    """The summed-area table: sums over all cells above and to the left; its first row and column stay zero."""
     height, width, channels = activations.shape
     row = np.empty(channels, np.float64)
     for y in range(height):
@@ -176,30 +68,135 @@ def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
             for k in range(channels):
                 row[k] += activations[y, x, k]
                 table[y + 1, x + 1, k] = table[y, x + 1, k] + row[k]
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _add_few(cells, top, left, bottom, right, width, total):  # type: ignore[no-untyped-def]
+    """The sum over a small box, two cells at a time; float32 [X·Y, K] to [K]."""
+    for y in range(top, bottom):
+        at, stop = y * width + left, y * width + right
+        if y == top and stop - at == 1:
+            one = cells[at]
+            for k in range(len(total)):
+                total[k] = one[k]
+            at += 1
+        elif y == top:
+            one, two = cells[at], cells[at + 1]
+            for k in range(len(total)):
+                total[k] = one[k] + two[k]
+            at += 2
+        while at + 1 < stop:
+            one, two = cells[at], cells[at + 1]
+            for k in range(len(total)):
+                total[k] += one[k] + two[k]
+            at += 2
+        if at < stop:
+            one = cells[at]
+            for k in range(len(total)):
+                total[k] += one[k]
+
+
+@numba.njit(cache=True, nogil=True)
+def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
+    """Put the sum of the local descriptors in each box into ``sums``, float32 [T, K].
+
+    Most boxes are small and summed directly.  When the others hold more cells together than a summed-area table
+    has, ``table``, float64 [X + 1, Y + 1, K], is filled.
+    """
+    height, width, channels = activations.shape
+    cells = activations.reshape(height * width, channels)
+    many = 0
     for t in range(len(boxes)):
-        top, left, bottom, right = boxes[t]
-        for k in range(channels):
-            sums[t, k] = table[bottom, right, k] - table[top, right, k] - table[bottom, left, k] + table[top, left, k]
+        area = (boxes[t, 2] - boxes[t, 0]) * (boxes[t, 3] - boxes[t, 1])
+        many += area if area > FEW else 0
+    tabled = many > 2 * height * width
+    if tabled:
+        _fill(activations, table)
+    exact = np.empty(channels, np.float64)
+    for t in range(len(boxes)):
+        top, left, bottom, right = boxes[t, 0], boxes[t, 1], boxes[t, 2], boxes[t, 3]
+        total = sums[t]
+        if (bottom - top) * (right - left) <= FEW:
+            _add_few(cells, top, left, bottom, right, width, total)
+        elif tabled:
+            for k in range(channels):
+                total[k] = table[bottom, right, k] - table[top, right, k] - table[bottom, left, k] + table[top, left, k]
+        else:
+            exact[:] = 0
+            for y in range(top, bottom):
+                for at in range(y * width + left, y * width + right):
+                    for k in range(channels):
+                        exact[k] += cells[at, k]
+            for k in range(channels):
+                total[k] = exact[k]
+
+
+@dataclass(frozen=True)
+class _Room:
+    """What a pass over a layer works in; fresh pages would cost as much as the pass itself."""
+
+    cells: NDArray[np.int32]
+    singles: NDArray[np.float32]
+    doubles: NDArray[np.float64]
+    bits: NDArray[np.uint64]
+    firsts: NDArray[np.int32]
+    table: NDArray[np.float64]
 
 
 class _Workspace(threading.local):
-    """The summed-area tables that one thread's passes share: fresh pages would cost as much as the sums."""
+    """The rooms of one thread, by the shape of the layer; an encoder has few."""
 
     def __init__(self) -> None:
-        self._tables: dict[tuple[int, ...], NDArray[np.float64]] = {}
+        self._rooms: dict[tuple[int, ...], _Room] = {}
 
-    def table(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """The table for activations of this shape; an encoder has few."""
-        if shape not in self._tables:
-            if len(self._tables) >= TABLES:
-                self._tables.clear()
+    def room(self, shape: tuple[int, ...]) -> _Room:
+        """The room for activations of this shape."""
+        found = self._rooms.get(shape)
+        if found is None:
+            if len(self._rooms) >= SHAPES:
+                self._rooms.clear()
             height, width, channels = shape
-            # The first row and column are never written: they stay zero.
-            self._tables[shape] = np.zeros((height + 1, width + 1, channels), np.float64)
-        return self._tables[shape]
+            values = height * width * channels
+            found = _Room(
+                cells=np.empty((INTEGERS, values), np.int32),
+                singles=np.empty((SINGLES, values), np.float32),
+                doubles=np.empty((DOUBLES, values), np.float64),
+                bits=np.zeros(bits_shape(height, width, channels), np.uint64),
+                firsts=np.zeros(bits_shape(height, width, channels), np.int32),
+                table=np.zeros((height + 1, width + 1, channels), np.float64),
+            )
+            self._rooms[shape] = found
+        return found
 
 
 _workspace = _Workspace()
+
+
+def find_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
+    """As :func:`extract_regions`, but without the features: float32 [T, 0]."""
+    if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
+        raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
+    room = count * len(layers)
+    boxes, energies = np.empty((room, 4), np.int32), np.empty(room, np.float32)
+    channels, owners = np.empty(room, np.int32), np.empty(room, np.int32)
+    end = 0
+    for index, (layer, step) in enumerate(zip(layers, steps, strict=True)):
+        work = _workspace.room(layer.shape)
+        start, stop = end, end + count
+        end += strongest(
+            np.ascontiguousarray(layer, np.float32),
+            np.float32(step),
+            work.cells,
+            work.singles,
+            work.doubles,
+            work.bits,
+            work.firsts,
+            boxes[start:stop],
+            energies[start:stop],
+            channels[start:stop],
+        )
+        owners[start:end] = index
+    return Regions(boxes[:end], energies[:end], channels[:end], owners[:end], np.empty((end, 0), np.float32))
 
 
 def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
@@ -217,33 +214,25 @@ def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count
     Raises:
         ValueError: a step or ``count`` is not positive, an array is not 3-D, or K differs.
     """
-    if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
-        raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
+    found = find_regions(layers, steps, count)
     if len({layer.shape[2] for layer in layers}) != 1:
         raise ValueError("the layers that are fused have the same number of channels")
-    grids = [np.ascontiguousarray(layer, np.float32) for layer in layers]
-    found = [
-        _strongest(grid, *_foreground(grid, np.float32(step)), count) for grid, step in zip(grids, steps, strict=True)
-    ]
-    features = np.empty((sum(len(boxes) for boxes, _, _ in found), layers[0].shape[2]), np.float32)
-    start = 0
-    for grid, (boxes, _, _) in zip(grids, found, strict=True):
-        _box_sums(grid, boxes, _workspace.table(grid.shape), features[start : start + len(boxes)])
-        start += len(boxes)
-    return Regions(
-        boxes=np.concatenate([boxes for boxes, _, _ in found]),
-        energies=np.concatenate([energies for _, energies, _ in found]).astype(np.float32),
-        channels=np.concatenate([channels for _, _, channels in found]),
-        layers=np.repeat(np.arange(len(found), dtype=np.int32), [len(boxes) for boxes, _, _ in found]),
-        features=features,
-    )
+    features = np.empty((len(found), layers[0].shape[2]), np.float32)
+    for layer, part in zip(layers, found.parts(len(layers)), strict=True):
+        box_sums(layer, found.boxes[part], features[part])
+    return Regions(found.boxes, found.energies, found.channels, found.layers, features)
 
 
-def box_sums(grid: Activations, boxes: NDArray[np.int32]) -> NDArray[np.float32]:
-    """The sum of a layer's local descriptors, float32 [X, Y, K], in each box, int32 [T, 4]; float32 [T, K]."""
-    sums = np.empty((len(boxes), grid.shape[2]), np.float32)
-    _box_sums(np.ascontiguousarray(grid, np.float32), boxes, _workspace.table(grid.shape), sums)
-    return sums
+def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | None = None) -> NDArray[np.float32]:
+    """The sum of a layer's local descriptors, float32 [X, Y, K], in each box, int32 [T, 4]; float32 [T, K].
+
+    Args:
+        out: where to put them, float32 [T, K]; None: a new array.
+    """
+    if out is None:
+        out = np.empty((len(boxes), grid.shape[2]), np.float32)
+    _box_sums(np.ascontiguousarray(grid, np.float32), boxes, _workspace.room(grid.shape).table, out)
+    return out
 
 
 def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:

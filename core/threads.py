@@ -1,10 +1,41 @@
-"""Threads: a product of a frame's features takes half a millisecond, too little to share between cores."""
+"""Threads: those of torch, FAISS, OpenCV and NumPy share the cores, and none holds one while it waits.
+
+One frame's forward pass is shared between the cores; all else that is done for a frame takes so little that a
+second thread would cost more than it gains.  Of several frames, each core takes whole ones (:func:`each`).
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+from collections.abc import Callable, MutableMapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TypeVar
 
 from threadpoolctl import ThreadpoolController
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+
+SPINS = "1000"
+"""Turns that an OpenMP thread waits awake for its next work before it sleeps: some ten microseconds."""
+
+
+def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Let OpenMP's threads sleep soon after a parallel section; to be called before torch or FAISS are imported.
+
+    By default they spin for a millisecond and more.  The search that follows a forward pass then has half the
+    machine, and when other processes want the cores, threads that spin take them from those that are waited for.
+    What the user has set stays.
+    """
+    if "OMP_WAIT_POLICY" not in environment:
+        environment.setdefault("GOMP_SPINCOUNT", SPINS)
+
+
+def cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @cache
@@ -18,3 +49,47 @@ def keep_numpy_single_threaded() -> None:
     for library in ThreadpoolController().lib_controllers:
         if library.user_api == "blas" and "numpy" in library.filepath:
             library.set_num_threads(1)
+
+
+def share_cores(threads: int) -> None:
+    """Let torch and FAISS use so many threads each, and OpenCV none of its own, in this process.
+
+    Frames are encoded and maps are searched in turn, so each may have all of the cores; OpenCV would only
+    split what takes it a tenth of a millisecond.
+
+    Args:
+        threads: at least 1.
+    """
+    import cv2
+    import faiss
+    import torch
+
+    torch.set_num_threads(threads)
+    faiss.omp_set_num_threads(threads)
+    cv2.setNumThreads(1)
+    keep_numpy_single_threaded()
+
+
+def _compute_alone() -> None:
+    """Let this thread compute by itself: the others of its pool have the other cores."""
+    import torch
+
+    torch.get_num_threads()  # torch settles a thread's number at its first use, and would undo what follows
+    for library in ThreadpoolController().lib_controllers:
+        if library.user_api == "openmp":
+            library.set_num_threads(1)  # OpenMP keeps this number by thread
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "core", _compute_alone)
+
+
+def each(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> list[Made]:
+    """``work`` of every item, in their order, each in one of so many threads that compute alone.
+
+    It is for work that lets go of the interpreter and does not call this again.
+    """
+    if threads < 2 or len(items) < 2:
+        return [work(item) for item in items]
+    return list(_pool(threads).map(work, items))

@@ -12,11 +12,33 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from core.bitmasks import BLOCK, lowest_bit, reaching
+from core.products import ConstantMatrix
+
 Normalization = Literal["intra", "global"]
 Array = NDArray[np.float32]
 
 
-def assign(features: Array, centers: Array) -> NDArray[np.int64]:
+class Words:
+    """The words of a vocabulary, made ready once to be held against the features of many frames.
+
+    Args:
+        centers: float32 [V, K].
+    """
+
+    def __init__(self, centers: Array) -> None:
+        self.centers = np.ascontiguousarray(centers, np.float32)
+        # ‖f - o‖² = ‖f‖² - 2 f·o + ‖o‖², and ‖f‖² is the same for all centres.
+        self.closeness = ConstantMatrix(self.centers.T, np.float32(-0.5) * np.einsum("vk,vk->v", centers, centers))
+        """float32 [T, K] to [T, V]: the highest value of a row is the nearest word's."""
+
+
+def ready(centers: Array | Words) -> Words:
+    """The words of these centres, float32 [V, K], if they are not ready yet."""
+    return centers if isinstance(centers, Words) else Words(centers)
+
+
+def assign(features: Array, centers: Array | Words) -> NDArray[np.int64]:
     """Z = α(F): the nearest centre in L2 of each feature (eqs. 3.7, 4.7), ties to the lower index.
 
     Args:
@@ -26,24 +48,41 @@ def assign(features: Array, centers: Array) -> NDArray[np.int64]:
     Returns:
         int64 [T].
     """
-    # ‖f - o‖² = ‖f‖² - 2 f·o + ‖o‖², and ‖f‖² is the same for all centres.
-    closeness = features @ centers.T
-    closeness -= 0.5 * np.einsum("vk,vk->v", centers, centers)
-    return np.argmax(closeness, axis=1)
+    return np.argmax(ready(centers).closeness(features), axis=1)
 
 
-def residuals(features: Array, centers: Array) -> Array:
+def residuals(features: Array, centers: Array | Words) -> Array:
     """v_u = Σ (f - o_u) over the features assigned to u (eqs. 3.8, 4.8); float32 [V, K]."""
-    return _summed(features, centers, assign(features, centers))
+    words = ready(centers)
+    made: Array = _summed(features, words.centers, words.closeness(features))
+    return made
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def _highest(values):  # type: ignore[no-untyped-def]
+    """The place of the highest of finite values, the first of equal ones; float32 [n]."""
+    most = values[0]
+    for i in range(len(values)):
+        most = max(most, values[i])
+    whole = len(values) - len(values) % BLOCK
+    for start in range(0, whole, BLOCK):
+        bits = reaching(values, start, most)
+        if bits != 0:
+            return start + int(lowest_bit(bits))
+    for i in range(whole, len(values)):
+        if values[i] >= most:
+            return i
+    return 0
 
 
 @numba.njit(cache=True, nogil=True)
-def _summed(features, centers, words):  # type: ignore[no-untyped-def]
+def _summed(features, centers, closeness):  # type: ignore[no-untyped-def]
     vectors = np.zeros_like(centers)
     for t in range(len(features)):
-        u = words[t]
+        u = _highest(closeness[t])
+        vector, feature, center = vectors[u], features[t], centers[u]
         for k in range(features.shape[1]):
-            vectors[u, k] += features[t, k] - centers[u, k]
+            vector[k] += feature[k] - center[k]
     return vectors
 
 
@@ -66,7 +105,30 @@ def normalize(vectors: Array, normalization: Normalization) -> Array:
     return np.divide(vectors, norms, out=np.zeros_like(vectors), where=norms > 0)
 
 
-def aggregate(features: Array, centers: Array, gamma: float, normalization: Normalization) -> Array:
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _finish(vectors, gamma, intra):  # type: ignore[no-untyped-def]
+    """:func:`power` and :func:`normalize` at once and in place; float32 [V, K]."""
+    whole = np.float32(0)
+    for u in range(vectors.shape[0]):
+        square = np.float32(0)
+        for k in range(vectors.shape[1]):
+            value = vectors[u, k]
+            magnitude = np.sqrt(abs(value)) if gamma == 0.5 else abs(value) ** gamma
+            vectors[u, k] = np.copysign(magnitude, value)
+            square += magnitude * magnitude
+        whole += square
+        if intra and square > 0:
+            inverse = np.float32(1) / np.sqrt(square)
+            for k in range(vectors.shape[1]):
+                vectors[u, k] *= inverse
+    if not intra and whole > 0:
+        inverse = np.float32(1) / np.sqrt(whole)
+        for u in range(vectors.shape[0]):
+            for k in range(vectors.shape[1]):
+                vectors[u, k] *= inverse
+
+
+def aggregate(features: Array, centers: Array | Words, gamma: float, normalization: Normalization) -> Array:
     """The VLAD of one frame, flattened.
 
     Args:
@@ -77,4 +139,5 @@ def aggregate(features: Array, centers: Array, gamma: float, normalization: Norm
         float32 [V·K].
     """
     vectors = residuals(features, centers)
-    return normalize(power(vectors, gamma), normalization).reshape(-1)
+    _finish(vectors, np.float32(gamma), normalization == "intra")
+    return vectors.reshape(-1)

@@ -14,6 +14,8 @@ from core.encoder import Encoder, EncoderDefinition, canary_frame
 from core.encoders import EncoderCatalogue
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.features import FeatureExtractor
+from core.forward import has_bfloat16
+from core.masks import Mask
 from core.network import ShallowNetwork, caffenet_definition
 from core.preprocessing import InputDefinition
 from core.projection import Projection
@@ -72,6 +74,47 @@ def test_a_batch_gives_what_single_frames_give(encoder: Encoder) -> None:
         alone = encoder.encode(frame).descriptor
         assert float(alone @ encoding.descriptor) >= 0.999 * float(alone @ alone)
     assert encoder.encode_batch([]) == []
+
+
+LOWER_LEFT = Mask(polygons=(((0.0, 0.5), (0.5, 0.5), (0.5, 1.0), (0.0, 1.0)),))
+
+
+def test_what_a_mask_covers_does_not_count() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    frame = canary_frame()
+    other = frame.copy()
+    other[250:, :310] = random_frame(7, 230, 310)  # well within the mask
+    masked, same = encoder.encode_batch([frame, other], [LOWER_LEFT, LOWER_LEFT])
+    np.testing.assert_array_equal(masked.descriptor, same.descriptor)
+    np.testing.assert_array_equal(masked.local, same.local)
+    seen, changed = (encoder.encode(one).descriptor for one in (frame, other))
+    assert float(seen @ changed) < 0.99 * np.linalg.norm(seen) * np.linalg.norm(changed)
+
+
+def test_covered_cells_bear_no_region_and_no_local_descriptor() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    masked, free = encoder.encode_batch([canary_frame(), canary_frame()], [LOWER_LEFT, None])
+    hidden = LOWER_LEFT.covered(13, 13)
+    assert not masked.local.reshape(13, 13, -1)[hidden].any()
+    assert free.local.reshape(13, 13, -1)[hidden].any(axis=1).all()
+    for top, left, bottom, right in masked.regions.boxes:
+        assert not hidden[top:bottom, left:right].all()
+    alone = encoder.encode(canary_frame())
+    assert float(free.descriptor @ alone.descriptor) >= 0.999 * float(alone.descriptor @ alone.descriptor)
+
+
+def test_a_frame_that_shows_nothing_outside_its_mask_is_blank() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    frame = np.full((240, 320, 3), 90, np.uint8)
+    frame[130:, :150] = random_frame(1, 110, 150)
+    assert len(encoder.encode(frame).regions) > 0
+    assert len(encoder.encode(frame, LOWER_LEFT).regions) == 0
+
+
+def test_there_is_one_mask_a_frame() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    with pytest.raises(ValueError):
+        encoder.encode_batch([canary_frame(), canary_frame()], [LOWER_LEFT])
 
 
 @pytest.mark.parametrize("shape", [(16, 16), (16, 4000), (3000, 2000)])
@@ -299,3 +342,40 @@ def test_a_changed_encoder_fails_its_golden_values() -> None:
     changed = Encoder("m-region-vlad", packaged.extractor, packaged.definition, vocabulary, CALIBRATION, golden)
     with pytest.raises(GoldenMismatch, match="cosine"):
         changed.check_golden()
+
+
+def test_a_precision_that_changes_descriptors_is_not_chosen_and_asking_for_it_fails() -> None:
+    encoder = EncoderCatalogue(precision="float32").get("m-region-vlad")
+    before = encoder.encode(canary_frame()).descriptor
+    assert encoder.settle("auto") == "float32"
+    with pytest.raises((GoldenMismatch, InvalidModel)):  # descriptors differ, or this machine has no bfloat16
+        encoder.settle("bfloat16")
+    np.testing.assert_array_equal(encoder.encode(canary_frame()).descriptor, before)
+
+
+def test_a_precision_that_changes_nothing_is_chosen(encoder: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not has_bfloat16():
+        pytest.skip("the processor does not multiply bfloat16")
+    assert encoder.settle("float32") == "float32"
+    monkeypatch.setattr("core.encoder.GOLDEN_COSINE", 0.5)
+    try:
+        assert encoder.settle("auto") == "bfloat16"
+    finally:
+        encoder.settle("float32")
+
+
+def test_a_plugged_network_takes_itself_elsewhere() -> None:
+    module = nn.Conv2d(3, 4, 3)
+    shown = InputDefinition(height=32, width=32, mean=(0.0, 0.0, 0.0))
+    definition = DEFINITION.model_copy(update={"layers": ("0",), "steps": (0.05,)})
+    extractor = FeatureExtractor(PluggedNetwork(nn.Sequential(module), ("0",), shown, "one"), definition)
+    extractor.compute("float32", "cpu")
+    with pytest.raises(InvalidModel, match="plugged"):
+        extractor.compute("bfloat16")
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 9])
+def test_a_batch_of_any_size_gives_each_frame_its_own_encoding(encoder: Encoder, count: int) -> None:
+    frames = [random_frame(n) for n in range(count)]
+    for frame, encoding in zip(frames, encoder.encode_batch(frames), strict=True):
+        np.testing.assert_allclose(encoding.descriptor, encoder.encode(frame).descriptor, atol=1e-4)

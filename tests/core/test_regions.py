@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from skimage import measure
 
-from core.regions import extract_regions, unit_length
+from core.regions import box_sums, extract_regions, unit_length
 
 Array = NDArray[np.float32]
 
@@ -64,6 +64,39 @@ def test_agrees_on_maps_of_the_real_size(scale: float, count: int) -> None:
     smooth = smooth[:-2, :-2] + smooth[1:-1, 1:-1] + smooth[2:, 2:]
     activations = np.maximum(smooth, 0).astype(np.float32) * np.float32(scale)
     assert_same_regions(activations, 1.0, count)
+
+
+@pytest.mark.parametrize("channels", [63, 64, 65, 130])
+@pytest.mark.parametrize("count", [5, 40, 5000])
+def test_agrees_whether_or_not_channels_come_in_whole_blocks(channels: int, count: int) -> None:
+    generator = np.random.default_rng(channels)
+    quarters = np.maximum(generator.integers(-12, 24, (6, 5, channels)), 0)
+    activations = np.asarray(quarters / 4, np.float32)
+    assert_same_regions(activations, 1.0, count)
+
+
+def test_many_regions_of_one_energy_keep_the_order_of_maps_and_rows() -> None:
+    activations = np.zeros((9, 9, 70), np.float32)
+    activations[::2, ::2] = 3  # 25 x 70 single cells
+    made = extract_regions([activations], [1.0], 60)
+    assert made.channels.tolist() == [0] * 25 + [1] * 25 + [2] * 10
+    assert made.boxes[:6, :2].tolist() == [[0, 0], [0, 2], [0, 4], [0, 6], [0, 8], [2, 0]]
+
+
+def test_what_one_frame_leaves_behind_does_not_touch_the_next() -> None:
+    generator = np.random.default_rng(8)
+    frames = [np.maximum(generator.standard_normal((7, 7, 80)) * scale, 0).astype(np.float32) for scale in (9, 1, 4)]
+    for frame in frames * 2:
+        assert_same_regions(frame, 1.0, 30)
+
+
+def test_large_boxes_are_summed_by_a_table_and_few_of_them_directly() -> None:
+    generator = np.random.default_rng(3)
+    grid = generator.random((12, 11, 40)).astype(np.float32)
+    few = np.array([[0, 0, 12, 11], [3, 4, 4, 5], [2, 1, 7, 9]], np.int32)
+    for boxes in (few, np.repeat(few, 20, axis=0)):
+        wanted = [grid[top:bottom, left:right].sum(axis=(0, 1), dtype=np.float64) for top, left, bottom, right in boxes]
+        np.testing.assert_allclose(box_sums(grid, boxes), wanted, rtol=1e-6)
 
 
 @pytest.mark.parametrize("largest", [1e6, 1e30])

@@ -1,0 +1,71 @@
+"""Masks: the parts of a camera's picture that show the vehicle or a time stamp, and never the place."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import lru_cache
+from typing import Annotated, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Coordinate = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Corner = tuple[Coordinate, Coordinate]
+Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256)]
+
+_FINER = 8
+"""Steps of a cell's side in which its covered area is counted."""
+
+_LEAST_LEFT = 0.1
+"""Share of the picture that a mask must leave to be seen."""
+
+
+class Mask(BaseModel):
+    """What to ignore in each frame of one camera.
+
+    ``polygons`` are given by their corners, (x, y) in shares of the upright frame's width and height,
+    from its top left corner; where they overlap, all that any of them holds is covered.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    polygons: tuple[Polygon, ...] = Field(min_length=1, max_length=64)
+
+    @model_validator(mode="after")
+    def _leaves_something(self) -> Self:
+        left = 1 - float(self.shares(32, 32).mean())
+        if left < _LEAST_LEFT:
+            raise ValueError(f"the mask leaves {left:.0%} of the picture; it must leave at least {_LEAST_LEFT:.0%}")
+        return self
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its content, hexadecimal: two frames encoded under equal digests were masked alike."""
+        return hashlib.sha256(json.dumps(self.polygons, separators=(",", ":")).encode()).hexdigest()
+
+    def shares(self, height: int, width: int) -> NDArray[np.float32]:
+        """Which share of each cell of a grid over the frame is covered; float32 [height, width], read-only."""
+        return _shares(self, height, width)
+
+    def covered(self, height: int, width: int) -> NDArray[np.bool_]:
+        """The cells of a grid over the frame at least half of which is covered; bool [height, width]."""
+        return np.asarray(self.shares(height, width) >= 0.5)
+
+
+@lru_cache(maxsize=64)
+def _shares(mask: Mask, height: int, width: int) -> NDArray[np.float32]:
+    """Drawn finer than the grid and averaged; a camera's grids are few, so they are kept."""
+    canvas = np.zeros((height * _FINER, width * _FINER), np.uint8)
+    size = np.array([width, height], np.float64) * _FINER
+    for polygon in mask.polygons:
+        # Corners lie between pixels, OpenCV counts from pixel centres; 4 bits of a pixel are fine enough.
+        corners = np.rint((np.array(polygon) * size - 0.5) * 16).astype(np.int32)
+        one = np.zeros_like(canvas)  # by itself: of two in one call, what both hold would be left open
+        cv2.fillPoly(one, [corners], 1, shift=4)
+        canvas |= one
+    shares = canvas.reshape(height, _FINER, width, _FINER).mean(axis=(1, 3), dtype=np.float32)
+    shares.setflags(write=False)
+    return shares

@@ -1,0 +1,36 @@
+"""The literal pipeline gives the vector that the encoder gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.reference_pipeline import reference_vlad
+from benchmarks.thesis_pipeline import THESIS, literal, ours
+from core.encoders import EncoderCatalogue
+from core.images import decode
+from core.vlad import Words, aggregate
+from service.measurement import jpeg, sample_picture
+
+
+def test_the_literal_vlad_is_the_compiled_one() -> None:
+    generator = np.random.default_rng(0)
+    features, centers = generator.random((50, 12)).astype(np.float32), generator.random((7, 12)).astype(np.float32)
+    made = aggregate(features, centers, 0.5, "intra")
+    np.testing.assert_allclose(reference_vlad(features, centers).reshape(-1), made, atol=1e-4)
+
+
+@pytest.mark.parametrize("step", [2.0, 0.5])
+def test_both_pipelines_give_one_vector(step: float) -> None:
+    encoder = EncoderCatalogue().get(THESIS)
+    data = jpeg(sample_picture(3))
+    a, b = literal(encoder, data, step), ours(encoder, data, step, Words(encoder.centers))
+    assert float(a @ b) >= 0.995 * np.linalg.norm(a) * np.linalg.norm(b)
+
+
+def test_at_the_packaged_step_it_is_the_encoders_own_vector() -> None:
+    encoder = EncoderCatalogue().get(THESIS)
+    picture = sample_picture(4)
+    data = jpeg(picture)
+    vector = ours(encoder, data, encoder.definition.steps[0], Words(encoder.centers))
+    np.testing.assert_allclose(vector, encoder.encode(decode(data)).descriptor, atol=1e-5)

@@ -1,0 +1,83 @@
+"""How threads wait, and work shared between those that compute alone."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import ThreadpoolController
+
+from core.threads import SPINS, cores, each, share_cores, wait_briefly
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ({}, {"GOMP_SPINCOUNT": SPINS}),
+        ({"GOMP_SPINCOUNT": "5"}, {"GOMP_SPINCOUNT": "5"}),
+        ({"OMP_WAIT_POLICY": "active"}, {"OMP_WAIT_POLICY": "active"}),
+    ],
+)
+def test_what_the_user_has_set_stays(before: dict[str, str], after: dict[str, str]) -> None:
+    wait_briefly(before)
+    assert before == after
+
+
+@pytest.mark.parametrize("module", ["core.encoders", "service.inference", "benchmarks.encode", "service.commands"])
+def test_it_is_set_before_torch_is_imported(module: str) -> None:
+    code = f"import os, sys, importlib.abc\n{WATCH}\nimport {module}\nassert os.environ['GOMP_SPINCOUNT'] == '{SPINS}'"
+    clean = {"PATH": "/usr/bin:/bin"}
+    done = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+WATCH = """
+class Watch(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        assert name not in ("torch", "faiss") or "GOMP_SPINCOUNT" in os.environ, name + " is imported too early"
+sys.meta_path.insert(0, Watch())
+"""
+
+
+def test_results_stand_in_the_order_of_the_items_and_errors_are_raised() -> None:
+    def slow_at_first(item: int) -> int:
+        time.sleep(0.02 / (item + 1))
+        return item * item
+
+    assert each(slow_at_first, range(8), 4) == [n * n for n in range(8)]
+    assert each(slow_at_first, [], 4) == []
+    with pytest.raises(ZeroDivisionError):
+        each(lambda n: 1 // n, [1, 0, 2], 2)
+
+
+def test_several_threads_work_each_alone_and_the_caller_keeps_its_own() -> None:
+    before = torch.get_num_threads()
+    together = threading.Barrier(2, timeout=10)
+
+    def work(_: int) -> tuple[str, int]:
+        together.wait()  # only if two run at one time
+        return threading.current_thread().name, torch.get_num_threads()
+
+    found = each(work, [0, 1], 2)
+    assert len({name for name, _ in found}) == 2
+    assert [threads for _, threads in found] == [1, 1]
+    assert torch.get_num_threads() == before
+    assert each(lambda _: threading.current_thread(), [0, 1], 1) == [threading.current_thread()] * 2
+
+
+def test_threads_are_shared_out() -> None:
+    before = torch.get_num_threads()
+    try:
+        share_cores(1)
+        assert torch.get_num_threads() == 1
+        blas = [library for library in ThreadpoolController().lib_controllers if "numpy" in library.filepath]
+        assert blas and all(library.num_threads == 1 for library in blas if library.user_api == "blas")
+        np.testing.assert_allclose(np.ones((3, 3)) @ np.ones((3, 3)), 3)
+    finally:
+        share_cores(before)
+    assert 1 <= cores() <= 4096
