@@ -108,12 +108,20 @@ class UnknownSequence(PlacerecError):
     """The map has no place of this sequence."""
 
 
+class UnknownCamera(PlacerecError):
+    """The map has no camera of this name."""
+
+
 class NoThumbnail(PlacerecError):
     """The map keeps no picture of this place."""
 
 
 class RevisionMismatch(PlacerecError):
     """The map was changed since the revision that the caller names."""
+
+
+class CalibrationImpossible(PlacerecError):
+    """What a map was asked does not tell when to believe its answers: too little, or too hard to tell apart."""
 
 
 # Storage

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -100,7 +100,18 @@ def _utc(moment: datetime) -> datetime:
 
 
 Timestamp = Annotated[datetime, AfterValidator(_utc)]
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def microseconds(moment: datetime) -> int:
+    """An instant as microseconds since 1970 UTC, exactly; negative before."""
+    return (moment - _EPOCH) // timedelta(microseconds=1)
+
+
 Sequence = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f/]+$")]
+
+Camera = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._~-]{0,63}$")]
 
 
 class PlaceFields(BaseModel):
@@ -111,6 +122,7 @@ class PlaceFields(BaseModel):
     pose: Pose | None = None
     timestamp: Timestamp | None = None
     sequence: Sequence | None = None
+    camera: Camera | None = Field(default=None, description="Whose mask was applied to the frame.")
     metadata: dict[str, Any] = Field(default_factory=dict)
 
 

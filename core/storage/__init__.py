@@ -5,24 +5,33 @@ from core.storage.map import Map
 from core.storage.records import (
     Change,
     Enrolment,
+    History,
     Keep,
     MapRecord,
     MapSettings,
     SequenceSummary,
     VerifyReport,
 )
+from core.storage.resting import NewPrecision
 from core.storage.snapshot import Ranking, Snapshot
+from core.storage.tiers import IndexStatus, Recall, StorageStatus, TierSetting
 
 __all__ = [
     "Atlas",
     "Change",
     "Enrolment",
+    "History",
+    "IndexStatus",
     "Keep",
     "Map",
     "MapRecord",
     "MapSettings",
+    "NewPrecision",
     "Ranking",
+    "Recall",
     "SequenceSummary",
     "Snapshot",
+    "StorageStatus",
+    "TierSetting",
     "VerifyReport",
 ]

@@ -3,7 +3,8 @@
 LOCK                       held for as long as the atlas is open
 FORMAT                     the version of this arrangement
 maps/<id>/map.sqlite       record, places, sequences, pictures, and which rows count
-maps/<id>/descriptors-….seg, index-….faiss
+maps/<id>/descriptors-….seg, ….index   descriptors, and what large maps are searched by
+maps/.unlisted-<id>/…      a map that is being made, and is not listed before it is whole
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from core.storage.cursors import Listing, decode_name, encode_cursor
 from core.storage.descriptors import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.disk import Damage, FolderLock, refusals, sync_file, sync_folder, write_file
 from core.storage.map import Map
-from core.storage.opening import create_folder, read_record
+from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.records import MapRecord, MapSettings, VerifyReport
+from core.storage.resting import HALF, Precision
 from core.storage.verification import inspect_folder
 
 log = logging.getLogger(__name__)
@@ -54,6 +56,7 @@ class Atlas:
         self._rows_per_segment = rows_per_segment
         self._making = threading.Lock()  # held by the one that makes or deletes a map
         self._maps: dict[str, Map] = {}
+        self._unlisted: dict[str, Map] = {}
         # Maps that could not be read at the start, and why: their files are damaged, or the disk refused.
         self._damaged: dict[str, str] = {}
         self._refused: dict[str, str] = {}
@@ -90,8 +93,20 @@ class Atlas:
             if folder.name.startswith((_HALF_MADE, _HALF_REMOVED)):
                 log.info("Removing %s, left by a crash.", folder.name)
                 shutil.rmtree(folder, ignore_errors=True)
+            elif folder.name.startswith(UNLISTED):
+                self._adopt_unlisted(folder)
             elif folder.is_dir() and not folder.name.startswith("."):
                 self._adopt(folder)
+
+    def _adopt_unlisted(self, folder: Path) -> None:
+        try:
+            with refusals(f"open map {folder.name!r}"):
+                self._unlisted[folder.name.removeprefix(UNLISTED)] = Map(folder, *read_record(folder))
+        except Damage as damage:
+            log.error("Removing the unfinished map %s: %s", folder.name, damage)
+            shutil.rmtree(folder, ignore_errors=True)
+        except (StorageFull, StorageFailure) as refusal:
+            log.error("The unfinished map %s cannot be opened: %s", folder.name, refusal)
 
     def _adopt(self, folder: Path) -> None:
         self._refused.pop(folder.name, None)
@@ -113,11 +128,15 @@ class Atlas:
         dimension: int,
         settings: MapSettings | None = None,
         local_shape: tuple[int, int] = NO_LOCAL,
+        unlisted: bool = False,
+        precision: Precision = HALF,
     ) -> Map:
         """Make an empty map, bound to an encoder for life; it is durable when this returns.
 
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
+            unlisted: it is found by :meth:`unlisted` alone, over a restart too, until it is published.
+            precision: how its descriptors are kept, for good.
 
         Raises:
             InvalidIdentifier: the id does not have the form of one.
@@ -125,7 +144,8 @@ class Atlas:
             StorageFull, StorageFailure.
         """
         check_map_id(map_id)
-        Layout(dimension, encoder_identity, self._rows_per_segment, local_shape)  # refuses what no file can hold
+        # Refuses what no file can hold.
+        Layout(dimension, encoder_identity, self._rows_per_segment, local_shape, precision)
         now = datetime.now(UTC)
         record = MapRecord(
             id=map_id,
@@ -133,6 +153,7 @@ class Atlas:
             dimension=dimension,
             local_cells=local_shape[0],
             local_values=local_shape[1],
+            precision=precision,
             revision=1,
             created_at=now,
             updated_at=now,
@@ -143,6 +164,9 @@ class Atlas:
             folder = self._folder / map_id
             if map_id in self._maps or folder.exists():
                 raise MapExists(f"There is a map {map_id!r} already.")
+            if map_id in self._unlisted:
+                raise MapExists(f"A map {map_id!r} is being made.")
+            folder = self._folder / f"{UNLISTED}{map_id}" if unlisted else folder
             unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
             try:
                 create_folder(unfinished, record, self._rows_per_segment)
@@ -153,8 +177,45 @@ class Atlas:
                 shutil.rmtree(folder, ignore_errors=True)
                 raise
             made = Map(folder, record)
-            self._maps[map_id] = made
+            (self._unlisted if unlisted else self._maps)[map_id] = made
         return made
+
+    def unlisted(self) -> dict[str, Map]:
+        """The maps that are being made, by the ids that they will have."""
+        return self._unlisted.copy()
+
+    def publish(self, map_id: str) -> Map:
+        """List a map that is whole now, from one moment to the next; durable when this returns.
+
+        Raises:
+            UnknownMap: none of this id is being made.
+            StorageFull, StorageFailure.
+        """
+        with self._making, refusals(f"publish map {map_id!r}"):
+            self._expect_open()
+            made = self._unlisted.get(map_id)
+            if made is None:
+                raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
+            unfinished, folder = self._folder / f"{UNLISTED}{map_id}", self._folder / map_id
+            places = made.count_places()
+            made.close()
+            try:
+                os.rename(unfinished, folder)
+            except OSError:
+                self._unlisted[map_id] = Map(unfinished, made.record, places)
+                raise
+            del self._unlisted[map_id]
+            listed = self._maps[map_id] = Map(folder, made.record, places)
+            sync_folder(self._folder)
+        return listed
+
+    def abandon(self, map_id: str) -> None:
+        """Remove a map that was being made; nothing happens if there is none."""
+        with self._making, refusals(f"remove map {map_id!r}"):
+            made = self._unlisted.pop(map_id, None)
+            if made is not None:
+                made.close(deleted=True)
+        shutil.rmtree(self._folder / f"{UNLISTED}{map_id}", ignore_errors=True)
 
     def get(self, map_id: str) -> Map:
         """A map, ready to serve; its first use reads it from disk.
@@ -165,6 +226,11 @@ class Atlas:
         found = self.find(map_id)
         found.open()
         return found
+
+    def opened(self, map_id: str) -> Map | None:
+        """A map that serves and was read from disk before; None where :meth:`get` has to say more. Never waits."""
+        found = self._maps.get(map_id)
+        return found if found is not None and found.is_open else None
 
     def find(self, map_id: str) -> Map:
         """A map as it is listed: its record and the number of its places, for which it is not read from disk.
@@ -274,7 +340,7 @@ class Atlas:
         """Let what is under way end, close all maps, and give the directory back."""
         with self._making:
             self._closed = True
-            for found in self._maps.values():
+            for found in [*self._maps.values(), *self._unlisted.values()]:
                 found.close()
             self._lock.release()
 

@@ -1,15 +1,21 @@
-"""Descriptors on disk: append-only segment files, the truth from which every index can be made again.
+"""Segment files: the descriptors of a map, append-only, every row with a checksum of its own.
 
-A segment file is a header of 4 096 bytes and records of one size, so that it can be mapped into
-memory as it is (:func:`map_records`):
+Little-endian throughout.  A file is a header of 4 096 bytes followed by records (see `Layout.record`):
 
-    header   magic, version, dtype, dimension, rows of a full segment, first row, length of the encoder
-             identity; in version 2 the cells and the values a cell of the local descriptors; the
-             identity, zeros, CRC-32 of all before it
-    record   descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
+    header   magic, version, how descriptors are kept, dimension, rows of a full segment, first row, length of
+             the encoder identity; from version 2 on the cells and the values a cell of the local descriptors;
+             the identity, zeros, CRC-32 of all before it
+    record   versions 1, 2: descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
              CRC-32 of descriptors and row (uint32), zeros (uint32)
+             version 3: descriptor at rest, row (uint64), checksum of the record (uint32), CRC-32 of descriptor
+             and row (uint32), CRC-32 of local descriptors and row (uint32), zeros (uint32), local descriptors
+             at rest
 
-Maps whose encoder has no second stage are of version 1, which is version 2 without local descriptors.
+Maps that were made before there was version 3 go on in theirs: 1 where their encoder has no second stage, which is
+2 without local descriptors.  In version 3 the checksum of a record is the CRC-32 of its two others, so that the
+descriptor can be read and checked without its neighbour, and its neighbour without it; how both are kept is the
+map's precision (:data:`Precision`).
+
 Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  Only as many
 records count as SQLite names; what stands behind them was never acknowledged and is overwritten.
 """
@@ -23,27 +29,37 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.storage.disk import Damage, sync_folder, write_at
-
-Descriptor = NDArray[np.float32]
-Local = NDArray[np.int8]
-"""Local descriptors of one frame, [C, L]; [0, 0] where the encoder has no second stage."""
+from core.storage.resting import (
+    FULL,
+    Descriptor,
+    Local,
+    Precision,
+    pack_descriptors,
+    pack_local,
+    resting_types,
+    unpack_descriptors,
+    unpack_local,
+)
 
 NO_LOCAL = (0, 0)
 """Shape of the local descriptors of an encoder that has none."""
 
-ROWS_PER_SEGMENT = 256
-"""Rows of a full segment of a new map: some tens of megabytes of the default encoder's descriptors."""
+ROWS_PER_SEGMENT = 1024
+"""Rows of a full segment of a new map: 64 MB of the default encoder's descriptors, a thousand files at a million."""
 
 HEADER_BYTES = 4096
 _HEADER = struct.Struct("<8sI8sIIQH")
 _LOCAL_SHAPE = struct.Struct("<II")
-_MAGIC, _VERSION, _LOCAL_VERSION, _DTYPE = b"PLRCSEG\x00", 1, 2, b"<f4"
+_MAGIC = b"PLRCSEG\x00"
+_FIRST_VERSION, _LOCAL_VERSION, _LATEST_VERSION = 1, 2, 3
+_KEPT: dict[Precision, bytes] = {"full": b"<f4", "half": b"<f2", "compressed": b"6 bits"}
 _IDENTITY_BYTES = 1024
 _CHUNK_BYTES = 8 << 20
 
@@ -56,6 +72,7 @@ class Layout:
     identity: str
     rows_per_segment: int
     local_shape: tuple[int, int] = NO_LOCAL
+    precision: Precision = FULL
 
     def __post_init__(self) -> None:
         if len(self.identity.encode()) > _IDENTITY_BYTES:
@@ -64,28 +81,81 @@ class Layout:
             raise ValueError(f"local descriptors of {self.local_shape} cells and values make no sense")
 
     @property
+    def version(self) -> int:
+        """Of the segment files."""
+        if self.precision != FULL:
+            return _LATEST_VERSION
+        return _FIRST_VERSION if self.local_shape == NO_LOCAL else _LOCAL_VERSION
+
+    @cached_property
     def record(self) -> np.dtype[np.void]:
         """The structured type of one record."""
-        return np.dtype(
-            [
-                ("descriptor", "<f4", (self.dimension,)),
-                ("local", "i1", self.local_shape),
-                ("row", "<u8"),
-                ("checksum", "<u4"),
-                ("reserved", "<u4"),
-            ]
-        )
+        descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
+        row, last = ("row", "<u8"), ("reserved", "<u4")
+        if self.version < _LATEST_VERSION:
+            return np.dtype([("descriptor", *descriptor), ("local", *local), row, ("checksum", "<u4"), last])
+        sums = [("checksum", "<u4"), ("of_descriptor", "<u4"), ("of_local", "<u4")]
+        return np.dtype([("descriptor", *descriptor), row, *sums, last, ("local", *local)])
 
     def header(self, number: int) -> bytes:
         """The first 4 096 bytes of segment ``number``."""
         identity = self.identity.encode()
         first_row = number * self.rows_per_segment
-        has_local = self.local_shape != NO_LOCAL
-        version = _LOCAL_VERSION if has_local else _VERSION
-        fixed = _HEADER.pack(_MAGIC, version, _DTYPE, self.dimension, self.rows_per_segment, first_row, len(identity))
-        shape = _LOCAL_SHAPE.pack(*self.local_shape) if has_local else b""
+        fixed = _HEADER.pack(
+            _MAGIC, self.version, _KEPT[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
+        )
+        shape = b"" if self.version == _FIRST_VERSION else _LOCAL_SHAPE.pack(*self.local_shape)
         content = (fixed + shape + identity).ljust(HEADER_BYTES - 4, b"\x00")
         return content + struct.pack("<I", zlib.crc32(content))
+
+    def packed(self, descriptors: Sequence[Descriptor], local: Sequence[Local], first_row: int) -> NDArray[np.void]:
+        """Frames as records for the rows from ``first_row`` on, checksums included.
+
+        Args:
+            descriptors, local: of the same n frames, float32 [D] and int8 [C, L] each.
+        """
+        frames = list(zip(descriptors, local, strict=True))
+        records = np.zeros(len(frames), dtype=self.record)
+        for i, (descriptor, cells) in enumerate(frames):
+            records[i]["descriptor"] = pack_descriptors(descriptor[np.newaxis], self.precision)[0]
+            records[i]["local"] = pack_local(cells[np.newaxis], self.precision)[0]
+            self._seal(records[i], first_row + i)
+        return records
+
+    def _seal(self, record: np.void, row: int) -> None:
+        record["row"] = row
+        if self.version == _LATEST_VERSION:
+            record["of_descriptor"], record["of_local"] = self.part_checksums(record, row)
+        record["checksum"] = self.row_checksum(record, row)
+
+    def part_checksums(self, record: np.void, row: int) -> tuple[int, int]:
+        """CRC-32 of the descriptor and the row, and of the local descriptors and the row, of what is in ``record``."""
+        place = struct.pack("<Q", row)
+        descriptor, local = (np.ascontiguousarray(record[name]).tobytes() for name in ("descriptor", "local"))
+        return zlib.crc32(place, zlib.crc32(descriptor)), zlib.crc32(place, zlib.crc32(local))
+
+    def row_checksum(self, record: np.void, row: int) -> int:
+        """The checksum of what ``record`` holds, if it is that of ``row``: in the wrong place it does not pass."""
+        if self.version == _LATEST_VERSION:
+            return zlib.crc32(struct.pack("<II", *self.part_checksums(record, row)))
+        running = zlib.crc32(record["descriptor"].tobytes())
+        return zlib.crc32(struct.pack("<Q", row), zlib.crc32(record["local"].tobytes(), running))
+
+    def is_sound(self, record: np.void, row: int) -> bool:
+        """Whether a record is that of ``row`` and passes its checksums."""
+        if record["row"] != row or record["checksum"] != self.row_checksum(record, row):
+            return False
+        if self.version < _LATEST_VERSION:
+            return True
+        return (int(record["of_descriptor"]), int(record["of_local"])) == self.part_checksums(record, row)
+
+    def descriptors_of(self, records: NDArray[np.void]) -> NDArray[np.float32]:
+        """What is searched: float32 [n, D]."""
+        return unpack_descriptors(records["descriptor"], self.precision, self.dimension)
+
+    def locals_of(self, records: NDArray[np.void]) -> Local:
+        """What the second stage compares: int8 [n, C, L]."""
+        return unpack_local(records["local"], self.precision, self.local_shape)
 
 
 def segment_name(number: int) -> str:
@@ -93,19 +163,13 @@ def segment_name(number: int) -> str:
     return f"descriptors-{number + 1:06d}.seg"
 
 
-def row_checksum(descriptor: Descriptor, local: Local, row: int) -> int:
-    """CRC-32 over the bytes of a frame's descriptors and its row: a record in the wrong place does not pass."""
-    running = zlib.crc32(np.ascontiguousarray(descriptor, dtype="<f4").data)
-    running = zlib.crc32(np.ascontiguousarray(local, dtype="i1").data, running)
-    return zlib.crc32(struct.pack("<Q", row), running)
-
-
 def chain(checksums: ArrayLike, before: int = 0) -> int:
     """The checksum of a segment: CRC-32 over those of its rows, continued from ``before``."""
     return zlib.crc32(np.asarray(checksums, dtype="<u4").tobytes(), before)
 
 
-def _check_header(path: Path, found: bytes, layout: Layout, number: int) -> None:
+def check_header(path: Path, found: bytes, layout: Layout, number: int) -> None:
+    """Raise Damage unless the first bytes of a segment file are what they must be."""
     if found == layout.header(number):
         return
     if len(found) < HEADER_BYTES:
@@ -128,7 +192,7 @@ def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterat
     except FileNotFoundError as error:
         raise Damage(f"{path.name}: the file is missing") from error
     with file:
-        _check_header(path, file.read(HEADER_BYTES), layout, number)
+        check_header(path, file.read(HEADER_BYTES), layout, number)
         step = max(1, _CHUNK_BYTES // layout.record.itemsize)
         for start in range(0, rows, step):
             records = np.empty(min(step, rows - start), dtype=layout.record)
@@ -143,14 +207,9 @@ def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterat
             yield records
 
 
-def damaged_rows(records: NDArray[np.void], first_row: int) -> list[int]:
+def damaged_rows(layout: Layout, records: NDArray[np.void], first_row: int) -> list[int]:
     """Those of consecutive records, the first of which is ``first_row``, that fail their checksum."""
-    damaged = []
-    for offset, record in enumerate(records):
-        row = first_row + offset
-        if record["row"] != row or record["checksum"] != row_checksum(record["descriptor"], record["local"], row):
-            damaged.append(row)
-    return damaged
+    return [row for row, record in enumerate(records, start=first_row) if not layout.is_sound(record, row)]
 
 
 def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum: int) -> Iterator[NDArray[np.void]]:
@@ -161,7 +220,7 @@ def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum:
     """
     row, running = number * layout.rows_per_segment, 0
     for records in read_records(folder, layout, number, rows):
-        if damaged := damaged_rows(records, row):
+        if damaged := damaged_rows(layout, records, row):
             raise Damage(f"{segment_name(number)}: row {damaged[0]} does not match its checksum")
         running = chain(records["checksum"], running)
         row += len(records)
@@ -170,37 +229,18 @@ def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum:
         raise Damage(f"{segment_name(number)}: the rows are not those that map.sqlite names")
 
 
-def map_records(folder: Path, layout: Layout, number: int, rows: int) -> np.memmap[tuple[int], np.dtype[np.void]]:
-    """The first ``rows`` records of a segment as memory that the system reads when it is touched; unchecked."""
-    return np.memmap(folder / segment_name(number), dtype=layout.record, mode="r", offset=HEADER_BYTES, shape=(rows,))
-
-
-def append(
-    folder: Path, layout: Layout, first_row: int, descriptors: Sequence[Descriptor], local: Sequence[Local]
-) -> list[int]:
-    """Write frames behind the ``first_row`` rows there are, and sync every file and folder touched.
-
-    Args:
-        descriptors, local: of the same n frames, float32 [D] and int8 [C, L] each.
-
-    Returns:
-        The checksum of each row.
+def append(folder: Path, layout: Layout, first_row: int, records: NDArray[np.void]) -> None:
+    """Write records (:meth:`Layout.packed`) behind the ``first_row`` rows there are; sync files and folders touched.
 
     Raises:
         OSError: the disk refuses; what it holds behind ``first_row`` is then unknown (:func:`rewind`).
     """
-    checksums: list[int] = []
-    while len(checksums) < len(descriptors):
-        row = first_row + len(checksums)
-        number, offset = divmod(row, layout.rows_per_segment)
-        batch = slice(len(checksums), len(checksums) + layout.rows_per_segment - offset)
-        frames = list(zip(descriptors[batch], local[batch], strict=True))
-        records = np.zeros(len(frames), dtype=layout.record)
-        for i, (descriptor, cells) in enumerate(frames):
-            records[i] = (descriptor, cells, row + i, row_checksum(descriptor, cells, row + i), 0)
-        _write(folder / segment_name(number), layout, number, offset, records)
-        checksums += records["checksum"].tolist()
-    return checksums
+    done = 0
+    while done < len(records):
+        number, offset = divmod(first_row + done, layout.rows_per_segment)
+        batch = records[done : done + layout.rows_per_segment - offset]
+        _write(folder / segment_name(number), layout, number, offset, batch)
+        done += len(batch)
 
 
 def _write(path: Path, layout: Layout, number: int, offset: int, records: NDArray[np.void]) -> None:

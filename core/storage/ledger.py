@@ -15,7 +15,7 @@ from typing import Any
 
 from core.errors import InvalidField, UnknownPlace
 from core.places import Place, PlaceFields, Pose
-from core.storage.records import Enrolment, Keep, MapRecord, SequenceSummary
+from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 from core.storage.schema import NO_SEQUENCE
 
 DEEPEST_METADATA = 64
@@ -25,7 +25,7 @@ _POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 
 _PLACE = (
     "SELECT p.number, p.id, p.row, p.digest, p.regions, p.picture, p.x, p.y, p.z, p.latitude, p.longitude, p.heading,"
-    " p.timestamp, s.name, p.metadata, p.created_at, p.updated_at, p.sequence, p.ordinal"
+    " p.timestamp, s.name, p.metadata, p.created_at, p.updated_at, p.sequence, p.ordinal, p.camera"
     " FROM places p JOIN sequences s ON s.code = p.sequence "
 )
 
@@ -51,6 +51,7 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
         pose=Pose(**pose) if pose else None,
         timestamp=values[12],
         sequence=values[13],
+        camera=values[19],
         metadata=json.loads(values[14]),
         created_at=values[15],
         updated_at=values[16],
@@ -92,6 +93,7 @@ def metadata_text(metadata: dict[str, Any]) -> str:
 def _field_columns(fields: PlaceFields) -> dict[str, Any]:
     columns: dict[str, Any] = {name: getattr(fields.pose, name) if fields.pose else None for name in _POSE}
     columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
+    columns["camera"] = fields.camera
     columns["metadata"] = metadata_text(fields.metadata)
     return columns
 
@@ -134,6 +136,12 @@ def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int,
     query = _PLACE + "WHERE p.row IN (SELECT value FROM json_each(?))"
     found = (_stored(values) for values in connection.execute(query, (json.dumps(rows),)).fetchall())
     return {stored.row: stored.place for stored in found}
+
+
+def rows_of_places(connection: sqlite3.Connection, place_ids: list[str]) -> dict[str, int]:
+    """The descriptor rows of those of the places that there are."""
+    query = "SELECT id, row FROM places WHERE id IN (SELECT value FROM json_each(?))"
+    return dict(connection.execute(query, (json.dumps(place_ids),)).fetchall())
 
 
 def sequences_after(connection: sqlite3.Connection, after: str, limit: int) -> list[SequenceSummary]:
@@ -262,6 +270,18 @@ def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: Plac
     return expect(connection, stored.place.id)
 
 
+def set_history(connection: sqlite3.Connection, place_id: str, history: History) -> StoredPlace:
+    """When a place was made and changed, and its order in its sequence, as they were elsewhere."""
+    stored = expect(connection, place_id)
+    moments = {"created_at": moment_text(history.created_at), "updated_at": moment_text(history.updated_at)}
+    ordinal = stored.ordinal if history.ordinal is None else history.ordinal
+    _set(connection, stored.number, ordinal=ordinal, **moments)
+    connection.execute(
+        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?", (ordinal + 1, stored.sequence)
+    )
+    return expect(connection, place_id)
+
+
 def delete(connection: sqlite3.Connection, stored: StoredPlace) -> None:
     """Forget a place, its picture too."""
     connection.execute("DELETE FROM places WHERE number = ?", (stored.number,))
@@ -277,7 +297,8 @@ def delete_sequence(connection: sqlite3.Connection, name: str) -> None:
 
 def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
     """Say that a segment file holds so many rows, whose checksums have this checksum."""
-    connection.execute("INSERT OR REPLACE INTO segments VALUES (?, ?, ?)", (segment, rows, checksum))
+    statement = "INSERT OR REPLACE INTO segments (number, rows, checksum) VALUES (?, ?, ?)"
+    connection.execute(statement, (segment, rows, checksum))
 
 
 # The map's own record
@@ -286,14 +307,14 @@ def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum:
 def insert_record(connection: sqlite3.Connection, record: MapRecord, rows_per_segment: int) -> None:
     """The one row of a new map."""
     columns = {"only": 1, "rows_per_segment": rows_per_segment, **_record_columns(record)}
-    names, marks = ", ".join(columns), ", ".join("?" * len(columns))
+    names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
     connection.execute(f"INSERT INTO map ({names}) VALUES ({marks})", tuple(columns.values()))
 
 
 def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
     """Put ``record`` in the place of the map's own."""
     columns = _record_columns(record)
-    assignments = ", ".join(f"{name} = ?" for name in columns)
+    assignments = ", ".join(f'"{name}" = ?' for name in columns)
     connection.execute(f"UPDATE map SET {assignments}", tuple(columns.values()))
 
 

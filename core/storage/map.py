@@ -6,8 +6,9 @@ import hashlib
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,20 @@ from core.errors import (
 )
 from core.images import Limits, decode, encode_thumbnail
 from core.places import Place, PlaceFields
-from core.storage import descriptors, ledger
-from core.storage.caches import cache_name, write_cache
-from core.storage.cursors import Listing, decode_name, decode_number, encode_cursor
+from core.storage import ledger, pages
+from core.storage.attributes import Attributes
+from core.storage.cameras import Cameras
 from core.storage.database import DatabaseClosed
-from core.storage.disk import Damage, primary_code, refusals
-from core.storage.opening import OpenMap, named_segments, open_map
+from core.storage.disk import Damage, refusals
+from core.storage.doubts import Doubts
+from core.storage.indexing import IndexedMap, Indexer, Stopped
+from core.storage.named import NamedSegment, named_segments
+from core.storage.opening import OpenMap, open_map
 from core.storage.patches import patched_fields, patched_record
 from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
 from core.storage.snapshot import Snapshot
+from core.storage.tiers import IndexStatus, StorageStatus, storage_of, unopened
+from core.storage.transfer import Transfer
 from core.storage.verification import inspect
 from core.storage.writing import Write, check_enrolment
 
@@ -58,8 +64,11 @@ class Map:
         self._snapshot: Snapshot | None = None
         self._damage: str | None = None
         self._end: PlacerecError | None = None
-        self._rows_in_doubt = False
-        self._log_in_doubt = False
+        self._doubts = Doubts(folder)
+        self._indexer: Indexer | None = None
+        self.cameras = Cameras(self._reading, self._writing)
+        self.attributes = Attributes(self._reading)
+        self.transfer = Transfer(self._reading, self._writing, self._lock)
 
     # Opening and closing
 
@@ -78,21 +87,33 @@ class Map:
         if self._damage is not None:
             raise self._quarantined()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it serves and was read from disk."""
+        return self._opened is not None
+
     def open(self) -> None:
         """Read the map from disk, unless that was done already."""
         self._expect_open()
 
     def close(self, deleted: bool = False) -> None:
         """Let the reads and the write under way end, and refuse further ones."""
-        with self._lock:
+        with self._lock:  # from here on it is not opened any more
             name = self._folder.name
             if self._end is None:
                 self._end = (
                     UnknownMap(f"There is no map {name!r}.") if deleted else StorageFailure(f"Map {name!r} is closed.")
                 )
-            opened, self._opened, self._snapshot = self._opened, None, None
-            if opened is not None:
-                opened.database.close()
+        if (indexer := self._indexer) is not None:
+            indexer.stop()
+        with self._lock:
+            opened, last, self._opened, self._snapshot = self._opened, self._snapshot, None, None
+            if opened is None:
+                return
+            if indexer is not None and last is not None and not deleted:
+                with suppress(Damage, OSError, sqlite3.Error), opened.database.reading() as connection:
+                    indexer.keep_tail(last, named_segments(connection, opened.layout))
+            opened.database.close()
 
     def _expect_open(self) -> OpenMap:
         if (opened := self._opened) is not None:
@@ -104,8 +125,12 @@ class Map:
                 raise self._quarantined()
             if self._opened is None:
                 with self._guarded("open"):
-                    self._opened = open_map(self._folder)
-                    self._record, self._snapshot = self._opened.record, self._opened.snapshot
+                    opened, snapshot = open_map(self._folder)
+                    self._opened, self._record = opened, opened.record
+                    self._snapshot = replace(snapshot, guard=self._searching)
+                    self._indexer = Indexer(self._indexed(opened), opened.files)
+                    if self._indexer.needs_work(self._snapshot):
+                        self._indexer.wake()
             return self._opened
 
     def _quarantined(self) -> MapQuarantined:
@@ -118,13 +143,53 @@ class Map:
             with refusals(f"{action} map {self._folder.name!r}"):
                 yield
         except Damage as damage:
-            log.error("Map %s is quarantined: %s", self._folder.name, damage)
-            self._damage = str(damage)
-            with self._lock:
-                opened, self._opened, self._snapshot = self._opened, None, None
-                if opened is not None:
-                    opened.database.close()
+            if self._end is not None:
+                raise type(self._end)(*self._end.args) from damage  # its files are gone, as they must be
+            self._quarantine(damage)
             raise self._quarantined() from damage
+
+    def _quarantine(self, damage: Damage) -> None:
+        log.error("Map %s is quarantined: %s", self._folder.name, damage)
+        self._damage = str(damage)
+        with self._lock:
+            opened, self._opened, self._snapshot = self._opened, None, None
+            if opened is not None:
+                opened.database.close()
+        if self._indexer is not None:
+            self._indexer.stop(wait=False)
+
+    @contextmanager
+    def _searching(self) -> Iterator[None]:
+        with self._guarded("search"):
+            yield
+
+    def _indexed(self, opened: OpenMap) -> IndexedMap:
+        """What is needed of the map to build what it is searched by."""
+
+        def publish(change: Callable[[Snapshot], Snapshot]) -> Snapshot:
+            with self._lock:
+                if self._snapshot is None:
+                    raise Stopped
+                self._snapshot = change(self._snapshot)
+                return self._snapshot
+
+        def named() -> Sequence[NamedSegment]:
+            with self._reading() as connection:
+                return named_segments(connection, opened.layout)
+
+        return IndexedMap(lambda: self._record.index, self.snapshot, publish, named, self._quarantine)
+
+    def index_status(self) -> IndexStatus:
+        """How the map is searched; it is not read from disk for it."""
+        snapshot, indexer = self._snapshot, self._indexer
+        if snapshot is None or indexer is None:
+            return unopened(self._record.index, self._places)
+        return indexer.status(snapshot)
+
+    def storage_status(self) -> StorageStatus:
+        """What the map takes on disk."""
+        with self._guarded("read"):
+            return storage_of(self._folder, self._record.precision, self.count_places())
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
@@ -145,7 +210,7 @@ class Map:
         with self._lock:
             opened, before = self._expect_open(), self.snapshot()
             with self._guarded("write to"):
-                self._resolve_doubts(opened, before)
+                self._doubts.resolve(opened, before.rows)
                 write = None
                 try:
                     with opened.database.transaction() as connection:
@@ -154,44 +219,11 @@ class Map:
                         after = write.finish()
                 except BaseException as error:
                     if write is not None and write.appending:
-                        self._doubt(error, opened, before)
+                        self._doubts.arise(error, opened, before.rows)
                     raise
             self._snapshot, self._record = after, write.record
-            for number, checksum in write.filled.items():
-                full = after.segments[number]
-                write_cache(self._folder / cache_name(number), full.index, full.local, checksum)
-
-    def _doubt(self, error: BaseException, opened: OpenMap, before: Snapshot) -> None:
-        """After a failure: what stands behind the rows that are named, in the segment files and in SQLite's log?
-
-        A COMMIT that found no room wrote no end of the transaction; after any other failure of
-        SQLite the log must be emptied first, or a crash could bring that transaction to life.
-        """
-        self._rows_in_doubt = True
-        found_no_room = isinstance(error, sqlite3.Error) and primary_code(error) == sqlite3.SQLITE_FULL
-        self._log_in_doubt = not (found_no_room or isinstance(error, OSError))
-        try:
-            self._resolve_doubts(opened, before)
-        except (OSError, sqlite3.Error, Damage) as further:
-            log.warning("Map %s takes no writes until its files are in order again: %s", self._folder.name, further)
-
-    def _resolve_doubts(self, opened: OpenMap, before: Snapshot) -> None:
-        """Bring the files back to what was acknowledged last; no write is begun until this succeeds."""
-        if self._log_in_doubt:
-            opened.database.settle()
-            self._log_in_doubt = False
-        if self._rows_in_doubt:
-            descriptors.rewind(self._folder, opened.layout, before.rows)
-            # The failed sync may have lost a block that holds the end of the last good row, too.
-            with opened.database.reading() as connection:
-                named = named_segments(connection, opened.layout)
-            if sum(segment.rows for segment in named) != before.rows:
-                raise Damage("map.sqlite names other rows than were acknowledged")
-            for last in named[-1:]:
-                number, rows, checksum = last.number, last.rows, last.checksum
-                for _ in descriptors.read_checked(self._folder, opened.layout, number, rows, checksum):
-                    pass
-            self._rows_in_doubt = False
+            if self._indexer is not None and ((write.filled and after.coded) or self._indexer.needs_work(after)):
+                self._indexer.wake()
 
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
         """Change settings (those of MapSettings) or ``calibration`` (None: back to the encoder's).
@@ -304,12 +336,8 @@ class Map:
         Raises:
             InvalidCursor.
         """
-        listing: Listing = ["places", self._folder.name, sequence]
-        after = decode_number(listing, cursor)
         with self._reading() as connection:
-            found = ledger.places_after(connection, after, _one_more(limit), sequence)
-        more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None
-        return [stored.place for stored in found[:limit]], more
+            return pages.places(connection, self._folder.name, cursor, limit, sequence)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
         """A page of sequences by name, and the cursor of the next page.
@@ -317,18 +345,20 @@ class Map:
         Raises:
             InvalidCursor.
         """
-        listing: Listing = ["sequences", self._folder.name]
-        after = decode_name(listing, cursor)
         with self._reading() as connection:
-            found = ledger.sequences_after(connection, after, _one_more(limit))
-        more = encode_cursor(listing, found[limit - 1].name) if len(found) > limit else None
-        return found[:limit], more
+            return pages.sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         """The places of rows that a search returned; None for one deleted or given another frame since."""
         with self._reading() as connection:
             found = ledger.places_of_rows(connection, [int(row) for row in rows])
         return [found.get(int(row)) for row in rows]
+
+    def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
+        """The rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""
+        with self._reading() as connection:
+            found = ledger.rows_of_places(connection, list(place_ids))
+        return [found.get(place_id) for place_id in place_ids]
 
     def thumbnail(self, place_id: str) -> bytes:
         """A small JPEG of a place.
@@ -365,10 +395,3 @@ class Map:
                 return inspect(self._folder, connection, snapshot)
             finally:
                 connection.execute("ROLLBACK")
-
-
-def _one_more(limit: int) -> int:
-    """To ask for one more than a page tells whether there is a next one."""
-    if limit < 1:
-        raise ValueError("a page has at least one entry")
-    return limit + 1

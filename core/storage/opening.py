@@ -7,53 +7,62 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
+from math import nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from core.places import Pose
+from core.index import Codes, CodeTable
+from core.places import Pose, microseconds
 from core.storage import descriptors, ledger
-from core.storage.caches import StaleCache, cache_name, load_cache, write_cache
+from core.storage.arrays import StaleArrays
+from core.storage.columns import read_columns
 from core.storage.database import FILE, Database, connect
-from core.storage.descriptors import Layout, Local
+from core.storage.descriptors import Layout
 from core.storage.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
+from core.storage.index_files import IndexFiles
+from core.storage.named import NamedSegment, named_segments
 from core.storage.patches import complaint
 from core.storage.records import MapRecord
 from core.storage.schema import NO_SEQUENCE, check_schema, migrate
-from core.storage.snapshot import Segment, Snapshot, Spot, flat_index, vectors, whereabouts_of
-from core.verdict import GEOGRAPHIC, METRIC, NO_POSE
+from core.storage.segment import Held, Segment, flat_index, vectors
+from core.storage.shelf import Shelf
+from core.storage.snapshot import Snapshot
+from core.storage.spots import Spot
+from core.storage.tiers import tier_for
+from core.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
 
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class NamedSegment:
-    """What SQLite says of a segment file."""
-
-    number: int
-    rows: int
-    checksum: int
+UNLISTED = ".unlisted-"
+"""Before the id, names the folder of a map that is being made; no map id begins with a dot."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenMap:
-    """A map in memory."""
+    """A map in use."""
 
     record: MapRecord
     layout: Layout
     database: Database
-    snapshot: Snapshot
+    shelf: Shelf
+    files: IndexFiles
 
 
-def spot_of(pose: Pose | None, sequence: int, ordinal: int) -> Spot:
+def spot_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Spot:
     """A place as the snapshot knows it."""
+    timestamp = NO_TIME if moment is None else microseconds(moment)
     if pose is None:
-        return Spot(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal)
+        return Spot(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
     x, y, z = pose.position().tolist()
-    return Spot(METRIC if pose.kind() == "metric" else GEOGRAPHIC, (x, y, z), sequence, ordinal)
+    kind = METRIC if pose.kind() == "metric" else GEOGRAPHIC
+    heading = nan if pose.heading is None else pose.heading
+    return Spot(kind, (x, y, z), sequence, ordinal, heading, timestamp)
 
 
 def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> None:
@@ -83,14 +92,14 @@ def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     """
     try:
         record, rows_per_segment = ledger.read_record(connection)
-        return record, Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape)
+        return record, Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
     except ValueError as error:
         raise Damage(f"map.sqlite: the map's own record cannot be read: {complaint(error)}") from error
 
 
 def _adopt(folder: Path, connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     record, layout = read_layout(connection)
-    if record.id != folder.name:
+    if record.id != folder.name.removeprefix(UNLISTED):
         raise Damage(f"the folder holds the map {record.id!r}")
     return record, layout
 
@@ -115,61 +124,53 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
         connection.close()
 
 
-def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[NamedSegment]:
-    """The segments in order.
-
-    Raises:
-        Damage: one is missing, or one that is not the last is not full.
-    """
-    found = [NamedSegment(*row) for row in connection.execute("SELECT * FROM segments ORDER BY number").fetchall()]
-    for position, segment in enumerate(found):
-        full, last = segment.rows == layout.rows_per_segment, position == len(found) - 1
-        if segment.number != position or segment.rows > layout.rows_per_segment or not (full or last):
-            raise Damage(f"map.sqlite: segment {position + 1} is not as long as it must be")
-    return found
-
-
-def living_rows(connection: sqlite3.Connection, rows: int) -> Iterator[tuple[int, int, Spot]]:
-    """Row, checksum and spot of every place.
-
-    Raises:
-        Damage: a place has a row that no segment has.
-    """
-    query = "SELECT row, checksum, sequence, ordinal, x, y, z, latitude, longitude FROM places"
-    for row, checksum, sequence, ordinal, *coordinates in connection.execute(query).fetchall():
-        if row >= rows:
-            raise Damage(f"map.sqlite: a place has row {row}, but there are {rows}")
-        named = dict(zip(("x", "y", "z", "latitude", "longitude"), coordinates, strict=True))
-        pose = Pose(**named) if any(value is not None for value in coordinates) else None
-        yield row, checksum, spot_of(pose, sequence, ordinal)
-
-
-def _load_segment(folder: Path, layout: Layout, named: NamedSegment, wanted: dict[int, int]) -> tuple[Any, Local]:
-    """Index and local descriptors of a segment: from its cache if it has a good one, else from the records."""
-    full = named.rows == layout.rows_per_segment
-    cache = folder / cache_name(named.number)
-    if full:
-        try:
-            return load_cache(cache, layout, named.checksum)
-        except StaleCache as stale:
-            log.warning("Map %s: %s is made again from the descriptors: %s.", folder.name, cache.name, stale)
+def _load_segment(folder: Path, layout: Layout, named: NamedSegment, checksums: NDArray[np.uint32]) -> Held:
+    """The descriptors of a segment, every one of them checked; ``checksums`` are what SQLite names of its rows."""
     index = flat_index(named.rows, layout.dimension)
     local = np.zeros((named.rows, *layout.local_shape), dtype=np.int8)
     target, filled = vectors(index), 0
     for records in descriptors.read_checked(folder, layout, named.number, named.rows, named.checksum):
-        for record in records:
-            if wanted.get(int(record["row"]), int(record["checksum"])) != record["checksum"]:
-                raise Damage(f"{descriptors.segment_name(named.number)}: row {record['row']} is of another frame")
-        target[filled : filled + len(records)] = records["descriptor"]
-        local[filled : filled + len(records)] = records["local"]
+        part = slice(filled, filled + len(records))
+        foreign = (checksums[part] != 0) & (checksums[part] != records["checksum"])
+        for offset in np.flatnonzero(foreign)[:1].tolist():
+            row = int(records["row"][offset])
+            raise Damage(f"{descriptors.segment_name(named.number)}: row {row} is of another frame")
+        target[part], local[part] = layout.descriptors_of(records), layout.locals_of(records)
         filled += len(records)
-    if full:
-        write_cache(cache, index, local, named.checksum)
-    return index, local
+    return Held(index, local)
 
 
-def read_snapshot(folder: Path, layout: Layout, connection: sqlite3.Connection) -> Snapshot:
+def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable | None:
+    """The codes of the first groups that have good files; None without any, and where no code can be made sense of."""
+    try:
+        coder = files.read_coder()
+    except StaleArrays:
+        return None
+    parts = []
+    with suppress(StaleArrays):
+        group = 0
+        while of_group := files.named_group(named, group):
+            parts.append(files.read_codes(coder, of_group))
+            group += 1
+    if not parts:
+        return CodeTable.empty(coder)
+    return CodeTable.of(
+        coder,
+        Codes(
+            np.concatenate([part.sketches for part in parts]),
+            np.concatenate([part.bits for part in parts]),
+            np.concatenate([part.scales for part in parts]),
+        ),
+    )
+
+
+def read_snapshot(
+    folder: Path, layout: Layout, connection: sqlite3.Connection, record: MapRecord, shelf: Shelf, files: IndexFiles
+) -> Snapshot:
     """All that is searched, from disk.
+
+    The descriptors of a small map are read and checked.  Those of a larger one stay where they are and are checked
+    as they are read; here it is seen to it that their files are there, those of this map, and long enough.
 
     Raises:
         Damage: SQLite and the segment files do not agree, or a checksum fails.
@@ -177,22 +178,49 @@ def read_snapshot(folder: Path, layout: Layout, connection: sqlite3.Connection) 
     """
     named = named_segments(connection, layout)
     total = sum(segment.rows for segment in named)
-    spots = [Spot(NO_POSE, (0.0, 0.0, 0.0), NO_SEQUENCE, 0)] * total
-    alive = np.zeros(total, dtype=np.bool_)
-    wanted: dict[int, int] = {}
-    for row, checksum, spot in living_rows(connection, total):
-        spots[row], alive[row], wanted[row] = spot, True, checksum
+    columns = read_columns(connection, total)
+    whereabouts = Whereabouts(
+        np.full(total, NO_POSE, np.int8),
+        np.zeros((total, 3)),
+        np.full(total, NO_SEQUENCE, np.int32),
+        np.zeros(total, np.int64),
+    )
+    for name, column in vars(columns.whereabouts).items():
+        getattr(whereabouts, name)[columns.rows] = column
+    alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
+    alive[columns.rows], checksums[columns.rows] = True, columns.checksums
+    table = _load_codes(files, named)
+    tier = tier_for(record.index, len(columns.rows), "exact" if table is None else "compact")
+    holds = tier == "exact"
     segments = []
     for segment in named:
         first = segment.number * layout.rows_per_segment
         part = slice(first, first + segment.rows)
-        index, local = _load_segment(folder, layout, segment, wanted)
-        segments.append(Segment(index, local, first, whereabouts_of(spots[part]), alive[part].copy()))
-    return Snapshot(layout.dimension, layout.rows_per_segment, tuple(segments), layout.local_shape)
+        if not holds:
+            shelf.check(segment.number, segment.rows)
+        held = _load_segment(folder, layout, segment, checksums[part]) if holds else None
+        there = Whereabouts(**{name: column[part] for name, column in vars(whereabouts).items()})
+        segments.append(Segment(held, first, there, alive[part], checksums[part]))
+    lists = None
+    if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
+        with suppress(StaleArrays):
+            lists, _ = files.read_lists(table.coder, len(table))
+    return Snapshot(
+        layout.dimension,
+        layout.rows_per_segment,
+        tuple(segments),
+        layout.local_shape,
+        shelf,
+        None if holds else table,
+        lists,
+        holds,
+    )
 
 
-def open_map(folder: Path) -> OpenMap:
+def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     """Open a map for use, and clear away what a crash left unfinished.
+
+    The snapshot is the caller's alone: its memory is free again when later ones hold less.
 
     Raises:
         DataDirectoryTooNew: a later version wrote it.
@@ -205,11 +233,13 @@ def open_map(folder: Path) -> OpenMap:
     try:
         with database.reading() as connection:
             record, layout = _adopt(folder, connection)
-            snapshot = read_snapshot(folder, layout, connection)
+            shelf, files = Shelf(folder, layout), IndexFiles(folder, layout)
+            snapshot = read_snapshot(folder, layout, connection, record, shelf, files)
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # SQLite has made the name of its log
-        for unfinished in folder.glob(f"*{TEMPORARY}"):
-            unfinished.unlink()
+        # Earlier versions kept the descriptors of full segments a second time, for FAISS to read.
+        for superfluous in (*folder.glob(f"*{TEMPORARY}"), *folder.glob("index-*.faiss")):
+            superfluous.unlink()
     except sqlite3.OperationalError as error:
         database.close()
         if primary_code(error) == sqlite3.SQLITE_ERROR:  # SQL that suits our tables does not suit these
@@ -221,4 +251,4 @@ def open_map(folder: Path) -> OpenMap:
     except BaseException:
         database.close()
         raise
-    return OpenMap(record, layout, database, snapshot)
+    return OpenMap(record, layout, database, shelf, files), snapshot

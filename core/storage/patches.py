@@ -47,6 +47,8 @@ def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFiel
     """
     if not isinstance(changes, Mapping):
         raise InvalidField("A patch is a JSON object.")
+    if "camera" in changes:
+        raise InvalidField("The camera of a place cannot be changed: send its frame again.")
     document = fields.model_dump(include=set(PlaceFields.model_fields), exclude={"pose"})
     if fields.pose is not None:
         document["pose"] = fields.pose.model_dump(exclude_none=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Annotated, Literal
 
 import numpy as np
@@ -10,6 +11,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.places import PlaceFields, Timestamp
+from core.storage.resting import Precision
+from core.storage.tiers import COMPACT_FROM, INVERTED_FROM, TierSetting
 from core.verdict import Calibration
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
@@ -32,6 +35,12 @@ class MapSettings(BaseModel):
     same_place_frames: Annotated[int, Field(ge=0, le=2**31)] = Field(
         default=3, description="Without poses: places so many frames apart in their sequence are the same place."
     )
+    index: TierSetting = Field(
+        default="auto",
+        description="How the map is searched: every place compared (exact), by codes (compact), by lists of codes "
+        f"(inverted), or by what suits its size (auto): compact from {COMPACT_FROM} places, inverted from "
+        f"{INVERTED_FROM}.",
+    )
 
 
 class MapRecord(MapSettings):
@@ -42,6 +51,7 @@ class MapRecord(MapSettings):
     dimension: int = Field(gt=0, description="Values of one descriptor.")
     local_cells: int = Field(default=0, ge=0, description="Local descriptors of one frame; 0: there are none.")
     local_values: int = Field(default=0, ge=0, description="Values of one local descriptor.")
+    precision: Precision = Field(default="full", description="How its descriptors are kept; chosen when it is made.")
     calibration: Calibration | None = Field(default=None, description="The map's own; none: that of its encoder.")
     revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
     created_at: Timestamp
@@ -85,6 +95,20 @@ class Enrolment:
     local: NDArray[np.int8] = field(default_factory=lambda: np.empty((0, 0), np.int8))
     thumbnail: bytes | None = None
     image: bytes | None = None
+
+
+@dataclass(frozen=True)
+class History:
+    """What a place brings along from another map besides its frame and fields.
+
+    picture: what is kept of its frame there.
+    ordinal: its order in its sequence here; None puts it at the end.
+    """
+
+    picture: Keep
+    ordinal: int | None
+    created_at: datetime
+    updated_at: datetime
 
 
 class VerifyReport(BaseModel):

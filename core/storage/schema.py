@@ -79,7 +79,59 @@ _LOCAL: Migration = (
     "ALTER TABLE map ADD COLUMN local_values INTEGER NOT NULL DEFAULT 0 CHECK (local_values >= 0)",
 )
 
-MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL)
+# Which camera took a frame, and what is ignored in the frames of each.
+_CAMERAS: Migration = (
+    """CREATE TABLE cameras (
+        name TEXT PRIMARY KEY,
+        mask TEXT,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    "ALTER TABLE places ADD COLUMN camera TEXT",
+)
+
+LONGEST_INDEXED = 512
+"""Characters of a text in a place's metadata by which places can be found; longer ones are kept all the same."""
+
+
+def _values_of(place: str) -> str:
+    """Rows of ``place_values`` for the top-level scalars of a place's metadata."""
+    return (
+        "SELECT key, CASE type WHEN 'true' THEN 'boolean' WHEN 'false' THEN 'boolean'"
+        " WHEN 'integer' THEN 'number' WHEN 'real' THEN 'number' ELSE type END,"
+        f" coalesce(atom, 0), {place}.row FROM {{source}}json_each({place}.metadata)"
+        f" WHERE type NOT IN ('object', 'array') AND (type <> 'text' OR length(atom) <= {LONGEST_INDEXED})"
+    )
+
+
+_INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(source='')}"
+_DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
+
+# By which metadata places are found.  Triggers keep it in step, whatever writes a place.
+_VALUES: Migration = (
+    # The kind tells true from 1; as ANY, 1 and 1.0 are equal.
+    """CREATE TABLE place_values (
+        key TEXT NOT NULL,
+        kind TEXT NOT NULL,
+        value ANY NOT NULL,
+        row INTEGER NOT NULL,
+        PRIMARY KEY (key, kind, value, row)
+    ) STRICT, WITHOUT ROWID""",
+    f"INSERT OR IGNORE INTO place_values {_values_of('p').format(source='places p, ')} AND json_valid(p.metadata)",
+    f"CREATE TRIGGER place_values_made AFTER INSERT ON places BEGIN {_INSERT_VALUES}; END",
+    "CREATE TRIGGER place_values_changed AFTER UPDATE OF row, metadata ON places"
+    " WHEN old.row <> new.row OR old.metadata <> new.metadata"
+    f" BEGIN {_DELETE_VALUES}; {_INSERT_VALUES}; END",
+    f"CREATE TRIGGER place_values_gone AFTER DELETE ON places BEGIN {_DELETE_VALUES}; END",
+    "CREATE INDEX places_in_order ON places (sequence, ordinal)",
+)
+
+# How the map is searched, and how its descriptors are kept; "full" in the maps that were there before.
+_TIERS: Migration = (
+    "ALTER TABLE map ADD COLUMN \"index\" TEXT NOT NULL DEFAULT 'auto'",
+    "ALTER TABLE map ADD COLUMN precision TEXT NOT NULL DEFAULT 'full'",
+)
+
+MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:

@@ -1,147 +1,46 @@
-"""What is searched: an immutable view of a map, made of FAISS flat inner-product indexes.
+"""What is searched: an immutable view of a map.
 
 A map's rows lie in segments of a fixed size; the last one, the tail, still grows.  A write makes a
-new snapshot that shares every index, and the local descriptors beside it, with the one before:
-descriptors are put behind the rows that older snapshots see, and only the few bytes per row that say
-where a place is, and whether it is still alive, are copied, for the segments that the write touches.
+new snapshot that shares all descriptors and codes with the one before: rows are put behind those
+that older snapshots see, and only the few bytes per row that say where a place is, and whether it is
+still alive, are copied, for the segments that the write touches.
+
+A small map holds its descriptors in memory and ranks every place (the tier ``exact``).  A larger one
+holds codes of them (``compact``), by nearest centre too in the largest maps (``inverted``): the codes
+name the few places that are worth an exact comparison, whose descriptors are read from the shelf.
+Rows that have no code yet are compared exactly, so that what is searched is always the whole map.
 """
 
 from __future__ import annotations
 
-import os
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from itertools import pairwise
 
-import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.descriptors import NO_LOCAL, Descriptor, Local
+from core.index import Codes, CodeTable, InvertedLists
+from core.storage.descriptors import NO_LOCAL
+from core.storage.parallel import threads, together
+from core.storage.resting import Descriptor, Local
+from core.storage.segment import Held, Segment, vectors
+from core.storage.shelf import Shelf
+from core.storage.spots import Spot, joined, whereabouts_of
 from core.verdict import Whereabouts
+
+__all__ = ["SHORTLIST", "Ranking", "Segment", "Snapshot", "Spot"]
 
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Rows, best first, and their inner products."""
 
-_SMALLEST_TAIL = 8
+SHORTLIST = 100
+"""Places of a coded map whose descriptors are compared exactly; its rankings are of these."""
+
 _PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
-
-
-@dataclass(frozen=True)
-class Spot:
-    """Where one place is; the fields are those of :class:`Whereabouts`."""
-
-    kind: int
-    position: tuple[float, float, float]
-    sequence: int
-    ordinal: int
-
-
-def whereabouts_of(spots: Sequence[Spot]) -> Whereabouts:
-    """Of n places, row-aligned."""
-    return Whereabouts(
-        np.array([spot.kind for spot in spots], dtype=np.int8),
-        np.array([spot.position for spot in spots], dtype=np.float64).reshape(-1, 3),
-        np.array([spot.sequence for spot in spots], dtype=np.int32),
-        np.array([spot.ordinal for spot in spots], dtype=np.int64),
-    )
-
-
-def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
-    """One after the other."""
-    if not parts:
-        return whereabouts_of([])
-    return Whereabouts(
-        np.concatenate([part.kind for part in parts]),
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.sequence for part in parts]),
-        np.concatenate([part.ordinal for part in parts]),
-    )
-
-
-def flat_index(capacity: int, dimension: int) -> faiss.IndexFlatIP:
-    """An inner-product index with room for ``capacity`` rows, all zero, to be filled through :func:`vectors`."""
-    index = faiss.IndexFlatIP(dimension)
-    index.codes.resize(capacity * dimension * 4)
-    index.ntotal = capacity
-    return index
-
-
-def vectors(index: faiss.IndexFlatIP) -> NDArray[np.float32]:
-    """The rows of an index itself, not a copy: float32 [capacity, D], valid as long as the index is."""
-    size = index.ntotal * index.d
-    flat: NDArray[np.float32] = faiss.rev_swig_ptr(index.get_xb(), size) if size else np.empty(0, np.float32)
-    return flat.reshape(index.ntotal, index.d)
-
-
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """Consecutive rows of a map.
-
-    index: holds ``len(self)`` rows, and behind them room that nobody reads.
-    local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room behind them.
-    first_row: the map's row that is row 0 here.
-    alive: bool [n], False for the rows of places that were forgotten or got another frame.
-    """
-
-    index: faiss.IndexFlatIP
-    local: Local
-    first_row: int
-    whereabouts: Whereabouts
-    alive: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        return len(self.alive)
-
-    def appended(
-        self, descriptors: Sequence[Descriptor], spots: Sequence[Spot], local: Sequence[Local], largest: int
-    ) -> Segment:
-        """With more rows.  Only on the newest segment, by one thread: the room behind it is shared."""
-        n, end = len(self), len(self) + len(descriptors)
-        index, cells = self.index, self.local
-        if end > index.ntotal:
-            # Doubling: over a segment's life each row is copied about once.
-            capacity = min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL))
-            index, cells = flat_index(capacity, self.index.d), np.zeros((capacity, *cells.shape[1:]), np.int8)
-            vectors(index)[:n], cells[:n] = vectors(self.index)[:n], self.local[:n]
-        rows = vectors(index)
-        for offset, descriptor in enumerate(descriptors, start=n):
-            rows[offset] = descriptor
-        for offset, of_frame in enumerate(local, start=n):
-            cells[offset] = of_frame
-        return replace(
-            self,
-            index=index,
-            local=cells,
-            whereabouts=joined([self.whereabouts, whereabouts_of(spots)]),
-            alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
-        )
-
-    def moved(self, spots: Mapping[int, Spot]) -> Segment:
-        """With some of the map's rows somewhere else."""
-        old = self.whereabouts
-        new = Whereabouts(old.kind.copy(), old.position.copy(), old.sequence.copy(), old.ordinal.copy())
-        for row, spot in spots.items():
-            offset = row - self.first_row
-            new.kind[offset], new.position[offset] = spot.kind, spot.position
-            new.sequence[offset], new.ordinal[offset] = spot.sequence, spot.ordinal
-        return replace(self, whereabouts=new)
-
-    def without(self, rows: Sequence[int]) -> Segment:
-        """With some of the map's rows dead."""
-        alive = self.alive.copy()
-        alive[np.asarray(rows, dtype=np.int64) - self.first_row] = False
-        return replace(self, alive=alive)
-
-    def search(self, queries: NDArray[np.float32], start: int, stop: int, products: NDArray[np.float32]) -> None:
-        """Put the inner products of ``queries`` [B, D] with rows start … stop into ``products`` [B, stop - start]."""
-        parameters, selected = faiss.SearchParameters(), faiss.IDSelectorRange(start, stop)
-        parameters.sel = selected
-        found, labels = self.index.search(queries, stop - start, params=parameters)
-        np.put_along_axis(products, labels - start, found, axis=1)
+_PART_ROWS = 32  # of rows that one thread reads from the shelf at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,51 +52,26 @@ class _Part:
     stop: int
 
 
-@cache
-def _threads() -> tuple[ThreadPoolExecutor, int]:
-    """Threads shared by all maps, one for each core that this process may use."""
-    count = len(os.sched_getaffinity(0))
-    # Each is one core's worth of work already; FAISS is not to make threads of its own below it.
-    pool = ThreadPoolExecutor(count, thread_name_prefix="search", initializer=faiss.omp_set_num_threads, initargs=(1,))
-    return pool, count
-
-
-def _together(run: Callable[[_Part], None], parts: Sequence[_Part], calling_too: bool) -> None:
-    """Run every part once, on as many threads as there are cores.
-
-    Each thread takes the next part when it has done one, so that a core that is busy elsewhere
-    delays nothing but the part it is at; a helper that has not begun by the end is not waited for.
-    """
-    if len(parts) == 1:
-        run(parts[0])
-        return
-    pool, cores = _threads()
-    waiting = deque(parts)
-
-    def work() -> None:
-        while True:
-            try:
-                part = waiting.popleft()
-            except IndexError:
-                return
-            run(part)
-
-    helpers = [pool.submit(work) for _ in range(min(len(parts), cores) - calling_too)]
-    if calling_too:
-        work()
-    for helper in helpers:
-        if not (calling_too and helper.cancel()):
-            helper.result()
-
-
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's."""
+    """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's.
+
+    shelf: the descriptors of segments that hold none in memory.
+    table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
+    lists: the same rows by nearest centre; None in all but the largest maps.
+    holds: whether new rows are held in memory.
+    guard: entered around everything that reads from the shelf; names what the disk refuses.
+    """
 
     dimension: int
     rows_per_segment: int
     segments: tuple[Segment, ...] = ()
     local_shape: tuple[int, int] = NO_LOCAL
+    shelf: Shelf | None = None
+    table: CodeTable | None = None
+    lists: InvertedLists | None = None
+    holds: bool = True
+    guard: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def __len__(self) -> int:
         return len(self._living)
@@ -207,64 +81,170 @@ class Snapshot:
         """Rows ever written, those of forgotten places included."""
         return self.segments[-1].first_row + len(self.segments[-1]) if self.segments else 0
 
+    @property
+    def coded(self) -> int:
+        """Rows that have a code."""
+        return 0 if self.table is None else len(self.table)
+
     @cached_property
     def whereabouts(self) -> Whereabouts:
         """By row, dead rows included: take the rows that :meth:`search` returns."""
         return joined([segment.whereabouts for segment in self.segments])
 
+    def whereabouts_at(self, rows: NDArray[np.int64]) -> Whereabouts:
+        """The same as ``whereabouts.take(rows)``, without putting all rows of a large map together for it."""
+        if len(rows) * 8 > self.rows:
+            return self.whereabouts.take(rows)
+        numbers, offsets = np.divmod(rows, self.rows_per_segment)
+        parts = [
+            self.segments[number].whereabouts.take(offsets[numbers == number]) for number in np.unique(numbers).tolist()
+        ]
+        by_segment = np.argsort(numbers, kind="stable")
+        return joined(parts).take(np.argsort(by_segment))
+
+    @cached_property
+    def alive(self) -> NDArray[np.bool_]:
+        """By row, whether a place is there: bool [rows]."""
+        parts = [segment.alive for segment in self.segments]
+        return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
+
     @cached_property
     def _living(self) -> NDArray[np.int64]:
         """The rows of living places, ascending."""
-        parts = [np.flatnonzero(segment.alive) + segment.first_row for segment in self.segments]
-        return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+        return np.flatnonzero(self.alive)
+
+    @cached_property
+    def _held(self) -> NDArray[np.bool_]:
+        """By row, whether its descriptor is in memory: bool [rows]."""
+        return np.repeat(
+            np.array([segment.held is not None for segment in self.segments], np.bool_),
+            np.array([len(segment) for segment in self.segments], np.int64),
+        )
+
+    @property
+    def memory(self) -> int:
+        """Bytes that the segments and the codes take."""
+        codes = 0 if self.table is None else self.table.coder.bytes_per_place * len(self.table)
+        lists = 0 if self.lists is None else sum(array.nbytes for array in self.lists.tensors().values())
+        return sum(segment.memory for segment in self.segments) + codes + lists
 
     @cached_property
     def _parts(self) -> list[_Part]:
         """The rows to compare with, in parts of equal size within a segment; segments of the dead are left out."""
         parts = []
         for segment in self.segments:
-            if segment.alive.any():
+            if segment.held is not None and segment.alive.any():
                 count = -(-len(segment) * self.dimension * 4 // _PART_BYTES)
                 ends = [len(segment) * i // count for i in range(count + 1)]
                 parts += [_Part(segment, start, stop) for start, stop in pairwise(ends) if stop > start]
         return parts
 
-    def search(self, descriptor: Descriptor) -> Ranking:
-        """Every living place, best first; equal ones by row.
+    def search(self, descriptor: Descriptor, allowed: NDArray[np.bool_] | None = None) -> Ranking:
+        """The living places, best first; equal ones by row.
 
         Args:
             descriptor: float32 [D], finite.
+            allowed: bool [rows], the rows to choose from, of which only the living count; None: all.
 
         Returns:
-            rows int64 [n] and inner products float32 [n], n = len(self).
+            rows int64 [n] and inner products float32 [n] with what is stored: of all that are allowed, or, in a map
+            with codes, of those at least ``SHORTLIST`` that the codes chose.
         """
-        return self.search_batch(descriptor[np.newaxis])[0]
+        return self.search_batch(descriptor[np.newaxis], allowed)[0]
 
-    def search_batch(self, descriptors: NDArray[np.float32]) -> list[Ranking]:
+    def search_batch(self, descriptors: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> list[Ranking]:
         """The same for each of ``descriptors``, float32 [B, D].
 
-        One FAISS search per segment and thread for all of them, which reads each place once, not B
-        times.  Inner products may differ in their last bits from those of :meth:`search`.
+        Places in memory are read once for all of them, not B times.  Inner products may differ in
+        their last bits from those of :meth:`search`.
         """
         queries = np.ascontiguousarray(descriptors, dtype=np.float32)
         if queries.ndim != 2 or queries.shape[1] != self.dimension or not np.isfinite(queries).all():
             raise ValueError(f"a query is {self.dimension} finite values")
+        if allowed is not None and allowed.shape != (self.rows,):
+            raise ValueError(f"the map has {self.rows} rows to allow")
+        if len(self._parts) and len(queries):
+            rows, products = self._compare_held(queries, allowed)
+        else:
+            rows, products = np.empty(0, np.int64), np.empty((len(queries), 0), np.float32)
+        if self.shelf is None or self._held.all():
+            return [_ranked(rows, found) for found in products]
+        with self.guard():
+            return self._with_shelf(queries, allowed, rows, products)
+
+    def _compare_held(
+        self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The rows that are in memory, alive and allowed, ascending, and their inner products float32 [B, n]."""
         products = np.empty((len(queries), self.rows), dtype=np.float32)
 
         def compare(part: _Part) -> None:
-            first = part.segment.first_row
-            part.segment.search(queries, part.start, part.stop, products[:, first + part.start : first + part.stop])
+            rows = slice(part.segment.first_row + part.start, part.segment.first_row + part.stop)
+            chosen = None if allowed is None else allowed[rows]
+            part.segment.search(queries, part.start, part.stop, products[:, rows], chosen)
 
-        if len(queries) and self._parts:
-            # With many queries FAISS would start threads of its own in a thread that is not one of ours.
-            _together(compare, self._parts, calling_too=len(queries) == 1)
-        return [self._ranked(row) for row in products]
+        # With many queries FAISS would start threads of its own in a thread that is not one of ours.
+        together(compare, self._parts, calling_too=len(queries) == 1)
+        chosen = self.alive & self._held
+        if allowed is not None:
+            chosen &= allowed
+        return (rows := np.flatnonzero(chosen)), products if len(rows) == self.rows else products[:, rows]
 
-    def _ranked(self, products: NDArray[np.float32]) -> Ranking:
-        living = self._living
-        found = products if len(living) == len(products) else products[living]
-        order = np.argsort(-found, kind="stable")
-        return living[order], found[order]
+    def _with_shelf(
+        self,
+        queries: NDArray[np.float32],
+        allowed: NDArray[np.bool_] | None,
+        held: NDArray[np.int64],
+        products: NDArray[np.float32],
+    ) -> list[Ranking]:
+        """The rankings once the rows on the shelf are looked at too."""
+        chosen = self.alive & ~self._held
+        if allowed is not None:
+            chosen &= allowed
+        by_code = chosen[: self.coded]
+        if int(np.count_nonzero(by_code)) <= SHORTLIST:
+            by_code = np.zeros(self.coded, np.bool_)  # so few that all are compared exactly
+        tail = np.flatnonzero(np.concatenate([chosen[: self.coded] & ~by_code, chosen[self.coded :]]))
+        exact, exact_products = np.concatenate([held, tail]), np.hstack([products, self._compared(queries, tail)])
+        rankings = []
+        for query, found in zip(queries, exact_products, strict=True):
+            rows, found = _best(exact, found, SHORTLIST if by_code.any() else len(exact))
+            if by_code.any():
+                short = self._shortlist(query, by_code)
+                rows = np.concatenate([rows, short])
+                found = np.concatenate([found, self._compared(query[np.newaxis], short)[0]])
+            rankings.append(_ranked(rows, found))
+        return rankings
+
+    def _shortlist(self, query: NDArray[np.float32], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """The rows that the codes choose among those allowed, bool [coded]; ascending."""
+        assert self.table is not None
+        every = None if allowed.all() else allowed
+        coded = self.table.coder.query(query)
+        found = self.table.shortlist(coded, SHORTLIST, every, self.lists, threads()[0])
+        return np.sort(found.rows)
+
+    def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Inner products of queries with rows on the shelf, float32 [B, k]."""
+        assert self.shelf is not None
+        shelf, products = self.shelf, np.empty((len(queries), len(rows)), np.float32)
+
+        def compare(part: slice) -> None:
+            products[:, part] = shelf.inner_products(queries, rows[part], self._checksums(rows[part]))
+
+        parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
+        if parts:
+            together(compare, parts, calling_too=True)
+        return products
+
+    def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """What SQLite names of rows."""
+        segments = [(self.segments[row // self.rows_per_segment], row) for row in rows.tolist()]
+        return np.array([segment.checksums[row - segment.first_row] for segment, row in segments], np.uint32)
+
+    def _check_rows(self, rows: NDArray[np.int64]) -> None:
+        if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
+            raise IndexError(f"the map has rows 0 to {self.rows - 1}")
 
     def locals_at(self, rows: NDArray[np.int64]) -> Local:
         """The local descriptors of rows, as :meth:`search` returns them: int8 [k, C, L], a copy.
@@ -272,38 +252,71 @@ class Snapshot:
         Raises:
             IndexError: there is no such row.
         """
-        if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
-            raise IndexError(f"the map has rows 0 to {self.rows - 1}")
+        self._check_rows(rows)
         found = np.empty((len(rows), *self.local_shape), np.int8)
-        for position, row in enumerate(rows.tolist()):
-            segment = self.segments[row // self.rows_per_segment]
-            found[position] = segment.local[row - segment.first_row]
+        held = self._held[rows]
+        for position in np.flatnonzero(held).tolist():
+            segment = self.segments[int(rows[position]) // self.rows_per_segment]
+            found[position] = segment.local[int(rows[position]) - segment.first_row]
+        if not held.all():
+            assert self.shelf is not None
+            wanted = rows[~held]
+            with self.guard():
+                found[~held] = self.shelf.locals(wanted, self._checksums(wanted))
+        return found
+
+    def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D], a copy.
+
+        Raises:
+            IndexError: there is no such row.
+        """
+        self._check_rows(rows)
+        found = np.empty((len(rows), self.dimension), np.float32)
+        held = self._held[rows]
+        for position in np.flatnonzero(held).tolist():
+            segment = self.segments[int(rows[position]) // self.rows_per_segment]
+            found[position] = vectors(segment.index)[int(rows[position]) - segment.first_row]
+        if not held.all():
+            assert self.shelf is not None
+            wanted = rows[~held]
+            with self.guard():
+                found[~held] = self.shelf.descriptors(wanted, self._checksums(wanted))
         return found
 
     def appended(
-        self, descriptors: Sequence[Descriptor], spots: Sequence[Spot], local: Sequence[Local] = ()
+        self,
+        descriptors: Sequence[Descriptor],
+        spots: Sequence[Spot],
+        local: Sequence[Local] = (),
+        checksums: Sequence[int] | None = None,
     ) -> Snapshot:
         """With further places.  Only on the newest snapshot, by one thread at a time.
 
         Args:
             descriptors, spots, local: one of each a place, float32 [D] and int8 [C, L]; ``local`` may be
                 left out where the map has no local descriptors.
+            checksums: what SQLite names of the rows; None: nothing.
         """
         if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
             raise ValueError("every place of this map has local descriptors")
+        named = [0] * len(descriptors) if checksums is None else checksums
         segments, done = list(self.segments), 0
         while done < len(descriptors):
             if not segments or len(segments[-1]) == self.rows_per_segment:
                 row = sum(len(segment) for segment in segments)
-                empty = np.empty(0, dtype=np.bool_)
-                no_local = np.empty((0, *self.local_shape), np.int8)
-                segments.append(Segment(flat_index(0, self.dimension), no_local, row, whereabouts_of([]), empty))
+                nobody, nothing = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
+                held = Held.nothing(self.dimension, self.local_shape) if self.holds else None
+                segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
-                descriptors[done:stop], spots[done:stop], local[done:stop], self.rows_per_segment
+                descriptors[done:stop], spots[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
             )
             done = min(stop, len(descriptors))
-        return replace(self, segments=tuple(segments))
+        table = self.table
+        if table is not None and len(table) == self.rows and len(descriptors):
+            table = table.appended(table.coder.encode(np.stack(descriptors)))
+        return replace(self, segments=tuple(segments), table=table)
 
     def moved(self, spots: Mapping[int, Spot]) -> Snapshot:
         """With the places of some rows somewhere else."""
@@ -324,3 +337,31 @@ class Snapshot:
         for row in rows:
             groups.setdefault(row // self.rows_per_segment, []).append(row)
         return groups
+
+    def with_codes(self, codes: Codes) -> Snapshot:
+        """With codes of the rows behind those that have one.  Only on the newest snapshot, by one thread at a time."""
+        assert self.table is not None
+        return replace(self, table=self.table.appended(codes))
+
+    def holding(self, number: int, held: Held | None) -> Snapshot:
+        """With the descriptors of a segment in memory, or on the shelf only."""
+        segments = list(self.segments)
+        segments[number] = replace(segments[number], held=held)
+        return replace(self, segments=tuple(segments))
+
+
+def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) -> Ranking:
+    """At most ``count`` of rows, those with the largest products, ascending by row."""
+    if len(rows) <= count:
+        return rows, products
+    chosen = np.sort(np.argpartition(-products, count)[:count])
+    return rows[chosen], products[chosen]
+
+
+def _ranked(rows: NDArray[np.int64], products: NDArray[np.float32]) -> Ranking:
+    """Best first; equal ones by row."""
+    if np.any(rows[1:] < rows[:-1]):
+        order = np.argsort(rows)
+        rows, products = rows[order], products[order]
+    order = np.argsort(-products, kind="stable")
+    return rows[order], products[order]

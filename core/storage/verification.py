@@ -9,16 +9,21 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.storage import descriptors
-from core.storage.caches import StaleCache, cache_name, check_cache
+from core.storage.columns import read_columns
 from core.storage.database import FILE, connect
 from core.storage.descriptors import Layout
 from core.storage.disk import Damage
-from core.storage.opening import NamedSegment, living_rows, named_segments, read_layout
+from core.storage.index_files import IndexFiles
+from core.storage.indexing import tier_of
+from core.storage.named import NamedSegment, named_segments
+from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
 from core.storage.schema import check_schema
-from core.storage.snapshot import Segment, Snapshot, Spot, vectors
+from core.storage.segment import Segment, vectors
+from core.storage.snapshot import Snapshot
 
 _NAMED = 10  # of the rows of one kind of damage, so many are told one by one
 
@@ -89,7 +94,10 @@ def inspect(folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | N
         if snapshot is not None:
             with findings.noting():
                 _check_spots(connection, snapshot, findings)
-        _check_caches(folder, layout, segments, findings)
+        if snapshot is not None:
+            checked, stale = IndexFiles(folder, layout).check(segments, tier_of(snapshot))
+            findings.checked_bytes += checked
+            findings.stale_caches += stale
     return findings.report()
 
 
@@ -103,10 +111,10 @@ def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
 
 def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None:
     query = (
-        "SELECT p.id, p.number, p.picture, p.digest, k.digest, length(k.bytes) FROM places p"
+        "SELECT p.id, p.number, p.picture, p.digest, k.digest, length(k.bytes), p.camera FROM places p"
         " LEFT JOIN pictures k ON k.place = p.number ORDER BY p.number"
     )
-    for place, number, kind, source_digest, digest, size in connection.execute(query).fetchall():
+    for place, number, kind, source_digest, digest, size, camera in connection.execute(query).fetchall():
         if (kind == "none") != (size is None):
             findings.problems.append(f"{FILE}: place {place!r} is said to keep {kind}, which is not so")
         if size is None:
@@ -114,7 +122,8 @@ def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None
         ((content,),) = connection.execute("SELECT bytes FROM pictures WHERE place = ?", (number,)).fetchall()
         findings.checked_bytes += size
         found = hashlib.sha256(content).digest()
-        if found != digest or (kind == "image" and found != source_digest):
+        # The digest of a place that a camera took is that of its image and of what was masked in it.
+        if found != digest or (kind == "image" and camera is None and found != source_digest):
             findings.problems.append(f"{FILE}: the {kind} of place {place!r} does not match its digest")
 
 
@@ -151,13 +160,14 @@ def _check_segment(
     running = 0
     searched = None if snapshot is None else snapshot.segments[named.number]
     for records in descriptors.read_records(folder, layout, named.number, named.rows):
-        damaged += descriptors.damaged_rows(records, row)
+        damaged += descriptors.damaged_rows(layout, records, row)
         running = descriptors.chain(records["checksum"], running)
-        for offset, record in enumerate(records, start=row):
-            if offset in places and places[offset][1] != record["checksum"]:
+        named_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
+        for offset, (named_sum, record) in enumerate(zip(named_sums, records, strict=True), start=row):
+            if named_sum not in (None, record["checksum"]):
                 foreign.append(offset)
-            if searched is not None and not _same_descriptors(searched, offset - searched.first_row, record):
-                differing.append(offset)
+        if searched is not None:
+            differing += [row + offset for offset in _differing(searched, row - searched.first_row, layout, records)]
         findings.checked_bytes += records.nbytes
         row += len(records)
     for rows, what in (
@@ -175,41 +185,38 @@ def _check_segment(
         findings.problems.append(f"{descriptors.segment_name(named.number)}: its rows are not those that {FILE} names")
 
 
-def _same_descriptors(segment: Segment, offset: int, record: np.void) -> bool:
-    """Byte for byte, for a bit may be flipped that changes no comparison."""
-    in_memory = vectors(segment.index)[offset].tobytes(), segment.local[offset].tobytes()
-    return in_memory == (record["descriptor"].tobytes(), record["local"].tobytes())
+def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np.void]) -> list[int]:
+    """Which of the rows from ``start`` on are searched otherwise than they are stored.
 
-
-def _same_spot(segment: Segment, offset: int, spot: Spot) -> bool:
-    there = segment.whereabouts
-    return (
-        bool(segment.alive[offset])
-        and int(there.kind[offset]) == spot.kind
-        and tuple(there.position[offset].tolist()) == spot.position
-        and int(there.sequence[offset]) == spot.sequence
-        and int(there.ordinal[offset]) == spot.ordinal
-    )
+    Byte for byte, for a bit may be flipped that changes no comparison.  Of a segment on the shelf it is
+    its checksums in memory that count: whatever is read of it must have them.
+    """
+    rows = slice(start, start + len(records))
+    if segment.held is None:
+        named = segment.checksums[rows]
+        return [int(offset) for offset in np.flatnonzero((named != 0) & (named != records["checksum"]))]
+    stored = zip(layout.descriptors_of(records), layout.locals_of(records), strict=True)
+    held = zip(vectors(segment.index)[rows], segment.local[rows], strict=True)
+    return [
+        offset
+        for offset, (there, here) in enumerate(zip(stored, held, strict=True))
+        if [part.tobytes() for part in there] != [part.tobytes() for part in here]
+    ]
 
 
 def _check_spots(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
     """Is what is searched what is stored: the same places, alive, at the same spots?"""
-    stored = 0
-    for row, _, spot in living_rows(connection, snapshot.rows):
-        stored += 1
-        segment = snapshot.segments[row // snapshot.rows_per_segment]
-        if not _same_spot(segment, row - segment.first_row, spot):
-            findings.problems.append(f"row {row} is searched otherwise than {FILE} has it")
-    if snapshot.rows != findings.rows or len(snapshot) != stored:
-        searched = f"{len(snapshot)} places in {snapshot.rows} rows are searched"
-        findings.problems.append(f"{searched}, {stored} in {findings.rows} are stored")
-
-
-def _check_caches(folder: Path, layout: Layout, segments: list[NamedSegment], findings: _Findings) -> None:
-    for named in segments:
-        if named.rows == layout.rows_per_segment:
-            name = cache_name(named.number)
-            try:
-                findings.checked_bytes += check_cache(folder / name, layout, named.checksum)
-            except StaleCache as stale:
-                findings.stale_caches.append(f"{name}: {stale}")
+    columns = read_columns(connection, snapshot.rows)
+    searched, stored = snapshot.whereabouts.take(columns.rows), columns.whereabouts
+    same = snapshot.alive[columns.rows]
+    for name, column in vars(stored).items():
+        found = getattr(searched, name)
+        if name == "position":  # a point on the sphere may differ in its last bits
+            same &= np.isclose(found, column, rtol=0, atol=1e-6).all(axis=1)
+        else:
+            same &= (found == column) | ((found != found) & (column != column))
+    for row in columns.rows[~same].tolist():
+        findings.problems.append(f"row {row} is searched otherwise than {FILE} has it")
+    if snapshot.rows != findings.rows or len(snapshot) != len(columns.rows):
+        told = f"{len(snapshot)} places in {snapshot.rows} rows are searched"
+        findings.problems.append(f"{told}, {len(columns.rows)} in {findings.rows} are stored")

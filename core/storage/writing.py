@@ -7,13 +7,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
 from core.storage import descriptors, ledger
 from core.storage.ledger import StoredPlace
 from core.storage.opening import OpenMap, spot_of
-from core.storage.records import Change, Enrolment, MapRecord
+from core.storage.records import Change, Enrolment, History, Keep, MapRecord
+from core.storage.resting import LARGEST_HALF
 from core.storage.snapshot import Snapshot, Spot
 
 
@@ -38,6 +40,8 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
         squares = float(np.dot(descriptor, descriptor))
     if not np.isfinite(squares):
         raise ValueError("a descriptor is finite")
+    if np.abs(descriptor).max() > LARGEST_HALF:
+        raise ValueError(f"the values of a descriptor are within ±{LARGEST_HALF:.0f}")
     if squares == 0:
         raise NoRegions(f"The frame for place {item.id!r} has no region of interest, so it cannot be enrolled.")
     if len(item.digest) != 32:
@@ -47,7 +51,7 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
 
 
 def _spot(stored: StoredPlace) -> Spot:
-    return spot_of(stored.place.pose, stored.sequence, stored.ordinal)
+    return spot_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
 
 
 class Write:
@@ -68,29 +72,44 @@ class Write:
         self._folder = folder
         self._layout = opened.layout
         self._snapshot = snapshot
-        self._born: list[Enrolment] = []
+        self._born: list[NDArray[np.void]] = []
         self._spots: list[Spot] = []
         self._moved: dict[int, Spot] = {}
         self._dead: list[int] = []
         self._now = datetime.now(UTC)
 
-    def enrol(self, item: Enrolment) -> tuple[Place, Change]:
-        """Create a place, replace its frame, or give it other fields if the frame is the same."""
+    def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
+        """Create a place, replace its frame, or give it other fields if the frame is the same.
+
+        Args:
+            keep: what to keep of the frame; the map's own rule if left out.
+        """
         stored = ledger.find(self.connection, item.id)
         if stored is not None and stored.digest == item.digest:
             return self.set_fields(stored, item.fields)
         row = self._snapshot.rows + len(self._born)
-        checksum = descriptors.row_checksum(item.descriptor, item.local, row)
-        keep = self.record.keep
+        record = self._layout.packed([item.descriptor], [item.local], row)
+        checksum = int(record["checksum"][0])
+        keep = self.record.keep if keep is None else keep
         if stored is None:
             now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
         else:
             ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
             now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
             self._bury(stored.row)
-        self._born.append(item)
+        self._born.append(record)
         self._spots.append(_spot(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
+
+    def adopt(self, item: Enrolment, history: History) -> None:
+        """A place of another map, with its history."""
+        self.enrol(item, history.picture)
+        stored = ledger.set_history(self.connection, item.id, history)
+        born = stored.row - self._snapshot.rows
+        if born >= 0:
+            self._spots[born] = _spot(stored)
+        else:
+            self._moved[stored.row] = _spot(stored)
 
     def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
         """Other fields for the same frame."""
@@ -133,10 +152,11 @@ class Write:
         before = self._snapshot
         if self._born:
             self.appending = True
-            vectors, local = [item.descriptor for item in self._born], [item.local for item in self._born]
-            checksums = descriptors.append(self._folder, self._layout, before.rows, vectors, local)
-            self._name_rows(before.rows, checksums)
-            after = before.appended(vectors, self._spots, local)
+            records = np.concatenate(self._born)
+            descriptors.append(self._folder, self._layout, before.rows, records)
+            self._name_rows(before.rows, records["checksum"].tolist())
+            vectors, local = self._layout.descriptors_of(records), self._layout.locals_of(records)
+            after = before.appended(list(vectors), self._spots, list(local), records["checksum"].tolist())
         else:
             after = before
         after = after.moved(self._moved) if self._moved else after

@@ -16,7 +16,14 @@ DIMENSION = 16
 LOCAL_SHAPE = (3, 5)
 """An odd number of bytes, so that nothing behind them in a record lies where a processor would want it."""
 
-RECORD_BYTES = DIMENSION * 4 + 15 + 16
+DESCRIPTOR_BYTES = DIMENSION * 2
+RECORD_BYTES = DESCRIPTOR_BYTES + 24 + 15
+"""Of a map as it is made today: halves, sums, local descriptors."""
+
+
+def stored_of(name: str, dimension: int = 16) -> NDArray[np.float32]:
+    """What a map made today keeps of :func:`descriptor_of`."""
+    return descriptor_of(name, dimension).astype(np.float16).astype(np.float32)
 
 
 def descriptor_of(name: str, dimension: int = DIMENSION) -> NDArray[np.float32]:

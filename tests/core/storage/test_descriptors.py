@@ -15,11 +15,9 @@ from core.storage.descriptors import (
     Layout,
     append,
     chain,
-    map_records,
     read_checked,
     read_records,
     rewind,
-    row_checksum,
     segment_name,
 )
 from core.storage.disk import Damage
@@ -28,6 +26,7 @@ from tests.core.storage.frames import descriptor_of, local_of
 LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4, local_shape=(3, 5))
 WITHOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)
 RECORD_BYTES = 8 * 4 + 15 + 16
+HALF = replace(LAYOUT, precision="half")
 
 
 def rows(count: int, start: int = 0) -> list[NDArray[np.float32]]:
@@ -41,7 +40,13 @@ def local(count: int, start: int = 0) -> list[NDArray[np.int8]]:
 def write(folder: Path, first_row: int, count: int, start: int | None = None) -> list[int]:
     """Rows behind the first ones; they show ``start`` and those that follow, by default what their number says."""
     shown = first_row if start is None else start
-    return append(folder, LAYOUT, first_row, rows(count, shown), local(count, shown))
+    records = LAYOUT.packed(rows(count, shown), local(count, shown), first_row)
+    append(folder, LAYOUT, first_row, records)
+    return [int(checksum) for checksum in records["checksum"]]
+
+
+def checksum_of(layout: Layout, descriptor: NDArray[np.float32], cells: NDArray[np.int8], row: int) -> int:
+    return int(layout.packed([descriptor], [cells], row)["checksum"][0])
 
 
 def stored(folder: Path, number: int, count: int, checksum: int) -> NDArray[np.float32]:
@@ -74,19 +79,12 @@ def test_the_checksum_of_a_segment_can_be_continued() -> None:
 def test_the_checksum_of_a_row_is_of_all_that_it_holds() -> None:
     (descriptor,), (cells,) = rows(1), local(1)
     others = [(rows(1, 1)[0], cells, 0), (descriptor, local(1, 1)[0], 0), (descriptor, cells, 1)]
-    assert row_checksum(descriptor, cells, 0) not in [row_checksum(*other) for other in others]
-    by_hand = zlib.crc32(descriptor.tobytes() + cells.tobytes() + struct.pack("<Q", 7))
-    assert row_checksum(descriptor, cells, 7) == by_hand
-
-
-def test_records_can_be_mapped_into_memory(tmp_path: Path) -> None:
-    write(tmp_path, 0, 4)
-    mapped = map_records(tmp_path, LAYOUT, 0, 4)
-    assert mapped["row"].tolist() == [0, 1, 2, 3]
-    np.testing.assert_array_equal(mapped["descriptor"], rows(4))
-    np.testing.assert_array_equal(mapped["local"], local(4))
-    assert not mapped.flags.writeable
-    assert mapped.dtype.itemsize == RECORD_BYTES
+    for layout in (LAYOUT, HALF):
+        assert checksum_of(layout, descriptor, cells, 0) not in [checksum_of(layout, *other) for other in others]
+    place = struct.pack("<Q", 7)
+    assert checksum_of(LAYOUT, descriptor, cells, 7) == zlib.crc32(descriptor.tobytes() + cells.tobytes() + place)
+    parts = [zlib.crc32(part.tobytes() + place) for part in (descriptor.astype("<f2"), cells)]
+    assert checksum_of(HALF, descriptor, cells, 7) == zlib.crc32(struct.pack("<II", *parts))
 
 
 def test_only_the_rows_asked_for_count(tmp_path: Path) -> None:
@@ -143,7 +141,7 @@ def test_records_that_changed_places_are_found(tmp_path: Path) -> None:
 
 def test_good_records_that_are_not_the_named_ones_are_found(tmp_path: Path) -> None:
     write(tmp_path, 0, 3, 50)
-    checksum = chain([row_checksum(*both, i) for i, both in enumerate(zip(rows(3), local(3), strict=True))])
+    checksum = chain(LAYOUT.packed(rows(3), local(3), 0)["checksum"])
     with pytest.raises(Damage, match="not those that map"):
         stored(tmp_path, 0, 3, checksum)
 
@@ -168,6 +166,7 @@ def test_a_file_that_is_missing_or_short(tmp_path: Path) -> None:
         replace(LAYOUT, identity="encoder@2"),
         replace(LAYOUT, rows_per_segment=5),
         replace(LAYOUT, local_shape=(5, 3)),
+        HALF,
         WITHOUT,
     ],
 )
@@ -188,13 +187,13 @@ def test_local_descriptors_of_no_shape(shape: tuple[int, int]) -> None:
 
 def test_every_frame_has_both_kinds_of_descriptors(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="shorter"):
-        append(tmp_path, LAYOUT, 0, rows(3), local(2))
+        append(tmp_path, LAYOUT, 0, LAYOUT.packed(rows(3), local(2), 0))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_local_descriptors_a_file_is_as_it_always_was(tmp_path: Path) -> None:
     """Version 1, written out by its rules."""
-    append(tmp_path, WITHOUT, 4, rows(2, 4), [local_of("", (0, 0))] * 2)
+    append(tmp_path, WITHOUT, 4, WITHOUT.packed(rows(2, 4), [local_of("", (0, 0))] * 2, 4))
     head = struct.pack("<8sI8sIIQH", b"PLRCSEG\x00", 1, b"<f4", 8, 4, 4, 9) + b"encoder@1"
     expected = head.ljust(4092, b"\x00") + struct.pack("<I", zlib.crc32(head.ljust(4092, b"\x00")))
     for row in (4, 5):
@@ -209,6 +208,35 @@ def test_the_header_says_what_is_in_a_record(tmp_path: Path) -> None:
     header = (tmp_path / segment_name(0)).read_bytes()[:HEADER_BYTES]
     head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 2, b"<f4", 8, 4, 0, 9, 3, 5) + b"encoder@1"
     assert header[:-4] == head.ljust(HEADER_BYTES - 4, b"\x00")
+
+
+def test_version_3_written_out_by_its_rules(tmp_path: Path) -> None:
+    append(tmp_path, HALF, 4, HALF.packed(rows(2, 4), local(2, 4), 4))
+    head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 3, b"<f2", 8, 4, 4, 9, 3, 5) + b"encoder@1"
+    expected = head.ljust(4092, b"\x00") + struct.pack("<I", zlib.crc32(head.ljust(4092, b"\x00")))
+    for row in (4, 5):
+        halves, cells = rows(1, row)[0].astype("<f2").tobytes(), local(1, row)[0].tobytes()
+        sums = [zlib.crc32(part + struct.pack("<Q", row)) for part in (halves, cells)]
+        expected += halves + struct.pack("<QIIII", row, zlib.crc32(struct.pack("<II", *sums)), *sums, 0) + cells
+    assert (tmp_path / segment_name(1)).read_bytes() == expected
+
+
+@pytest.mark.parametrize("offset", [*range(8 * 2 + 20), *range(8 * 2 + 24, 8 * 2 + 24 + 15)])
+def test_every_flipped_bit_of_a_record_of_version_3_is_found(tmp_path: Path, offset: int) -> None:
+    records = HALF.packed(rows(3), local(3), 0)
+    append(tmp_path, HALF, 0, records)
+    flip(tmp_path / segment_name(0), HEADER_BYTES + records.dtype.itemsize + offset)
+    with pytest.raises(Damage, match="row 1 does not match"):
+        list(read_checked(tmp_path, HALF, 0, 3, chain(records["checksum"])))
+
+
+def test_what_comes_back_is_the_descriptor_to_half_precision() -> None:
+    records = HALF.packed(rows(5), local(5), 0)
+    np.testing.assert_array_equal(HALF.descriptors_of(records), np.array(rows(5)).astype(np.float16))
+    np.testing.assert_allclose(HALF.descriptors_of(records), rows(5), rtol=2**-11)
+    np.testing.assert_array_equal(HALF.locals_of(records), local(5))
+    types = [str(part.dtype) for part in (HALF.descriptors_of(records), HALF.locals_of(records))]
+    assert types == ["float32", "int8"]
 
 
 def test_an_identity_has_its_limit() -> None:

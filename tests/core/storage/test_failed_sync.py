@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from core.storage import Atlas
-from core.storage.snapshot import vectors
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
+from core.storage.segment import vectors
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, local_of, stored_of
 from tests.syscalls import strace
 
 REPOSITORY = Path(__file__).parents[3]
@@ -64,7 +64,7 @@ def test_what_is_refused_is_not_there_and_what_is_taken_is(directory: Path, call
     assert [place.id for place in lab.places(None, 100)[0]] == ["p0", "p1", *taken]
     for row, name in enumerate(["p0", "p1", *taken]):
         segment = lab.snapshot().segments[row // 4]
-        np.testing.assert_array_equal(vectors(segment.index)[row % 4], descriptor_of(name))
+        np.testing.assert_array_equal(vectors(segment.index)[row % 4], stored_of(name))
         np.testing.assert_array_equal(segment.local[row % 4], local_of(name))
     assert lab.verify().ok
     atlas.close()

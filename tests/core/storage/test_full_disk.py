@@ -95,7 +95,7 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     assert found.id == ids[-1]
     stored = sum(path.stat().st_size for path in (directory / "maps" / "lab").glob("*.seg"))
     segments = -(-len(ids) // 8)
-    assert stored == segments * HEADER_BYTES + len(ids) * (dimension * 4 + LOCAL_BYTES + 16)
+    assert stored == segments * HEADER_BYTES + len(ids) * (dimension * 2 + LOCAL_BYTES + 24)
     assert lab.verify().ok
 
     ballast.unlink()
@@ -150,5 +150,5 @@ def test_a_file_that_may_not_grow_is_a_full_disk(directory: Path) -> None:
     answer = json.loads(finished.stdout)
     assert answer["error"] == "StorageFull"
     assert answer["places"] > 20
-    assert answer["size"] == HEADER_BYTES + answer["places"] * (LARGE * 4 + LOCAL_BYTES + 16)
+    assert answer["size"] == HEADER_BYTES + answer["places"] * (LARGE * 2 + LOCAL_BYTES + 24)
     assert (answer["after"], answer["ok"]) == (answer["places"] + 1, True)

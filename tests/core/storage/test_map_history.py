@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +16,16 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from core.errors import UnknownPlace, UnknownSequence
 from core.places import PlaceFields, Pose
 from core.storage import Atlas
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
+from tests.core.storage.frames import (
+    DIMENSION,
+    ENCODER,
+    LOCAL_SHAPE,
+    descriptor_of,
+    digest_of,
+    frame,
+    local_of,
+    stored_of,
+)
 
 IDS = st.sampled_from([f"p{i}" for i in range(7)])
 PICTURES = st.sampled_from([f"picture {i}" for i in range(5)])
@@ -42,6 +52,12 @@ class MapHistory(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         if hasattr(self, "atlas"):
+            deadline = time.monotonic() + 60
+            while self.lab.index_status().state == "building":
+                assert time.monotonic() < deadline
+                time.sleep(0.002)
+            assert self.lab.index_status().tier == self.lab.index_status().wanted
+            self.agrees()
             report = self.lab.verify()
             assert report.ok, report.problems
             assert report.stale_caches == []
@@ -105,6 +121,11 @@ class MapHistory(RuleBasedStateMachine):
         for place_id in members:
             del self.model[place_id]
 
+    @rule(setting=st.sampled_from(["exact", "compact", "inverted"]))
+    def search_otherwise(self, setting: str) -> None:
+        """The index is built while the history goes on."""
+        assert self.lab.edit({"index": setting}).index == setting
+
     @rule()
     def restart(self) -> None:
         self.atlas.close()
@@ -135,7 +156,7 @@ class MapHistory(RuleBasedStateMachine):
             assert place is not None
             known = self.model[place.id]
             np.testing.assert_array_equal(local[i], local_of(known.picture))
-            assert abs(products[i] - float(descriptor_of(known.picture) @ query)) < 1e-5
+            assert abs(products[i] - float(stored_of(known.picture) @ query)) < 1e-5
             assert self.lab.digest(place.id) == digest_of(known.picture)
             assert (place.pose.x if place.pose else None, place.sequence) == (known.x, known.sequence)
             assert there.kind[i] == (known.x is not None)

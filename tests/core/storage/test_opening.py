@@ -1,8 +1,7 @@
-"""What is found when a map is opened: caches to be made again, rows that nobody named, damage."""
+"""What is found when a map is opened: rows that nobody named, damage."""
 
 from __future__ import annotations
 
-import logging
 import os
 import sqlite3
 from collections.abc import Callable
@@ -14,7 +13,16 @@ import pytest
 from core.errors import MapQuarantined
 from core.storage import Atlas
 from core.storage.descriptors import HEADER_BYTES
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, descriptor_of, frame, local_of
+from tests.core.storage.frames import (
+    DESCRIPTOR_BYTES,
+    DIMENSION,
+    ENCODER,
+    LOCAL_SHAPE,
+    RECORD_BYTES,
+    descriptor_of,
+    frame,
+    local_of,
+)
 
 PLACES = 10  # two full segments of four rows and a tail of two
 
@@ -38,7 +46,7 @@ def check(directory: Path) -> None:
         for i in range(PLACES):
             rows, products = lab.snapshot().search(descriptor_of(f"p{i}"))
             assert (rows[0], rows.size) == (i, PLACES)
-            assert products[0] == pytest.approx(1, abs=1e-5)
+            assert products[0] == pytest.approx(1, abs=1e-3)
             np.testing.assert_array_equal(lab.snapshot().locals_at(rows[:1]), [local_of(f"p{i}")])
         report = lab.verify()
         assert (report.ok, report.problems, report.stale_caches) == (True, [], [])
@@ -70,44 +78,6 @@ def garbage(path: Path) -> None:
     path.write_bytes(os.urandom(path.stat().st_size))
 
 
-def flip_local(path: Path) -> None:
-    """The trailer of 32 bytes is last, the local descriptors of four rows are before it."""
-    flip(path, path.stat().st_size - 32 - 4 * 15)
-
-
-def of_another_segment(path: Path) -> None:
-    path.write_bytes(path.with_name("index-000002.faiss").read_bytes())
-
-
-@pytest.mark.parametrize("spoil", [remove, cut, flip_middle, flip_local, garbage, of_another_segment])
-def test_a_cache_that_is_no_good_is_made_again(
-    directory: Path, folder: Path, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
-) -> None:
-    cache = folder / "index-000001.faiss"
-    good = cache.read_bytes()
-    spoil(cache)
-    with caplog.at_level(logging.WARNING):
-        check(directory)
-    assert cache.read_bytes() == good
-    assert "index-000001.faiss is made again" in caplog.text
-
-
-def test_a_good_cache_saves_reading_the_descriptors(directory: Path, folder: Path) -> None:
-    flip(folder / "descriptors-000001.seg", HEADER_BYTES + 5)
-    atlas = Atlas(directory)
-    lab = atlas.get("lab")
-    rows = lab.snapshot().search(descriptor_of("p0"))[0]
-    assert rows[0] == 0
-    np.testing.assert_array_equal(lab.snapshot().locals_at(rows[:1]), [local_of("p0")])
-    report = lab.verify()  # which reads all the same
-    assert not report.ok
-    assert report.problems == [
-        "descriptors-000001.seg: row 0 (place 'p0') does not match its checksum",
-        "descriptors-000001.seg: row 0 (place 'p0') is not what is searched",
-    ]
-    atlas.close()
-
-
 def test_rows_that_nobody_named_are_cut_off(directory: Path, folder: Path) -> None:
     tail = folder / "descriptors-000003.seg"
     size = tail.stat().st_size
@@ -129,7 +99,6 @@ def test_a_write_that_ended_before_its_commit_is_as_if_it_had_not_been(directory
     check(directory)
     assert (folder / "descriptors-000003.seg").read_bytes() == before["descriptors-000003.seg"]
     assert not (folder / "descriptors-000004.seg").exists()
-    # The cache of the third segment is still there; when that fills again, with other rows, it is written anew.
     atlas = Atlas(directory)
     atlas.get("lab").enrol([frame(f"r{i}") for i in range(3)])
     atlas.close()
@@ -144,7 +113,7 @@ def damage_row(folder: Path) -> None:
 
 
 def damage_local(folder: Path) -> None:
-    flip(folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES + DIMENSION * 4 + 7)
+    flip(folder / "descriptors-000003.seg", HEADER_BYTES + RECORD_BYTES + DESCRIPTOR_BYTES + 24 + 7)
 
 
 def damage_header(folder: Path) -> None:
@@ -160,9 +129,8 @@ def remove_tail(folder: Path) -> None:
     (folder / "descriptors-000003.seg").unlink()
 
 
-def damage_full_segment_and_its_cache(folder: Path) -> None:
+def damage_full_segment(folder: Path) -> None:
     flip(folder / "descriptors-000001.seg", HEADER_BYTES)
-    (folder / "index-000001.faiss").unlink()
 
 
 def restore_an_older_tail(folder: Path) -> None:
@@ -201,7 +169,7 @@ def spoil_a_pose(folder: Path) -> None:
         (damage_header, r"descriptors-000003\.seg: the header"),
         (cut_tail, r"descriptors-000003\.seg: the file ends after 1 of 2 rows"),
         (remove_tail, r"descriptors-000003\.seg: the file is missing"),
-        (damage_full_segment_and_its_cache, r"descriptors-000001\.seg: row 0"),
+        (damage_full_segment, r"descriptors-000001\.seg: row 0"),
         (restore_an_older_tail, r"descriptors-000003\.seg: the header is that of another"),
         (name_a_row_there_is_not, r"map\.sqlite: a place has row 4711, but there are 10"),
         (name_another_checksum, r"descriptors-000003\.seg: row 9 is of another frame"),

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from core.storage import Snapshot
 from core.storage import snapshot as module
-from core.storage.snapshot import Spot, flat_index, vectors
+from core.storage.segment import flat_index, vectors
+from core.storage.snapshot import Spot
 from tests.core.storage.frames import descriptor_of, local_of
 
 DIMENSION, ROWS, SHAPE = 8, 4, (2, 3)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from core.errors import PlacerecError
 from core.places import PlaceFields
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map, MapSettings, index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 LARGE = 4096
@@ -67,13 +67,13 @@ def everything(directory: Path) -> None:
     atlas.close()
 
 
-def enrol_for_ever(directory: Path) -> None:
+def enrol_for_ever(directory: Path, settings: MapSettings | None = None) -> None:
     """Enrols two new places, replaces one and forgets one, over and over; tells of each step before and after it."""
     atlas = Atlas(directory, rows_per_segment=4)
     lab = (
         atlas.get("lab")
         if atlas.records(None, 1)[0]
-        else atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        else atlas.create("lab", ENCODER, DIMENSION, settings, LOCAL_SHAPE)
     )
     for i in itertools.count(lab.snapshot().rows):
         fresh, twin = f"new{i}", f"pair{i}"
@@ -86,6 +86,12 @@ def enrol_for_ever(directory: Path) -> None:
             os.write(1, f"begin {json.dumps(outcome)}\n".encode())
             step()
             acknowledge(json.dumps(outcome))
+
+
+def enrol_and_code_for_ever(directory: Path) -> None:
+    """The same in a map that is searched by codes, whose files are small, so that many are made."""
+    index_files.GROUP_ROWS = 8
+    enrol_for_ever(directory, MapSettings(index="inverted"))
 
 
 def fill(directory: Path) -> None:
@@ -161,6 +167,7 @@ def die_at_refusal(directory: Path) -> None:
 ACTIONS: dict[str, Callable[[Path], None]] = {
     "everything": everything,
     "enrol-for-ever": enrol_for_ever,
+    "enrol-and-code-for-ever": enrol_and_code_for_ever,
     "fill": fill,
     "hold": hold,
     "keep-trying": keep_trying,

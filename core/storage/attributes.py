@@ -1,0 +1,74 @@
+"""Places found by what was said of them: sequences by name, rows by metadata."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+
+import numpy as np
+from numpy.typing import NDArray
+
+Scalar = str | int | float | bool | None
+
+FEW = 5000
+"""Rows that are sooner looked up one by one than all rows with a value are read."""
+
+_WANTED = (
+    " v.key = f.key AND v.kind = CASE f.type WHEN 'true' THEN 'boolean' WHEN 'false' THEN 'boolean'"
+    " WHEN 'integer' THEN 'number' WHEN 'real' THEN 'number' ELSE f.type END AND v.value = coalesce(f.atom, 0)"
+)
+# One text with all rows in it: making a Python object of each takes several times as long.
+_ALL = f"SELECT group_concat(v.row) FROM json_each(?) f JOIN place_values v ON{_WANTED}"
+_AMONG = (
+    "SELECT group_concat(v.row) FROM json_each(?) f CROSS JOIN json_each(?) r CROSS JOIN place_values v"
+    f" ON{_WANTED} AND v.row = r.value"
+)
+
+
+class Attributes:
+    """Look-ups in the indexes of one map; from any thread.
+
+    Args:
+        reading: gives a connection to the map's database; what it raises is raised here.
+    """
+
+    def __init__(self, reading: Callable[[], AbstractContextManager[sqlite3.Connection]]) -> None:
+        self._reading = reading
+
+    def sequence_codes(self, names: Sequence[str]) -> dict[str, int]:
+        """The codes of those of the sequences that there are, as ``Whereabouts.sequence`` has them."""
+        query = "SELECT name, code FROM sequences WHERE name IN (SELECT value FROM json_each(?))"
+        with self._reading() as connection:
+            return dict(connection.execute(query, (json.dumps(list(names)),)).fetchall())
+
+    def oldest_of_last(self, sequence: int, frames: int) -> int | None:
+        """The least ordinal among a sequence's last ``frames`` places; None if there is no such place."""
+        query = "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE sequence = ? ORDER BY ordinal DESC LIMIT ?)"
+        with self._reading() as connection:
+            (ordinal,) = connection.execute(query, (sequence, frames)).fetchone()
+        return None if ordinal is None else int(ordinal)
+
+    def rows_with(self, metadata: Mapping[str, Scalar], among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Rows of the places whose metadata has these values under these keys; int64 [n], ascending.
+
+        Numbers are equal as numbers (1 is 1.0), and true is not 1.  Only top-level values are found, and
+        of text only what has at most ``schema.LONGEST_INDEXED`` characters.
+
+        Args:
+            metadata: at least one.
+            among: the rows to choose from, if they are known; few are looked up one by one.
+        """
+        found = None if among is None else np.unique(among)
+        with self._reading() as connection:
+            for key, value in metadata.items():
+                query, values = _ALL, [json.dumps({key: value})]
+                if found is not None and len(found) <= FEW:
+                    query, values = _AMONG, [*values, json.dumps(found.tolist())]
+                (text,) = connection.execute(query, values).fetchone()
+                rows = np.fromstring(text or "", np.int64, sep=",")
+                rows = rows if np.all(rows[1:] > rows[:-1]) else np.unique(rows)  # the index has them in order
+                found = rows if found is None else np.intersect1d(found, rows, assume_unique=True)
+        assert found is not None
+        return found

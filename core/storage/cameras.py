@@ -1,0 +1,114 @@
+"""The cameras of a map: what of their pictures is ignored, at enrolment and at every query."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from typing import TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.errors import InvalidField, UnknownCamera
+from core.masks import Mask
+from core.places import Camera, Timestamp
+from core.storage.ledger import moment_text
+from core.storage.writing import Write
+
+MOST_CAMERAS = 256
+"""Of one map."""
+
+
+class CameraRecord(BaseModel):
+    """One camera."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Camera
+    mask: Mask | None = Field(description="What to ignore in its frames; null: nothing.")
+    updated_at: Timestamp
+
+
+Connected = TypeVar("Connected")
+Access = Callable[[], AbstractContextManager[Connected]]
+
+
+class Cameras:
+    """All cameras of one map; from any thread.  They are few and asked for by every frame, so they stay in memory.
+
+    Args:
+        reading: gives a connection to the map's database.
+        writing: gives a write to the map, which is committed at its end.  What both raise is raised here.
+    """
+
+    def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
+        self._reading, self._writing = reading, writing
+        self._known: dict[str, CameraRecord] | None = None
+        self._lock = threading.Lock()
+
+    def all(self) -> list[CameraRecord]:
+        """By name."""
+        return sorted(self._records().values(), key=lambda camera: camera.name)
+
+    def find(self, name: str) -> CameraRecord:
+        """One camera.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        found = self._records().get(name)
+        if found is None:
+            raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
+        return found
+
+    def mask(self, name: str | None) -> Mask | None:
+        """What to ignore in a frame of a camera; nothing if none is named.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        return None if name is None else self.find(name).mask
+
+    def put(self, name: str, mask: Mask | None) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace its mask; durable when this returns.  Returns whether it is new, too.
+
+        Raises:
+            InvalidField: the map has too many.
+        """
+        made = CameraRecord(name=name, mask=mask, updated_at=datetime.now(UTC))
+        with self._lock, self._writing() as write:
+            known = _read(write.connection)
+            if name not in known and len(known) >= MOST_CAMERAS:
+                raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
+            write.connection.execute(
+                "INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)",
+                (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
+            )
+        self._known = None
+        return made, name not in known
+
+    def forget(self, name: str) -> None:
+        """Delete a camera; the places that it took stay as they are.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        with self._lock, self._writing() as write:
+            if not write.connection.execute("DELETE FROM cameras WHERE name = ?", (name,)).rowcount:
+                raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
+        self._known = None
+
+    def _records(self) -> dict[str, CameraRecord]:
+        if (known := self._known) is None:
+            with self._lock, self._reading() as connection:
+                known = self._known = _read(connection)
+        return known
+
+
+def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
+    return {
+        name: CameraRecord(name=name, mask=None if mask is None else Mask.model_validate_json(mask), updated_at=moment)
+        for name, mask, moment in connection.execute("SELECT name, mask, updated_at FROM cameras")
+    }

@@ -1,0 +1,33 @@
+"""What SQLite says of the segment files."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass
+
+from core.storage.descriptors import Layout
+from core.storage.disk import Damage
+
+
+@dataclass(frozen=True)
+class NamedSegment:
+    """What SQLite says of a segment file."""
+
+    number: int
+    rows: int
+    checksum: int
+
+
+def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[NamedSegment]:
+    """The segments in order.
+
+    Raises:
+        Damage: one is missing, or one that is not the last is not full.
+    """
+    query = "SELECT number, rows, checksum FROM segments ORDER BY number"
+    found = [NamedSegment(*row) for row in connection.execute(query).fetchall()]
+    for position, segment in enumerate(found):
+        full, last = segment.rows == layout.rows_per_segment, position == len(found) - 1
+        if segment.number != position or segment.rows > layout.rows_per_segment or not (full or last):
+            raise Damage(f"map.sqlite: segment {position + 1} is not as long as it must be")
+    return found

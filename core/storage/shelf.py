@@ -1,0 +1,144 @@
+"""Rows read from the segment files when they are wanted, each checked as it is read.
+
+A map whose codes are in memory keeps its descriptors here only.  They are read by position and not through memory maps,
+although only the pages that are touched are read either way: a file that was cut under us is then damage with a name,
+not the end of the process, and what the system keeps of the files counts as its cache, not as our memory.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.storage.descriptors import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
+from core.storage.disk import Damage
+from core.storage.resting import FULL, Local, inner_products
+
+Rows = NDArray[np.int64]
+Checksums = NDArray[np.uint32]
+"""Of rows, as SQLite names them; 0 for rows that no place names."""
+
+
+class Shelf:
+    """The records of a map.  Any thread may read; rows behind those that are acknowledged are the caller's to avoid.
+
+    Every method that reads may raise Damage (a file is missing, short, or a row fails its checksum or is not the one
+    named) and OSError (the disk refuses).
+    """
+
+    def __init__(self, folder: Path, layout: Layout) -> None:
+        """Of the map in ``folder``; no file is opened yet."""
+        self._folder = folder
+        self._layout = layout
+        record = layout.record
+        assert record.fields is not None
+        offsets = {name: described[1] for name, described in record.fields.items()}
+        # In version 3 descriptor, sums and local descriptors follow one another, and each end is read with the sums.
+        is_split = layout.precision != FULL
+        self._first = self._part(0, offsets["local"]) if is_split else self._part(0, record.itemsize)
+        self._last = self._part(offsets["row"] if is_split else 0, record.itemsize)
+
+    def _part(self, start: int, stop: int) -> tuple[int, np.dtype[np.void]]:
+        """The fields of a record that lie within bytes start … stop of it."""
+        record = self._layout.record
+        assert record.fields is not None and record.names is not None
+        chosen = [name for name in record.names if start <= record.fields[name][1] < stop]
+        fields = {
+            "names": chosen,
+            "formats": [record.fields[name][0] for name in chosen],
+            "offsets": [record.fields[name][1] - start for name in chosen],
+            "itemsize": stop - start,
+        }
+        return start, np.dtype(fields)  # type: ignore[call-overload]
+
+    def check(self, number: int, rows: int) -> None:
+        """Is the file of a segment there, with its header, and long enough for so many rows?"""
+        with self._opened(number) as file:
+            check_header(self._folder / segment_name(number), os.pread(file, HEADER_BYTES, 0), self._layout, number)
+            found = (os.fstat(file).st_size - HEADER_BYTES) // self._layout.record.itemsize
+            if found < rows:
+                raise Damage(f"{segment_name(number)}: the file ends after {found} of {rows} rows")
+
+    def descriptors(self, rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D]."""
+        return self._layout.descriptors_of(self._first_parts(rows, checksums))
+
+    def inner_products(self, queries: NDArray[np.float32], rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
+        """Of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
+        kept = self._first_parts(rows, checksums)["descriptor"]
+        return inner_products(queries, kept, self._layout.precision)
+
+    def locals(self, rows: Rows, checksums: Checksums) -> Local:
+        """The local descriptors of rows: int8 [k, C, L]."""
+        if self._layout.local_shape == NO_LOCAL:
+            return np.empty((len(rows), *NO_LOCAL), np.int8)
+        start, dtype = self._last
+        found = self._read(rows, start, dtype)
+        for position, row in enumerate(rows.tolist()):
+            self._check(found[position], row, int(checksums[position]), "local")
+        return self._layout.locals_of(found)
+
+    def _first_parts(self, rows: Rows, checksums: Checksums) -> NDArray[np.void]:
+        start, dtype = self._first
+        found = self._read(rows, start, dtype)
+        for position, row in enumerate(rows.tolist()):
+            self._check(found[position], row, int(checksums[position]), "descriptor")
+        return found
+
+    def _check(self, part: np.void, row: int, named: int, name: str) -> None:
+        """Is it that of ``row``, whole, and of the frame that SQLite names?"""
+        where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
+        if self._layout.precision == FULL:
+            sound = self._layout.is_sound(part, row)
+        else:
+            sums = int(part["of_descriptor"]), int(part["of_local"])
+            content = zlib.crc32(np.ascontiguousarray(part[name]).data)
+            own = sums[0] if name == "descriptor" else sums[1]
+            sound = (
+                int(part["row"]) == row
+                and zlib.crc32(struct.pack("<Q", row), content) == own
+                and zlib.crc32(struct.pack("<II", *sums)) == int(part["checksum"])
+            )
+        if not sound:
+            raise Damage(f"{where} does not match its checksum")
+        if named and named != int(part["checksum"]):
+            raise Damage(f"{where} is of another frame")
+
+    def _read(self, rows: Rows, start: int, dtype: np.dtype[Any]) -> NDArray[np.void]:
+        """Bytes start … of the records of rows, in the order of the rows."""
+        layout, order = self._layout, np.argsort(rows, kind="stable").tolist()
+        found = np.empty(len(rows), dtype)
+        whole = found.view(np.uint8).reshape(len(rows), dtype.itemsize)
+        places = [(position, *divmod(int(rows[position]), layout.rows_per_segment)) for position in order]
+        for number, group in groupby(places, key=lambda place: place[1]):
+            stride = layout.record.itemsize
+            wanted = [(position, HEADER_BYTES + offset * stride + start) for position, _, offset in group]
+            with self._opened(number) as file:
+                for _, at in wanted:  # the disk may fetch all of them at once
+                    os.posix_fadvise(file, at, dtype.itemsize, os.POSIX_FADV_WILLNEED)
+                for position, at in wanted:
+                    if os.preadv(file, [whole[position].data], at) < dtype.itemsize:
+                        row = int(rows[position])
+                        raise Damage(f"{segment_name(number)}: the file ends before row {row}")
+        return found
+
+    @contextmanager
+    def _opened(self, number: int) -> Iterator[int]:
+        path = self._folder / segment_name(number)
+        try:
+            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError as error:
+            raise Damage(f"{path.name}: the file is missing") from error
+        try:
+            yield file
+        finally:
+            os.close(file)

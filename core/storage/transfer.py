@@ -1,0 +1,144 @@
+"""Places from one map to another, with all that is kept of them, and the removal of many at once."""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from core.errors import StorageFailure
+from core.places import Place
+from core.storage import ledger
+from core.storage.cameras import Access
+from core.storage.records import Enrolment, History, Keep
+from core.storage.writing import Write
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A place in brief: enough to see whether two maps hold the same.
+
+    number: grows in the order of enrolment.
+    row: of its descriptor.
+    digest: SHA-256 of its image.
+    ordinal: its order in its sequence.
+    """
+
+    number: int
+    id: str
+    row: int
+    digest: bytes
+    picture: Keep
+    camera: str | None
+    sequence: str | None
+    ordinal: int
+    updated_at: str
+
+    def same_as(self, other: Outline) -> bool:
+        """Whether the two tell of the same place in the same state, in whatever maps."""
+        return self.same_frame(other) and (self.sequence, self.ordinal, self.updated_at) == (
+            other.sequence,
+            other.ordinal,
+            other.updated_at,
+        )
+
+    def same_frame(self, other: Outline) -> bool:
+        """Whether both were encoded from the same bytes under the same camera's mask."""
+        return (self.id, self.digest, self.camera) == (other.id, other.digest, other.camera)
+
+
+_OUTLINE = (
+    "SELECT p.number, p.id, p.row, p.digest, p.picture, p.camera, s.name, p.ordinal, p.updated_at"
+    " FROM places p JOIN sequences s ON s.code = p.sequence ORDER BY p.number"
+)
+
+
+class Transfer:
+    """What a map gives to another and takes from it; from any thread.
+
+    Args:
+        reading, writing: give a connection to the map's database and a write to the map.  What both raise is
+            raised here.
+        lock: that of the one who writes.
+    """
+
+    def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write], lock: threading.RLock) -> None:
+        self._reading, self._writing, self._lock = reading, writing, lock
+
+    def outline(self) -> list[Outline]:
+        """All places in the order of their enrolment."""
+        with self._reading() as connection:
+            return [Outline(*values) for values in connection.execute(_OUTLINE).fetchall()]
+
+    def count_without_image(self) -> int:
+        """How many places keep no image."""
+        with self._reading() as connection:
+            (count,) = connection.execute("SELECT count(*) FROM places WHERE picture != 'image'").fetchone()
+        return int(count)
+
+    def sequence_ends(self) -> dict[str | None, int]:
+        """The ordinal that the next place of each sequence would get; None for the places without one."""
+        with self._reading() as connection:
+            return dict(connection.execute("SELECT name, next_ordinal FROM sequences").fetchall())
+
+    def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
+        """Those of the places that there are, each with the row of its descriptor."""
+        with self._reading() as connection:
+            found = [ledger.find(connection, place_id) for place_id in place_ids]
+        return {stored.place.id: (stored.place, stored.row) for stored in found if stored is not None}
+
+    def picture(self, place_id: str) -> bytes | None:
+        """What is kept of a place's frame, as its ``picture`` says; None if it is gone or keeps none.
+
+        Raises:
+            StorageFailure: it is damaged.
+        """
+        with self._reading() as connection:
+            stored = ledger.find(connection, place_id)
+            kept = None if stored is None else ledger.picture(connection, stored.number)
+        if kept is None:
+            return None
+        if hashlib.sha256(kept[0]).digest() != kept[1]:
+            raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
+        return kept[0]
+
+    def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
+        """Take places of another map, all of them or, if this raises, none.
+
+        Raises:
+            ValueError: descriptors of the wrong kind.
+            InvalidField, StorageFull, StorageFailure.
+        """
+        if items:
+            with self._writing() as write:
+                for item, history in items:
+                    write.adopt(item, history)
+
+    def forget(self, frames: Mapping[str, bytes]) -> int:
+        """Delete places, all in one COMMIT; those that are gone or show another frame by now are left alone.
+
+        Args:
+            frames: SHA-256 of its image by the id of each place.
+
+        Returns:
+            How many were deleted.
+        """
+        if not frames:
+            return 0
+        count = 0
+        with self._writing() as write:
+            for place_id, digest in frames.items():
+                stored = ledger.find(write.connection, place_id)
+                if stored is not None and stored.digest == digest:
+                    write.forget(stored)
+                    count += 1
+        return count
+
+    @contextmanager
+    def quiet(self) -> Iterator[None]:
+        """No other thread writes to the map within."""
+        with self._lock:
+            yield

@@ -1,0 +1,146 @@
+"""Places from one map to another: with all that is kept of them, all or none."""
+
+from __future__ import annotations
+
+import threading
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.errors import StorageFailure
+from core.places import PlaceFields
+from core.storage import Atlas, Enrolment, History, Map, MapSettings
+from core.storage.transfer import Outline
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
+
+EARLIER = datetime(2026, 1, 2, 3, 4, 5, 678, tzinfo=UTC)
+LATER = datetime(2026, 2, 3, tzinfo=UTC)
+
+
+@pytest.fixture
+def hall(atlas: Atlas) -> Map:
+    return atlas.create("hall", ENCODER, DIMENSION, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
+
+
+def history(ordinal: int | None = None, picture: str = "none") -> History:
+    return History(picture, ordinal, EARLIER, LATER)  # type: ignore[arg-type]
+
+
+def test_a_place_comes_with_its_history(lab: Map, hall: Map) -> None:
+    item = frame("a", x=3.0, sequence="monday", metadata={"n": 1})
+    item = Enrolment(item.id, item.fields, item.descriptor, 7, item.digest, item.local, thumbnail=b"small")
+    hall.transfer.adopt([(item, history(41, "thumbnail"))])
+    place = hall.place("a")
+    assert (place.created_at, place.updated_at, place.regions) == (EARLIER, LATER, 7)
+    assert place.picture == "thumbnail", "although this map keeps none of its own"
+    assert hall.transfer.picture("a") == b"small"
+    (outline,) = hall.transfer.outline()
+    assert (outline.id, outline.sequence, outline.ordinal, outline.digest) == ("a", "monday", 41, item.digest)
+    assert hall.snapshot().whereabouts.ordinal.tolist() == [41]
+    assert hall.transfer.sequence_ends()["monday"] == 42
+    hall.enrol([frame("b", sequence="monday")])
+    assert hall.snapshot().whereabouts.ordinal.tolist() == [41, 42], "the next one comes behind"
+    assert hall.verify().ok
+
+
+def test_what_is_searched_is_what_is_stored(atlas: Atlas, directory: Path, hall: Map) -> None:
+    items = [(frame(name, x=float(n), sequence="monday"), history(n * 10)) for n, name in enumerate("abcdefg")]
+    hall.transfer.adopt(items)
+    before = hall.snapshot().whereabouts
+    assert before.ordinal.tolist() == [0, 10, 20, 30, 40, 50, 60]
+    assert hall.verify().ok
+    atlas.close()
+    again = Atlas(directory)
+    after = again.get("hall").snapshot().whereabouts
+    assert np.array_equal(after.ordinal, before.ordinal) and np.array_equal(after.position, before.position)
+    again.close()
+
+
+def test_the_same_frame_again_only_takes_fields_and_history(hall: Map) -> None:
+    hall.transfer.adopt([(frame("a", sequence="monday"), history(5))])
+    nothing = np.empty(0, np.float32)
+    moved = Enrolment("a", PlaceFields(sequence="tuesday"), nothing, 0, digest_of("a"))
+    hall.transfer.adopt([(moved, history(9))])
+    (place,) = hall.transfer.outline()
+    assert (place.row, place.sequence, place.ordinal) == (0, "tuesday", 9)
+    assert hall.snapshot().whereabouts.ordinal.tolist() == [9]
+    assert hall.verify().ok
+
+
+def test_all_or_none(hall: Map) -> None:
+    bad = Enrolment(
+        "b", PlaceFields(metadata={"x": float("nan")}), frame("b").descriptor, 1, digest_of("b"), frame("b").local
+    )
+    with pytest.raises(Exception, match="JSON"):
+        hall.transfer.adopt([(frame("a"), history()), (bad, history())])
+    assert hall.transfer.outline() == [] and len(hall.snapshot()) == 0
+    assert hall.verify().ok
+
+
+def test_two_states_of_a_place_are_told_apart() -> None:
+    one = Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2026")
+    assert one.same_as(Outline(9, "a", 7, b"d", "none", None, "monday", 3, "2026")), "numbers and rows are a map's own"
+    for other in (
+        Outline(1, "a", 0, b"e", "image", None, "monday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", "front", "monday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "tuesday", 3, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "monday", 4, "2026"),
+        Outline(1, "a", 0, b"d", "image", None, "monday", 3, "2027"),
+    ):
+        assert not one.same_as(other)
+
+
+def test_many_are_forgotten_at_once_but_not_what_changed(lab: Map) -> None:
+    lab.enrol([frame(name, sequence="monday") for name in "abcde"])
+    listed = {place.id: place.digest for place in lab.transfer.outline()}
+    lab.enrol([frame("c", "another picture")])
+    lab.forget("d")
+    assert lab.transfer.forget(listed) == 3
+    assert [place.id for place in lab.transfer.outline()] == ["c"]
+    assert lab.transfer.forget({}) == lab.transfer.forget(listed) == 0
+    assert len(lab.snapshot()) == 1 and lab.verify().ok
+
+
+def test_what_a_map_can_tell(lab: Map) -> None:
+    keeping = lab.edit({"keep": "image"})
+    assert keeping.keep == "image"
+    item = frame("a")
+    content = b"the very bytes"
+    for name, image in (("a", content), ("b", None)):
+        lab.enrol([Enrolment(name, item.fields, item.descriptor, 1, item.digest, item.local, image=image)])
+    assert lab.transfer.count_without_image() == 1
+    assert lab.transfer.picture("a") == content and lab.transfer.picture("none") is None
+    found = lab.transfer.find(["a", "none", "b"])
+    assert {name: row for name, (_, row) in found.items()} == {"a": 0, "b": 1}
+
+
+def test_a_damaged_picture_is_not_given_on(atlas: Atlas, directory: Path, lab: Map) -> None:
+    import sqlite3
+
+    item = frame("a")
+    lab.enrol([Enrolment("a", item.fields, item.descriptor, 1, item.digest, item.local, thumbnail=b"small")])
+    connection = sqlite3.connect(directory / "maps" / "lab" / "map.sqlite")
+    with connection:
+        connection.execute("UPDATE pictures SET bytes = x'00'")
+    connection.close()
+    with pytest.raises(StorageFailure, match="damaged"):
+        lab.transfer.picture("a")
+
+
+def test_nobody_writes_in_the_quiet(lab: Map) -> None:
+    done = threading.Event()
+
+    def write() -> None:
+        lab.enrol([frame("b")])
+        done.set()
+
+    with lab.transfer.quiet():
+        writer = threading.Thread(target=write)
+        writer.start()
+        assert not done.wait(0.2)
+        lab.enrol([frame("a")])  # but the one who asked for it
+    assert done.wait(10)
+    writer.join()
+    assert [place.id for place in lab.transfer.outline()] == ["a", "b"]

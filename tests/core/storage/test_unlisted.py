@@ -1,0 +1,102 @@
+"""A map that is being made: nobody meets it before it is published, and a restart finds it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from core.errors import MapExists, StorageFailure, UnknownMap
+from core.storage import Atlas, Map
+from core.storage.opening import UNLISTED
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+
+
+def making(atlas: Atlas, map_id: str = "new") -> Map:
+    return atlas.create(map_id, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE, unlisted=True)
+
+
+def test_it_is_found_by_nobody_who_does_not_make_it(atlas: Atlas) -> None:
+    made = making(atlas)
+    made.enrol([frame("a")])
+    assert atlas.unlisted() == {"new": made}
+    assert atlas.records(None, 10) == ([], None) and atlas.quarantined() == {}
+    for action in (atlas.get, atlas.find, atlas.delete, atlas.verify):
+        with pytest.raises(UnknownMap):
+            action("new")
+
+
+def test_its_name_is_taken(atlas: Atlas, lab: Map) -> None:
+    making(atlas)
+    for unlisted in (True, False):
+        for name in ("new", "lab"):
+            with pytest.raises(MapExists):
+                atlas.create(name, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE, unlisted=unlisted)
+
+
+def test_publishing_lists_it_whole(atlas: Atlas, directory: Path) -> None:
+    made = making(atlas)
+    made.enrol([frame(name) for name in "abcdef"])
+    listed = atlas.publish("new")
+    assert atlas.get("new") is listed and atlas.unlisted() == {}
+    assert len(listed.snapshot()) == listed.count_places() == 6
+    rows, _ = listed.snapshot().search(descriptor_of("d"))
+    assert listed.places_at([int(rows[0])])[0] == listed.place("d")
+    assert listed.verify().ok
+    with pytest.raises(StorageFailure):
+        made.enrol([frame("z")])  # the one that was handed in is closed
+    with pytest.raises(UnknownMap):
+        atlas.publish("new")
+    assert os.listdir(directory / "maps") == ["new"]
+
+
+def test_a_restart_finds_it_as_it_was(atlas: Atlas, directory: Path) -> None:
+    making(atlas).enrol([frame("a")])
+    atlas.close()
+    again = Atlas(directory)
+    try:
+        assert again.records(None, 10) == ([], None)
+        (found,) = again.unlisted().values()
+        found.open()
+        found.enrol([frame("b")])
+        assert len(again.publish("new").snapshot()) == 2
+    finally:
+        again.close()
+
+
+def test_abandoning_leaves_nothing(atlas: Atlas, directory: Path) -> None:
+    made = making(atlas)
+    made.enrol([frame("a")])
+    atlas.abandon("new")
+    assert atlas.unlisted() == {} and os.listdir(directory / "maps") == []
+    with pytest.raises(UnknownMap):
+        made.enrol([frame("b")])
+    atlas.abandon("new")
+    atlas.create("new", ENCODER, DIMENSION)
+
+
+def test_one_that_a_crash_has_damaged_is_removed(atlas: Atlas, directory: Path) -> None:
+    making(atlas)
+    atlas.close()
+    (directory / "maps" / f"{UNLISTED}new" / "map.sqlite").write_bytes(b"torn" * 1000)
+    again = Atlas(directory)
+    assert again.unlisted() == {} and again.quarantined() == {}
+    assert os.listdir(directory / "maps") == []
+    again.close()
+
+
+def test_a_name_that_cannot_be_given_leaves_it_unlisted(
+    atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    making(atlas).enrol([frame("a")])
+
+    def refuse(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "rename", refuse)
+        with pytest.raises(StorageFailure):
+            atlas.publish("new")
+    assert list(atlas.unlisted()) == ["new"] and atlas.records(None, 10) == ([], None)
+    assert len(atlas.publish("new").snapshot()) == 1
