@@ -1,9 +1,10 @@
-"""A threshold and a margin for an encoder of one's own, from frames kept out of its training.
+"""A curve, a threshold and a margin for an encoder of one's own, from frames kept out of its training.
 
 Every frame held out is a query twice.  As it is, against the frames that are not its neighbours: a
 place that the map does not have.  And as a *second look*, disturbed, against all of them: a place
-that it has.  Real second visits differ by more than a disturbance, so this is a start: the packaged
-encoders are calibrated on real ones, and a map of importance deserves a calibration of its own.
+that it has.  Real second visits differ by more than a disturbance, so the probabilities are too
+high, and this is a start: the packaged encoders are calibrated on real ones, and a map of importance deserves a
+calibration of its own (``recalibration.py``).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.preprocessing import Pixels
+from core.probability import fit_curve
 from core.verdict import Calibration, Judgement, Neighborhood, Whereabouts, judge
 
 Scores = NDArray[np.float32]
@@ -36,7 +38,7 @@ def second_look(pixels: Pixels) -> Pixels:
 
 
 def calibrate(unknown: Scores, known: Scores, neighbours: int, source: str) -> Calibration:
-    """Background, threshold and margin from n frames in the order in which they were taken.
+    """Background, curve, threshold and margin from n frames in the order in which they were taken.
 
     Args:
         unknown: float32 [n, n], the scores of the frames among themselves.
@@ -59,6 +61,8 @@ def calibrate(unknown: Scores, known: Scores, neighbours: int, source: str) -> C
         margin=0.0,
         background_mean=float(unrelated.mean()),
         background_deviation=max(SMALLEST_DEVIATION, float(unrelated.std())),
+        decision="leading",
+        frames=n,
     )
     same_place = Neighborhood(radius=0.0, frames=neighbours)
     strangers = [_judge(unknown[i], np.flatnonzero(apart[i]), start, same_place) for i in range(n) if apart[i].any()]
@@ -66,10 +70,18 @@ def calibrate(unknown: Scores, known: Scores, neighbours: int, source: str) -> C
     # What equals the threshold passes, so it lies just above the last one to be kept out.
     threshold = float(np.nextafter(np.quantile(decisions, 1 - FALSE_ACCEPTS, method="higher"), np.inf))
 
-    right = [_judge(known[i], index, start, same_place) for i in range(n) if np.argmax(known[i]) == i]
+    looks = [_judge(known[i], index, start, same_place) for i in range(n)]
+    found = [bool(np.argmax(known[i]) == i) for i in range(n)]
+    right = [look for look, hit in zip(looks, found, strict=True) if hit]
     margins = [r.margin for r in right if r.margin is not None and r.decision is not None and r.decision >= threshold]
     margin = max(0.0, float(np.quantile(margins, LOST_BY_MARGIN))) if margins else 0.0
-    return start.model_copy(update={"threshold": threshold, "margin": margin})
+    outcomes = [(decision, False) for decision in decisions.tolist()]
+    outcomes += [(look.decision, hit) for look, hit in zip(looks, found, strict=True) if look.decision is not None]
+    try:
+        curve = fit_curve([decision for decision, _ in outcomes], [hit for _, hit in outcomes])
+    except ValueError:  # frames that are all alike: no probability can be told
+        curve = None
+    return start.model_copy(update={"threshold": threshold, "margin": margin, "curve": curve})
 
 
 def _judge(

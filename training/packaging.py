@@ -25,9 +25,10 @@ from core.features import FeatureExtractor
 from core.network import ShallowNetwork, save_network
 from core.preprocessing import Pixels
 from core.presets import NETWORK, PRESETS
+from core.trials import Trials
 from core.verdict import Calibration
 from core.vocabulary import Vocabulary, pool_features, train_vocabulary
-from training.calibration import Trials, camera_trials, choose, rates, walk_trials
+from training.calibration import camera_trials, choose, rates, walk_trials, worth
 from training.photographs import read, split_photographs
 from training.projection import fit_projections
 from training.student import student_definition
@@ -50,7 +51,7 @@ Array = NDArray[np.float32]
 
 VOCABULARY_IMAGES = 2600  # as many as the thesis pools for its vocabularies
 UNCALIBRATED = Calibration(
-    source="encoder-default", threshold=0, margin=0, background_mean=0.0, background_deviation=1.0
+    source="encoder-default", threshold=0, margin=0, background_mean=0.0, background_deviation=1.0, decision="leading"
 )
 
 
@@ -136,6 +137,8 @@ def assess(encoder: Encoder, tasks: Tasks) -> tuple[Calibration, dict[str, Any]]
         "lip6_recall_at_1": float(tasks.lip6.truth[np.arange(len(best)), best].mean()),
         "lip6_recall_at_1_as_stated": float(tasks.lip6_as_stated.truth[np.arange(len(best)), best].mean()),
         "verdicts": {name: rates(outcome, calibration) for name, outcome in outcomes.items()},
+        "probabilities": {name: worth(outcome, calibration) for name, outcome in outcomes.items()},
+        "unseen": {name: _unseen(name, outcomes, start) for name in outcomes},
         "decision_auc_roc": {
             name: auc_roc(outcome.decision, outcome.known & outcome.right) for name, outcome in outcomes.items()
         },
@@ -143,6 +146,12 @@ def assess(encoder: Encoder, tasks: Tasks) -> tuple[Calibration, dict[str, Any]]
     for name, (task, among, apart) in cameras.items():
         figures[f"{name}_recall_at_1"] = camera_recall(task, among, apart)
     return calibration, figures
+
+
+def _unseen(name: str, outcomes: dict[str, Trials], start: Calibration) -> dict[str, float]:
+    """What the calibration of the other kinds of maps does on the one named."""
+    calibration = choose([outcome for other, outcome in outcomes.items() if other != name], start)
+    return {**rates(outcomes[name], calibration), **worth(outcomes[name], calibration)}
 
 
 def background(encoder: Encoder, frames: Shown, unrelated: Shown) -> dict[str, float]:

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field
 
 from core.evaluation.outcomes import Outcome, answerable
 from core.evaluation.thresholds import Thresholding, best_wrong_score, thresholdings
+from core.evaluation.trust import Trust
 
 STAGES = ("forward", "regions", "vlad", "match")
 DEPTHS = (1, 5, 10)
@@ -52,6 +53,12 @@ class Evaluation(BaseModel):
         default=None, description="Median per query, all stages before matching, without decoding the picture."
     )
     trained_on: str | None = None
+    ece: float | None = Field(default=None, description="Expected calibration error of the probabilities in `trust`.")
+    brier: float | None = Field(default=None, description="Their Brier score.")
+    brier_of_base_rate: float | None = Field(
+        default=None, description="That of always stating the share of right ones."
+    )
+    trust: Trust | None = Field(default=None, description="Whether the system knows when it is right.")
     notes: dict[str, str] = Field(description="Why a figure cannot be told, by its name.")
 
 

@@ -13,6 +13,7 @@ from core.evaluation.comparison import Run
 from core.evaluation.figures import STAGES, summarize
 from core.evaluation.outcomes import judge
 from core.evaluation.subjects import Described, Subject
+from core.evaluation.trust import trust_figures
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,8 @@ def run(subject: Subject, cache: EvaluationCache) -> Run:
         bytes_per_place=measurement.bytes_per_place,
         trained_on=subject.trained_on,
     )
+    trusted = trust_figures(measurement.scores, subject.pair.kept, outcomes, evaluation.notes)
+    evaluation = evaluation.model_copy(update=trusted)
     return Run(
         about=subject.about,
         identity=measurement.identity,

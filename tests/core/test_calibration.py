@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.calibration import calibrate, second_look
-from core.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.verdict import Calibration, Judgement, Neighborhood, Whereabouts, judge
 
 N = 60
 
@@ -37,10 +37,15 @@ def test_the_background_is_that_of_frames_that_are_apart() -> None:
 
 def verdict_on(scores: NDArray[np.float32], places: NDArray[np.intp], calibration: Calibration) -> str:
     """Of one query against a map of the frames ``places``."""
+    return judged(scores, places, calibration).verdict
+
+
+def judged(scores: NDArray[np.float32], places: NDArray[np.intp], calibration: Calibration) -> Judgement:
+    """The same in full."""
     order = places[np.argsort(-scores[places], kind="stable")]
     n = len(order)
     frames = Whereabouts(np.zeros(n, np.int8), np.zeros((n, 3)), np.zeros(n, np.int32), order)
-    return judge(scores[order], frames, calibration, Neighborhood(radius=0.0, frames=2)).verdict
+    return judge(scores[order], frames, calibration, Neighborhood(radius=0.0, frames=2))
 
 
 def test_few_strangers_are_recognized_and_all_second_looks() -> None:
@@ -77,3 +82,14 @@ def test_a_second_look_is_another_picture_of_the_same_size(shape: tuple[int, int
     assert again.shape == shape
     assert again.dtype == np.uint8
     assert again.mean() < pixels.mean()
+
+
+def test_the_curve_is_sure_of_second_looks_and_not_of_strangers() -> None:
+    unknown, known = made_up()
+    made = calibrate(unknown, known, 2, "encoder-default")
+    assert made.curve is not None
+    assert (made.decision, made.frames) == ("leading", N)
+    looks = [judged(known[i], np.arange(N), made).probability for i in range(N)]
+    strangers = [judged(unknown[i], np.flatnonzero(np.abs(np.arange(N) - i) > 2), made).probability for i in range(N)]
+    assert np.median(np.array(looks, float)) > 0.9
+    assert np.median(np.array(strangers, float)) < 0.1

@@ -11,7 +11,7 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, PACKAGED, EncoderCatalogue, save_encoder
+from core.encoders import DEFAULT_ENCODER, PACKAGED, EncoderCatalogue, save_calibration, save_encoder
 from core.errors import InvalidModel, UnknownEncoder
 from core.presets import NETWORK, PRESETS
 from core.vocabulary import Vocabulary
@@ -127,3 +127,26 @@ def test_a_renamed_file_is_refused(tmp_path: Path, packaged: Encoder) -> None:
     shutil.move(path, tmp_path / "second.encoder.safetensors")
     with pytest.raises(InvalidModel, match="named as its encoder"):
         EncoderCatalogue(tmp_path).get("second")
+
+
+def test_another_calibration_changes_nothing_else_of_a_file(tmp_path: Path, packaged: Encoder) -> None:
+    path = install(tmp_path, packaged, "mine")
+    before = EncoderCatalogue(tmp_path).get("mine")
+    calibration = packaged.calibration.model_copy(update={"threshold": 0.5, "frames": 7})
+    save_calibration(path, calibration)
+    after = EncoderCatalogue(tmp_path).get("mine")
+    assert after.calibration == calibration
+    assert after.identity == before.identity
+    after.check_golden()
+    (tmp_path / "broken.encoder.safetensors").write_bytes(b"nothing")
+    with pytest.raises(InvalidModel):
+        save_calibration(tmp_path / "broken.encoder.safetensors", calibration)
+
+
+def test_the_packaged_encoders_tell_probabilities() -> None:
+    for summary in EncoderCatalogue().describe():
+        assert summary.calibration is not None and summary.calibration.curve is not None
+        assert summary.calibration.decision == "leading"
+        # At the threshold an answer is about as likely right as wrong, and far above it nearly certain.
+        assert 0.2 < summary.calibration.curve.probability(summary.calibration.threshold) < 0.8
+        assert summary.calibration.curve.probability(4 * summary.calibration.threshold) > 0.95

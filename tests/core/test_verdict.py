@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.places import Pose
-from core.verdict import GEOGRAPHIC, METRIC, NO_POSE, Calibration, Neighborhood, Whereabouts, judge, standing_out
+from core.probability import Curve
+from core.verdict import (
+    GEOGRAPHIC,
+    METRIC,
+    NO_POSE,
+    Calibration,
+    Neighborhood,
+    Whereabouts,
+    completed,
+    judge,
+    probability_of,
+    standing_out,
+)
 
 CALIBRATION = Calibration(
     source="encoder-default", threshold=2.0, margin=0.01, background_mean=0.02, background_deviation=0.01
@@ -128,3 +144,72 @@ def test_a_twin_of_the_best_place_leaves_it_ambiguous_and_not_unknown() -> None:
     places = in_sequence(12, [20 * n for n in range(12)])
     calibration = CALIBRATION.model_copy(update={"threshold": 0.4, "margin": 0.02})
     assert judge(falling(0.6, 0.6, *rest), places, calibration, NEARBY, examined=30).verdict == "ambiguous"
+
+
+CURVED = Calibration(
+    source="x",
+    threshold=0.2,
+    margin=0.02,
+    background_mean=0.02,
+    background_deviation=0.01,
+    curve=Curve(slope=20, intercept=-4),
+    decision="leading",
+)
+
+
+def test_a_calibration_stored_before_there_were_curves_loads_and_judges_as_before() -> None:
+    stored = {"source": "manual", "threshold": 2, "margin": 0.01, "background_mean": 0.02, "background_deviation": 0.01}
+    old = Calibration.model_validate_json(json.dumps(stored))
+    assert old == CALIBRATION.model_copy(update={"source": "manual"})
+    rest = [0.03 - 0.0001 * i for i in range(60)]
+    judgement = judge(falling(0.5, *rest), in_sequence(61), old, Neighborhood(5, 0))
+    assert judgement.decision == pytest.approx(standing_out(0.5, falling(*rest), old))
+    assert judgement.probability is None
+
+
+def test_the_probability_is_that_of_the_curve_and_half_of_it_for_twins() -> None:
+    rest = [0.1] * 20
+    alone = judge(falling(0.6, *rest), in_sequence(21), CURVED, Neighborhood(5, 0))
+    assert alone.decision is not None and CURVED.curve is not None
+    assert alone.probability == pytest.approx(CURVED.curve.probability(alone.decision))
+    twins = judge(falling(0.6, 0.6, *rest), in_sequence(22), CURVED, Neighborhood(5, 0))
+    assert twins.decision is not None
+    assert twins.verdict == "ambiguous"
+    assert twins.probability == pytest.approx(CURVED.curve.probability(twins.decision) / 2)
+
+
+@given(st.floats(0, 2), st.floats(0, 0.1), st.floats(0, 2), st.floats(0, 0.1))
+def test_a_better_answer_is_never_less_probable(a: float, b: float, more: float, further: float) -> None:
+    less, better = probability_of(a, b, CURVED), probability_of(a + more, b + further, CURVED)
+    assert less is not None and better is not None
+    assert 0 < less <= better < 1
+
+
+def test_the_best_part_of_a_ranking_says_the_same_as_all_of_it() -> None:
+    """An index that returns its hundred best changes neither decision nor verdict, with one stage or two."""
+    scores = np.sort(np.random.default_rng(0).normal(0.05, 0.02, 5000).astype(np.float32))[::-1]
+    scores[0] = 0.5
+    places = in_sequence(5000, [10 * n for n in range(5000)])
+    for examined in (0, 30):
+        whole = judge(scores, places, CURVED, NEARBY, examined)
+        assert judge(scores[:100], places.take(np.arange(100)), CURVED, NEARBY, examined) == whole
+        assert whole.verdict == "recognized"
+
+
+def test_which_places_were_examined_may_be_said_one_by_one() -> None:
+    scores, places = falling(0.6, 0.5, 0.2, 0.1), in_sequence(4, [0, 10, 20, 30])
+    mask = np.array([True, False, True, True])
+    judgement = judge(scores, places, CURVED, NEARBY, mask)
+    expected = judge(falling(0.6, 0.2, 0.1), in_sequence(3, [0, 20, 30]), CURVED, NEARBY, 3)
+    assert judgement.decision == pytest.approx(expected.decision)
+    assert judgement.margin == pytest.approx(0.1)
+
+
+def test_a_map_calibrated_before_there_were_curves_borrows_the_encoders() -> None:
+    old = CALIBRATION.model_copy(update={"source": "manual", "threshold": 0.3})
+    assert completed(None, CURVED, second_stage=True) == CURVED
+    borrowed = completed(old, CURVED, second_stage=True)
+    assert (borrowed.threshold, borrowed.source, borrowed.curve) == (0.3, "manual", CURVED.curve)
+    assert completed(old, CURVED, second_stage=False) == old, "its decision values are in other units"
+    own = CURVED.model_copy(update={"curve": Curve(slope=1, intercept=0)})
+    assert completed(own, CURVED, second_stage=True) == own

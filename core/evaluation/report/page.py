@@ -12,6 +12,7 @@ from core.evaluation.report.curves import plot_pr, plot_recall, plot_roc
 from core.evaluation.report.drawing import Plot
 from core.evaluation.report.folder import write_files
 from core.evaluation.report.pictures import Pictures
+from core.evaluation.report.reliability import plot_reliability, trust_table
 from core.evaluation.report.style import script, stylesheet
 from core.evaluation.report.table import figures_table, swatch
 from core.evaluation.report.text import counted, enumerate_words, escape, file_stems, number
@@ -152,6 +153,19 @@ def _figures(report: Report) -> str:
     return intro + figures_table(runs, report.cast) + remark
 
 
+def _reliability(report: Report) -> str:
+    runs, cast = report.comparison.runs, report.cast
+    plot = plot_reliability(runs, cast)
+    if plot is None:
+        return ""
+    intro = (
+        "<p>Each best match is given a probability of being right, by a curve fitted on other parts of the traverse. "
+        "Where that is honest, the points lie on the diagonal. The bars are Wilson’s intervals (95 %) of the first "
+        "system; the number before a name is its expected calibration error.</p>"
+    )
+    return intro + report.embed([plot]) + trust_table(runs, cast)
+
+
 def _scalability(report: Report) -> str:
     points = report.comparison.scalability
     if not points:
@@ -188,6 +202,9 @@ TERMS = {
     "R@k": "Share of the queries with a true reference that have one among their k best matches.",
     "R@100 %P": "Share of the queries with a true reference whose right match outscores every wrong match.",
     "EP": "Extended precision: the mean of R@100 %P and of the precision at the lowest recall.",
+    "ECE": "Expected calibration error: by how much probabilities and what came of them differ, on average.",
+    "Brier": "Mean square of probability minus outcome; beside it that of always stating the share of right matches.",
+    "P, R at 95 %": "Precision and recall of the answers whose probability is at least 0.95, with Wilson’s interval.",
     "TP, FP": "Accepted matches that are right, and wrong.",
     "TN, FN": "Rejected queries without a true reference, and with one. Before anything is rejected, TN are the "
     "queries without a true reference.",
@@ -202,6 +219,7 @@ def _terms(report: Report) -> str:
 SECTIONS: tuple[Section, ...] = (
     Section("accuracy", "Accuracy", _accuracy),
     Section("figures", "All figures", _figures),
+    Section("reliability", "Does it know when it is right?", _reliability),
     Section("scalability", "As the map grows", _scalability),
     Section("severity", "As conditions worsen", _severity),
     Section("systems", "System by system", _closeups),

@@ -1,0 +1,97 @@
+"""From a decision value to the probability that the best match is right, and back.
+
+A logistic curve, P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), fitted by maximum likelihood to
+outcomes with known truth (Platt, "Probabilistic outputs for support vector machines", 1999).  Two numbers
+suffice: the decision value is made to mean the same everywhere, so the curve has only to be placed and scaled,
+which few frames can do without following their noise, and it rises everywhere, so that no threshold on the one
+is another order than a threshold on the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+FARTHEST = 35.0
+"""Log odds beyond this are cut: 1 - P would be lost in rounding, and nothing measured is as sure."""
+
+NEWTON_STEPS = 100
+
+
+class Curve(BaseModel):
+    """P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), d a decision value."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by a decision value greater by one.")
+    intercept: float = Field(allow_inf_nan=False, description="Log odds at the decision value 0.")
+
+    def probability(self, decision: float) -> float:
+        """Of one decision value, in (0, 1)."""
+        return float(self.probabilities([decision])[0])
+
+    def probabilities(self, decisions: ArrayLike) -> NDArray[np.float64]:
+        """Of decision values, any shape, each in (0, 1)."""
+        return sigmoid(self.slope * np.asarray(decisions, np.float64) + self.intercept)
+
+    def decision(self, probability: float) -> float:
+        """The decision value of a probability in (0, 1)."""
+        return float((np.log(probability) - np.log1p(-probability) - self.intercept) / self.slope)
+
+
+def sigmoid(log_odds: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1 / (1 + exp(-x)), in (0, 1) for any finite x."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(log_odds, -FARTHEST, FARTHEST))), np.float64)
+
+
+def fit_curve(decisions: ArrayLike, right: ArrayLike, shares: ArrayLike | None = None) -> Curve:
+    """The curve under which the outcomes are most likely.
+
+    Both kinds of outcome are smoothed as Platt does: the targets are (N₊ + 1) / (N₊ + 2) and 1 / (N₋ + 2), as if one
+    more of each kind had been seen, so that outcomes that a threshold separates give a finite slope.
+
+    Args:
+        decisions: [n], decision values.
+        right: bool [n], whether the best match was right.
+        shares: [n], how much each outcome counts, over 0; all alike if left out.
+
+    Raises:
+        ValueError: there is one kind of outcome only, or right answers have no higher decision values than wrong ones.
+    """
+    d, y = np.asarray(decisions, np.float64), np.asarray(right, np.bool_)
+    positive, negative = int(y.sum()), int((~y).sum())
+    if not positive or not negative:
+        raise ValueError("a curve needs right and wrong answers")
+    scale = float(d.std())
+    if scale == 0:
+        raise ValueError("all decision values are the same")
+    counted = np.ones(len(d)) if shares is None else np.asarray(shares, np.float64) * (len(d) / np.sum(shares))
+    targets = np.where(y, (positive + 1) / (positive + 2), 1 / (negative + 2))
+    design = np.stack([(d - d.mean()) / scale, np.ones_like(d)], axis=1)
+    weights = np.array([0.0, np.log((positive + 1) / (negative + 1))])
+    for _ in range(NEWTON_STEPS):
+        p = sigmoid(design @ weights)
+        curvature = (design * (counted * p * (1 - p))[:, None]).T @ design + 1e-9 * np.eye(2)
+        step = np.linalg.solve(curvature, design.T @ (counted * (p - targets)))
+        loss = _loss(design, weights, targets, counted)
+        while _loss(design, weights - step, targets, counted) > loss and np.abs(step).max() > 1e-12:
+            step = step / 2
+        weights = weights - step
+        if np.abs(step).max() < 1e-9:
+            break
+    slope = float(weights[0] / scale)
+    if not slope > 0:
+        raise ValueError("right answers do not have higher decision values than wrong ones")
+    return Curve(slope=slope, intercept=float(weights[1] - slope * d.mean()))
+
+
+def _loss(
+    design: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    counted: NDArray[np.float64],
+) -> float:
+    """The negative logarithm of the likelihood."""
+    odds = design @ weights
+    return float((counted * (np.logaddexp(0, odds) - targets * odds)).sum())
