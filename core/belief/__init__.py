@@ -1,0 +1,32 @@
+"""Where a robot under way is: a belief over the places of a map, carried from frame to frame (thesis 2.1, 2.2.6).
+
+``graph`` knows which places follow one another, ``evidence`` what one frame's scores say, ``motion`` how far a robot
+gets, ``filter`` is the hidden Markov model, ``paths`` the sequence search beside it, ``estimate`` sums a belief up,
+``run`` puts them together and ``record`` writes a run down.
+"""
+
+from core.belief.estimate import Candidate, Estimate
+from core.belief.evidence import NOTHING, Evidence, evidence
+from core.belief.graph import PlaceGraph, place_graph
+from core.belief.motion import Odometry, Step, Stride
+from core.belief.record import DamagedRecord, from_bytes, to_bytes
+from core.belief.run import Run, RunOptions, RunState
+
+__all__ = [
+    "NOTHING",
+    "Candidate",
+    "DamagedRecord",
+    "Estimate",
+    "Evidence",
+    "Odometry",
+    "PlaceGraph",
+    "Run",
+    "RunOptions",
+    "RunState",
+    "Step",
+    "Stride",
+    "evidence",
+    "from_bytes",
+    "place_graph",
+    "to_bytes",
+]

@@ -1,0 +1,163 @@
+"""The belief of a robot under way: a hidden Markov model over the places of a map, and whether it is in the map.
+
+Given that the robot sees the map, where it is follows the forward algorithm (Rabiner, A tutorial on hidden Markov
+models, Proceedings of the IEEE 77(2), 1989, section III.A) in its scaled form, which is causal: a frame changes what
+is believed of now and nothing else.  It may be carried off to any place at any time (JUMP).  With a lag the backward
+pass over the frames since then tells, besides, where the robot was that many frames ago.
+
+Whether it sees the map is a second chain of two states (LEAVING, RETURNING), which weighs the likelihood of each frame
+under the first against that of a frame from outside.  So a robot whose view was blocked is looked for where it
+must have got to by then: what it saw meanwhile, however little, still counts among the places.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from core.belief.evidence import Evidence
+from core.belief.graph import PlaceGraph
+from core.belief.motion import Masses, Transition
+
+START_UNKNOWN = 0.5
+"""Belief, before the first frame, that the map does not show where the robot is."""
+
+JUMP = 1e-3
+LEAVING = 2e-2
+RETURNING = 0.1
+
+ALIKE = 1.02
+"""Places that hold no more than this times the floor are not moved one by one: what nearly all hold alike stays so."""
+
+MANY = 1000
+"""In smaller maps every place is moved, which costs little there; and there what the others hold is not little."""
+
+VANISHING = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What is believed of the present.
+
+    given: float32 [n], probabilities of the places, in the order of their graph, if the robot sees the map; their
+        sum is 1, or 0 where there is no place.
+    unknown: probability that it does not; 1 in an empty map.
+    floor: what a place holds for which nothing speaks; most hold no more.
+    """
+
+    given: Masses
+    unknown: float
+    floor: float = 0.0
+
+    @property
+    def places(self) -> Masses:
+        """float32 [n], the probability of each place; with ``unknown`` they sum to 1."""
+        return self.given * np.float32(1 - self.unknown)
+
+
+def uninformed(places: int) -> Belief:
+    """The belief before the first frame, over n places."""
+    if not places:
+        return Belief(np.zeros(0, np.float32), 1.0)
+    return Belief(np.full(places, 1 / places, np.float32), START_UNKNOWN, 1 / places)
+
+
+def predicted(belief: Belief, transition: Transition) -> Belief:
+    """What is believed after a motion and before the frame (the sum in Rabiner's eq. 20)."""
+    n = len(belief.given)
+    if not n:
+        return belief
+    moved, spread, gone = transition.forward(belief.given, ALIKE * belief.floor if n >= MANY else 0.0)
+    anywhere = ((1 - JUMP) * (spread + gone) + JUMP) / n
+    moved *= np.float32(1 - JUMP)
+    moved += np.float32(anywhere)
+    known = 1 - belief.unknown
+    left = 1 - (1 - LEAVING) * (1 - gone)
+    return Belief(moved, (1 - RETURNING) * belief.unknown + left * known, anywhere)
+
+
+def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
+    """What is believed once a frame is seen (the product with its likelihoods, scaled)."""
+    n = len(belief.given)
+    if not n:
+        return belief
+    likely, scale = _weighted(belief.given, seen, graph)
+    inside = float(likely.sum(dtype=np.float64))
+    outside = belief.unknown * float(np.exp(seen.unknown - scale))
+    known = (1 - belief.unknown) * inside
+    if inside < VANISHING or known + outside < VANISHING:  # nothing that was thought possible can have shown this
+        return uninformed(n)
+    floor = belief.floor * float(np.exp(-scale)) / inside
+    return Belief(likely / np.float32(inside), outside / (known + outside), floor)
+
+
+def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses, float]:
+    """Values times the likelihoods of a frame, and the log by which these were lowered, so that nothing overflows."""
+    places = graph.places_at(seen.rows)
+    there = places >= 0
+    scale = max(0.0, seen.unknown, float(seen.gains[there].max(initial=0)))
+    weighted = values * np.float32(np.exp(-scale))
+    weighted[places[there]] = values[places[there]] * np.exp(seen.gains[there] - np.float32(scale))
+    return weighted, scale
+
+
+@dataclass(frozen=True, eq=False)
+class _Moment:
+    """What smoothing needs of one past frame: the belief after it, the transition into it, what it showed."""
+
+    belief: Belief
+    transition: Transition
+    seen: Evidence
+
+
+class Smoother:
+    """The last frames of a run, kept to tell where the robot was ``lag`` frames ago given all since."""
+
+    def __init__(self, lag: int) -> None:
+        self.lag = lag
+        self._moments: deque[_Moment] = deque(maxlen=lag + 1)
+
+    def clear(self) -> None:
+        """Forget; for when the places have changed."""
+        self._moments.clear()
+
+    def append(self, belief: Belief, transition: Transition, seen: Evidence) -> None:
+        """Remember one frame."""
+        self._moments.append(_Moment(belief, transition, seen))
+
+    def smoothed(self, graph: PlaceGraph) -> Belief | None:
+        """The belief of ``lag`` frames ago (Rabiner's eqs. 25 and 27, scaled); None while there are fewer.
+
+        The frames since then tell the places apart; ``unknown`` stays what it was.
+        """
+        n = len(graph)
+        if len(self._moments) <= self.lag or not n:
+            return None
+        later = np.ones(n, np.float32)  # how likely all later frames are, by where the robot was
+        for moment in reversed(list(self._moments)[1:]):
+            likely, _ = _weighted(later, moment.seen, graph)
+            mean = float(likely.mean(dtype=np.float64))
+            later = moment.transition.backward(likely, mean) * np.float32(1 - JUMP) + np.float32(JUMP * mean)
+            later /= later.max()
+        then = self._moments[0].belief
+        given = then.given * later
+        total = float(given.sum(dtype=np.float64))
+        return Belief(given / np.float32(total), then.unknown) if total > VANISHING else then
+
+
+def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
+    """A belief after places came, went or moved: by row; new places start with what holds where nothing speaks.
+
+    What dead rows held becomes belief that the robot sees nothing of the map: it is where a place was that is no more.
+    """
+    n = len(new)
+    if not len(old) or not n:
+        return uninformed(n)
+    given = np.full(n, max(float(belief.given.min()), VANISHING), np.float32)
+    places = new.places_at(old.rows)
+    kept = places >= 0
+    given[places[kept]] = belief.given[kept]
+    lost = min(1.0, float(belief.given[~kept].sum(dtype=np.float64)))
+    return Belief(given / np.float32(given.sum(dtype=np.float64)), belief.unknown + (1 - belief.unknown) * lost)

@@ -1,0 +1,252 @@
+"""The places of a map as a robot can go from one to the next: along their sequences, and from pose to pose.
+
+A belief has one probability for each living place, in the order of this graph: by sequence, and within it by
+ordinal, so that "k frames on" is "k entries on".  Where places have poses, each is also joined to those near it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from core.places import EARTH_RADIUS
+from core.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
+
+NEAREST = 24
+"""A place is joined to so many of the nearest, at most; fewer in maps of over FULLY_JOINED places."""
+NEAREST_OF_MANY = 8
+FULLY_JOINED = 200_000
+ALONG = 4
+"""... and to so many before and behind it in its sequence, however near others lie."""
+SPACINGS = 3.0
+"""The nearest are looked for within so many times the usual distance of consecutive frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceGraph:
+    """n living places and who is near whom.
+
+    rows: int64 [n], the map's row of each place, in the graph's order.
+    index: int32 [rows of the map], the place at a row; -1 for a row that is dead or not allowed.
+    first, last: int32 [n], the ends (inclusive, exclusive) of the stretch of places of one sequence.
+    posed: bool [n].
+    coordinates: float64 [n, 3], metres east (or along x), north (y), up (z), to be compared with near places only.
+    shrink: float64 [n], what a metre along the first coordinate measures at the place: the cosine of its latitude.
+    heading: float64 [n], radians counter-clockwise from the first coordinate; of places without a heading the
+        direction in which their sequence goes on; NaN where there is neither.
+    starts, targets: int64 [n + 1] and int32 [edges]: place i is joined to targets[starts[i]:starts[i + 1]], itself
+        the first of them.  Places without a pose have no edges.
+    spacing: metres between consecutive frames, the median; 0 without poses.
+    reach: metres within which neighbours were looked for.
+    neighborhood: which places are the same place.
+    """
+
+    rows: NDArray[np.int64]
+    index: NDArray[np.int32]
+    first: NDArray[np.int32]
+    last: NDArray[np.int32]
+    posed: NDArray[np.bool_]
+    coordinates: NDArray[np.float64]
+    shrink: NDArray[np.float64]
+    heading: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    targets: NDArray[np.int32]
+    spacing: float
+    reach: float
+    neighborhood: Neighborhood
+    whereabouts: Whereabouts
+
+    @property
+    def geographic(self) -> bool:
+        """Whether any place is told by latitude and longitude."""
+        return bool((self.whereabouts.kind == GEOGRAPHIC).any())
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @property
+    def bytes(self) -> int:
+        """Of memory that its arrays hold."""
+        arrays = (self.rows, self.index, self.first, self.last, self.posed, self.coordinates, self.shrink)
+        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets))
+
+    def places_at(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
+        """The places at rows of the map, int32 [k]; -1 where none lives, rows beyond the graph's map included."""
+        inside = (rows >= 0) & (rows < len(self.index))
+        found = np.full(len(rows), -1, np.int32)
+        found[inside] = self.index[rows[inside]]
+        return found
+
+    def same_place(self, place: int) -> NDArray[np.int64]:
+        """The places, itself included, that are the same place as one; int64 [m].
+
+        Only those joined to it and those beside it in its sequence are looked at, so that the cost does not grow
+        with the map.
+        """
+        where = self.whereabouts
+        found: NDArray[np.int64] = _same_place(
+            place,
+            int(self.first[place]),
+            int(self.last[place]),
+            self.targets[self.starts[place] : self.starts[place + 1]],
+            where.kind,
+            where.position,
+            where.ordinal,
+            self.neighborhood.radius,
+            self.neighborhood.frames,
+        )
+        return found
+
+
+@cast(Callable[[Callable[..., Any]], Callable[..., Any]], numba.njit(cache=True, nogil=True))
+def _same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
+    """As ``Whereabouts.near`` has it, among the places joined and those beside it in its sequence; ascending."""
+    low, high = max(first, place - frames), min(last, place + frames + 1)
+    found = np.empty(len(joined) + high - low, np.int64)
+    count = 0
+    for number in range(len(found)):
+        beside = number >= len(joined)
+        other = low + number - len(joined) if beside else joined[number]
+        if other == place and not beside:
+            continue
+        if kind[other] == kind[place] and kind[place] != NO_POSE:
+            if beside and other != place and np.any(joined == other):
+                continue
+            distance = np.sqrt(np.sum((position[other] - position[place]) ** 2))
+            same = distance <= radius or other == place
+        else:
+            same = beside and abs(ordinal[other] - ordinal[place]) <= frames
+        if same:
+            found[count] = other
+            count += 1
+    return np.sort(found[:count])
+
+
+def place_graph(
+    whereabouts: Whereabouts, living: NDArray[np.int64], rows: int, neighborhood: Neighborhood
+) -> PlaceGraph:
+    """The graph of a map's living places.
+
+    Args:
+        whereabouts: of all rows of the map.
+        living: int64 [n], the rows of the places to take.
+        rows: of the map, dead ones included.
+    """
+    where = whereabouts.take(living)
+    order = np.lexsort((where.ordinal, where.sequence))
+    living, where = living[order], where.take(order)
+    index = np.full(rows, -1, np.int32)
+    index[living] = np.arange(len(living), dtype=np.int32)
+    bounds = np.flatnonzero(np.diff(where.sequence)) + 1
+    ends = np.concatenate([[0], bounds, [len(living)]]).astype(np.int32)
+    lengths = np.diff(ends)
+    first, last = np.repeat(ends[:-1], lengths), np.repeat(ends[1:], lengths)
+    coordinates, shrink = _plane(where)
+    posed = where.kind != NO_POSE
+    follows = np.zeros(len(living), np.bool_)  # whether the next entry is the next frame, with a pose of one kind
+    if len(living) > 1:
+        follows[:-1] = (first[1:] == first[:-1]) & posed[1:] & (where.kind[1:] == where.kind[:-1])
+    steps = np.linalg.norm(where.position[1:] - where.position[:-1], axis=1)[follows[:-1]]
+    moved = steps[steps > 0]
+    spacing = float(np.median(moved)) if len(moved) else 0.0
+    reach = max(neighborhood.radius, SPACINGS * spacing)
+    heading = _headings(where, coordinates, shrink, follows)
+    starts, targets = _edges(where, first, last, reach)
+    return PlaceGraph(
+        rows=living,
+        index=index,
+        first=first,
+        last=last,
+        posed=posed,
+        coordinates=coordinates,
+        shrink=shrink,
+        heading=heading,
+        starts=starts,
+        targets=targets,
+        spacing=spacing,
+        reach=reach,
+        neighborhood=neighborhood,
+        whereabouts=where,
+    )
+
+
+def _plane(where: Whereabouts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coordinates in which near places can be subtracted, and the shrinking of the first one."""
+    coordinates, shrink = where.position.copy(), np.ones(len(where))
+    earthly = where.kind == GEOGRAPHIC
+    if earthly.any():
+        unit = where.position[earthly] / EARTH_RADIUS
+        longitude = np.arctan2(unit[:, 1], unit[:, 0])
+        middle = np.angle(np.exp(1j * longitude).mean())  # so that the seam lies behind the map
+        longitude = np.angle(np.exp(1j * (longitude - middle)))
+        latitude = np.arcsin(np.clip(unit[:, 2], -1, 1))
+        flat = np.stack([longitude, latitude, np.zeros(len(latitude))], axis=1)
+        coordinates[earthly] = EARTH_RADIUS * flat
+        shrink[earthly] = np.cos(latitude)
+    return coordinates, shrink
+
+
+def _headings(
+    where: Whereabouts,
+    coordinates: NDArray[np.float64],
+    shrink: NDArray[np.float64],
+    follows: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Radians from the first coordinate; the way on where no heading was given."""
+    # Beside x and y a heading is counter-clockwise from +x, beside a latitude clockwise from north.
+    given = np.radians(np.where(where.kind == GEOGRAPHIC, 90 - where.heading, where.heading))
+    way = np.full(len(where), np.nan)
+    here = np.flatnonzero(follows)
+    step = coordinates[here + 1] - coordinates[here]
+    east, north = step[:, 0] * shrink[here], step[:, 1]
+    length = np.hypot(east, north)
+    clear = length > 0
+    way[here[clear]] = np.arctan2(north, east)[clear]
+    after = here + 1  # the last frame of a stretch looks where the one before it looked
+    ending = after[np.isnan(way[after])]
+    way[ending] = way[ending - 1]
+    return np.where(np.isnan(given), way, given)
+
+
+def _edges(
+    where: Whereabouts, first: NDArray[np.int32], last: NDArray[np.int32], reach: float
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Which places are joined: for each itself, then those beside it in its sequence and the nearest, once each."""
+    n = len(where)
+    none = np.empty(0, np.int64)
+    pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    everywhere = np.arange(n)
+    for offset in [*range(-ALONG, 0), *range(1, ALONG + 1)]:
+        beside = everywhere + offset
+        source = everywhere[(beside >= first) & (beside < last)]
+        target = source + offset
+        fits = (where.kind[source] != NO_POSE) & (where.kind[source] == where.kind[target])
+        pairs.append((source[fits], target[fits]))
+    for kind in (METRIC, GEOGRAPHIC):
+        members = np.flatnonzero(where.kind == kind)
+        if len(members) > 1 and reach > 0:
+            count = min(len(members), 1 + (NEAREST if n <= FULLY_JOINED else NEAREST_OF_MANY))
+            positions = where.position[members]
+            distances, found = cKDTree(positions).query(positions, k=count, distance_upper_bound=reach)
+            near = np.isfinite(distances)
+            source = np.repeat(members, near.sum(axis=1))
+            target = members[found[near]]
+            pairs.append((source[source != target], target[source != target]))
+    sources = np.concatenate([none, *(source for source, _ in pairs)])
+    targets = np.concatenate([none, *(target for _, target in pairs)])
+    keys = np.unique(sources * max(n, 1) + targets)
+    sources, targets = keys // max(n, 1), keys % max(n, 1)
+    posed = np.flatnonzero(where.kind != NO_POSE)
+    counts = np.bincount(sources, minlength=n) + np.bincount(posed, minlength=n)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    joined = np.empty(int(starts[-1]), np.int32)
+    joined[starts[posed]] = posed
+    before = np.concatenate([[0], np.cumsum(np.bincount(sources, minlength=n))])
+    joined[starts[sources] + 1 + np.arange(len(sources)) - before[sources]] = targets
+    return starts, joined

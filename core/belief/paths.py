@@ -1,0 +1,90 @@
+"""Straight paths through the last frames, instead of a filter: the sequence search of SeqSLAM, looking back only.
+
+Milford, Wyeth: SeqSLAM: Visual Route-based Navigation for Sunny Summer Days and Stormy Winter Nights, ICRA 2012.
+There paths of nearly constant velocity are laid through a matrix of differences; here through the evidence of the
+last frames, which already sets each score against the others of its frame, as SeqSLAM's contrast enhancement does.
+A path ends at the present frame.  No motion is assumed but a pace; nothing older than the last frames counts, so
+that a robot that was carried off is found again once it has gone as many frames.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from core.belief.evidence import NOTHING, Evidence
+from core.belief.filter import Belief, uninformed
+from core.belief.graph import PlaceGraph
+from core.belief.motion import Stride
+
+PACES = tuple(round(0.5 + 0.1 * step, 1) for step in range(11))
+"""Velocities of the paths, as multiples of the usual advance."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
+    """Add each place's gain to the end of the path that was at that place ``shift`` frames of the sequence before."""
+    for k in range(len(places)):
+        place = places[k]
+        if place >= 0 and first[place] <= place + shift < last[place]:
+            totals[place + shift] += gains[k]
+
+
+class PathSearch:
+    """The evidence of a run's last frames.
+
+    Args:
+        frames: how many count, 1 or more.
+    """
+
+    def __init__(self, frames: int, seen: Sequence[Evidence] = ()) -> None:
+        self.frames = frames
+        self._seen: deque[Evidence] = deque(seen, maxlen=frames)
+
+    @property
+    def seen(self) -> tuple[Evidence, ...]:
+        """The evidence that counts, oldest first."""
+        return tuple(self._seen)
+
+    def append(self, seen: Evidence, missed: int = 0) -> None:
+        """Take in one frame, after ``missed`` ones that did not arrive, which say nothing."""
+        for _ in range(min(missed, self.frames)):
+            self._seen.append(NOTHING)
+        self._seen.append(seen)
+
+    def belief(self, graph: PlaceGraph, stride: Stride) -> Belief:
+        """Each place by the likelihood of the best path that ends there, every path being as likely beforehand.
+
+        "Not in the map" is held against the best path of all, not against their sum: a map of many places is no
+        likelier to hold the robot than one of few.
+        """
+        n = len(graph)
+        if not n:
+            return uninformed(0)
+        best = np.zeros(n, np.float32)
+        velocities = sorted({round(stride.advance * pace, 3) for pace in PACES})
+        signs = (1, -1) if stride.backwards else (1,)
+        placed = [(graph.places_at(seen.rows), seen.gains) for seen in self._seen]
+        shifts: set[tuple[int, ...]] = set()
+        for velocity in velocities:
+            for sign in signs:
+                ages = range(len(placed) - 1, -1, -1)
+                shifts.add(tuple(sign * int(np.floor(velocity * age + 0.5)) for age in ages))
+        for path in sorted(shifts):
+            totals = np.zeros(n, np.float32)
+            for shift, (places, gains) in zip(path, placed, strict=True):
+                _add_along(places, gains, shift, graph.first, graph.last, totals)
+            np.maximum(best, totals, out=best)
+        unknown = sum(seen.unknown for seen in self._seen)
+        return _normalised(best, unknown)
+
+
+def _normalised(likelihoods: NDArray[np.float32], unknown: float) -> Belief:
+    best = float(likelihoods.max())
+    given: NDArray[np.float32] = np.exp(likelihoods - np.float32(best))
+    return Belief(given / np.float32(given.sum(dtype=np.float64)), 1 / (1 + math.exp(min(best - unknown, 500.0))))

@@ -1,0 +1,79 @@
+"""A run's state as bytes: a JSON head with its length before it and the arrays behind it, under one checksum."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from typing import Any
+
+import numpy as np
+
+from core.belief.evidence import Evidence
+from core.belief.motion import Odometry
+from core.belief.run import RunState
+
+FORMAT = 1
+_PREFIX = struct.Struct("<II")  # checksum of all that follows it, length of the head
+
+
+class DamagedRecord(ValueError):
+    """The bytes are not those that were written, or were written in another form."""
+
+
+def to_bytes(state: RunState) -> bytes:
+    """A few kilobytes: rows as 8 bytes each, probabilities and gains as 4."""
+    odometry = state.odometry
+    head = {
+        "format": FORMAT,
+        "unknown": state.unknown,
+        "frames": state.frames,
+        "unrecognized": state.unrecognized,
+        "odometry": [odometry.forward, odometry.left, odometry.turn, odometry.variance, odometry.turn_variance],
+        "reach": state.reach,
+        "places": len(state.rows),
+        "seen": [[len(seen.rows), seen.unknown] for seen in state.seen],
+    }
+    text = json.dumps(head, separators=(",", ":")).encode()
+    arrays = [state.rows.astype("<i8"), state.masses.astype("<f4")]
+    for seen in state.seen:
+        arrays += [seen.rows.astype("<i8"), seen.gains.astype("<f4")]
+    rest = struct.pack("<I", len(text)) + text + b"".join(array.tobytes() for array in arrays)
+    return struct.pack("<I", zlib.crc32(rest)) + rest
+
+
+def from_bytes(data: bytes) -> RunState:
+    """What ``to_bytes`` wrote.
+
+    Raises:
+        DamagedRecord: it did not write this.
+    """
+    try:
+        checksum, length = _PREFIX.unpack_from(data)
+        if zlib.crc32(data[4:]) != checksum:
+            raise DamagedRecord("the checksum is wrong")
+        head: dict[str, Any] = json.loads(data[_PREFIX.size : _PREFIX.size + length])
+        if head["format"] != FORMAT:
+            raise DamagedRecord("it is of another format")
+        position = _PREFIX.size + length
+
+        def array(kind: str, count: int) -> Any:
+            nonlocal position
+            found = np.frombuffer(data, kind, count, position).copy()
+            position += found.nbytes
+            return found
+
+        rows, masses = array("<i8", head["places"]), array("<f4", head["places"])
+        seen = tuple(Evidence(array("<i8", count), array("<f4", count), unknown) for count, unknown in head["seen"])
+        return RunState(
+            rows.astype(np.int64),
+            masses.astype(np.float32),
+            head["unknown"],
+            head["frames"],
+            head["unrecognized"],
+            Odometry(*head["odometry"]),
+            head["reach"],
+            seen,
+        )
+    except (struct.error, ValueError, KeyError, TypeError) as error:
+        raise DamagedRecord(str(error)) from error

@@ -1,0 +1,54 @@
+"""What scores say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.belief.evidence import LISTED, STRENGTH, STRONGEST, UNKNOWN, evidence
+from core.verdict import Calibration, Neighborhood, judge
+from tests.core.belief.maps import walk
+
+CALIBRATION = Calibration(
+    source="test", threshold=0.09, margin=0.004, background_mean=0.067, background_deviation=0.0136
+)
+APART = Neighborhood(5, 0)
+
+
+def told(scores: list[float], examined: int, calibration: Calibration = CALIBRATION) -> dict[int, float]:
+    values = np.sort(np.array(scores, np.float32))[::-1].copy()
+    marks = np.arange(len(values)) < examined
+    seen = evidence(np.arange(len(values)), values, walk(len(values)), calibration, APART, marks)
+    assert seen.unknown == pytest.approx(STRENGTH * UNKNOWN)
+    return dict(zip(seen.rows.tolist(), seen.gains.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("examined", [0, 30])
+def test_a_place_that_would_just_be_believed_gains_the_strength(examined: int) -> None:
+    random = np.random.default_rng(0)
+    rest = random.normal(0.07, 0.01, 60).tolist()
+    calibration = CALIBRATION if examined else CALIBRATION.model_copy(update={"threshold": 2.0})
+    below, above = 0.05, 1.0
+    for _ in range(60):  # the least score that the single-frame verdict takes
+        middle = (below + above) / 2
+        scores = np.sort(np.array([middle, *rest], np.float32))[::-1].copy()
+        verdict = judge(scores, walk(61), calibration, APART, examined).verdict
+        below, above = (below, middle) if verdict != "unknown" else (middle, above)
+    gains = told([above, *rest], examined, calibration)
+    assert gains[0] == pytest.approx(STRENGTH, abs=0.02)
+    assert told([2 * above, *rest], examined, calibration)[0] > 2 * STRENGTH
+
+
+def test_only_listed_places_speak_and_none_too_loudly() -> None:
+    scores = np.linspace(0.9, 0.1, 300).tolist()
+    assert max(told(scores, 0)) < LISTED
+    assert max(told(scores, 30)) < 30
+    assert told([1.0, *[0.001] * 60], 30)[0] == STRONGEST
+    assert min(told(scores, 0).values()) > 0
+
+
+def test_tiny_maps() -> None:
+    nothing = evidence(np.empty(0, np.int64), np.empty(0, np.float32), walk(), CALIBRATION, APART)
+    assert len(nothing.rows) == 0 and nothing.unknown == 0
+    assert told([0.5], 1)[0] > STRENGTH
+    assert 0 not in told([0.01], 1)

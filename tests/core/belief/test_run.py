@@ -1,0 +1,183 @@
+"""A run as a whole: carried off, out of the map, two corridors alike, taken up again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from core.belief import (
+    NOTHING,
+    DamagedRecord,
+    Evidence,
+    Odometry,
+    PlaceGraph,
+    Run,
+    RunOptions,
+    Step,
+    Stride,
+    from_bytes,
+    place_graph,
+    to_bytes,
+)
+from core.belief.run import LOST_AFTER
+from core.verdict import Neighborhood
+from tests.core.belief.maps import graph_of, posed, shows, walk
+
+BAYES, PATH = RunOptions(), RunOptions(filter="path")
+NOWHERE = 0.56
+
+
+def alive(graph: PlaceGraph) -> np.ndarray:
+    return np.ones(len(graph.index), np.bool_)
+
+
+def seen_at(row: int, places: int, random: np.random.Generator) -> Evidence:
+    """A frame taken at a row: that speaks for it a little more than for a few others."""
+    others = random.choice(places, 6, replace=False)
+    others = others[others != row]
+    gains = np.append(random.uniform(0.1, 0.9, len(others)), 1.5).astype(np.float32)
+    return Evidence(np.append(others, row).astype(np.int64), gains, NOWHERE)
+
+
+@pytest.mark.parametrize("options", [BAYES, PATH])
+def test_a_robot_is_found_and_found_again_when_carried_off(options: RunOptions) -> None:
+    random, graph = np.random.default_rng(3), graph_of(walk(400), Neighborhood(5, 3))
+    run, found = Run(options, graph), []
+    for row in [*range(50, 80), *range(300, 330)]:
+        run.advance(seen_at(row, 400, random), Step())
+        told = run.estimate(1, alive(graph))
+        found.append(told.verdict == "recognized" and abs(told.candidates[0].row - row) <= 3)
+    assert all(found[15:30]), "on the way"
+    assert found[30:].index(True) <= 20 and all(found[50:]), "and after it was carried off"
+
+
+@pytest.mark.parametrize("options", [BAYES, PATH])
+def test_what_is_not_in_the_map_is_unknown_after_a_few_frames(options: RunOptions) -> None:
+    random, graph = np.random.default_rng(4), graph_of(walk(300), Neighborhood(5, 3))
+    run = Run(options, graph)
+    for row in range(100, 125):
+        run.advance(seen_at(row, 300, random), Step())
+        verdict = run.estimate(1, alive(graph)).verdict
+    assert verdict == "recognized" and not run.lost
+    verdicts = []
+    for _ in range(30):
+        rows = random.choice(300, 6, replace=False)
+        run.advance(Evidence(rows, random.uniform(0.1, 0.9, 6).astype(np.float32), NOWHERE), Step())
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    assert verdicts[15:] == ["unknown"] * 15
+    assert run.lost and run.unrecognized is not None and run.unrecognized >= LOST_AFTER
+
+
+def test_a_blocked_view_does_not_lose_the_place() -> None:
+    random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
+    run = Run(BAYES, graph)
+    for row in range(100, 130):
+        run.advance(seen_at(row, 300, random), Step())
+    for _ in range(8):  # a bus stands before the camera
+        run.advance(NOTHING, Step())
+    run.advance(seen_at(138, 300, random), Step())
+    told = run.estimate(1, alive(graph))
+    assert told.verdict == "recognized" and abs(told.candidates[0].row - 138) <= 3
+
+
+def test_odometry_tells_two_corridors_apart_that_look_the_same() -> None:
+    straight = [(float(i), 0.0) for i in range(20)]
+    bent = [(float(min(i, 10)), 50.0 + max(0.0, i - 10.0)) for i in range(20)]
+    graph = graph_of(posed(straight, bent))
+    told = {}
+    for way, turning in (("straight", 0.0), ("bent", math.pi / 2)):
+        blind, knowing = Run(BAYES, graph), Run(BAYES, graph)
+        for number in range(2, 18):
+            frame = shows(number, 20 + number, gain=1.5, unknown=NOWHERE)
+            blind.advance(frame, Step())
+            # It looks along the way on: at frame 10 already to the left.
+            turn = turning if number == 10 else 0.0
+            knowing.advance(frame, Step(odometry=Odometry(1.0, 0.0, turn, 0.01, 0.01)))
+        told[way] = knowing.estimate(2, alive(graph))
+        assert blind.estimate(2, alive(graph)).verdict == "ambiguous"
+    assert told["straight"].verdict == told["bent"].verdict == "recognized"
+    assert told["straight"].candidates[0].row < 20 <= told["bent"].candidates[0].row
+
+
+def test_a_second_look_from_the_same_spot_is_no_second_witness() -> None:
+    graph = graph_of(posed([(float(i), 0.0) for i in range(20)]))
+    still, moving = (Run(RunOptions(stride=Stride(0.0)), graph) for _ in range(2))
+    for _ in range(6):
+        still.advance(shows(5, gain=0.5), Step(odometry=Odometry(0.0)))
+        moving.advance(shows(5, gain=0.5), Step())
+    assert (
+        still.look(1, alive(graph)).candidates[0].probability < moving.look(1, alive(graph)).candidates[0].probability
+    )
+
+
+def test_places_that_die_between_two_frames_are_not_told() -> None:
+    graph = graph_of(walk(30))
+    run = Run(BAYES, graph)
+    for number in range(5):
+        run.advance(shows(10 + number), Step())
+    assert run.look(1, alive(graph)).verdict == "recognized"
+    living = alive(graph)
+    living[13:16] = False
+    told = run.look(5, living)
+    assert not {13, 14, 15} & {candidate.row for candidate in told.candidates}
+    assert told.verdict == "unknown", "what is left of the belief is that the robot is where no place is any more"
+    run.place_on(place_graph(walk(30), np.flatnonzero(living), 30, Neighborhood(1, 1)))
+    assert run.look(1, living).verdict == "unknown"
+    assert run.look(1, living[:0]).candidates == ()
+
+
+@pytest.mark.parametrize("options", [BAYES, PATH])
+@pytest.mark.parametrize("start", [0, 5])
+def test_a_run_can_be_looked_at_when_places_have_come_or_gone(options: RunOptions, start: int) -> None:
+    run = Run(options, graph_of(walk(30)))
+    for number in range(5):
+        run.advance(shows(10 + number), Step())
+    rows = np.arange(start, 40)  # ten new ones at the end, and the first ones gone
+    changed = place_graph(walk(40), rows, 40, Neighborhood(1, 1))
+    run.place_on(changed)
+    assert run.look(1, alive(changed)).candidates[0].row == 14
+    run.advance(shows(15), Step())
+    assert run.look(1, alive(changed)).candidates[0].row == 15
+
+
+@pytest.mark.parametrize("options", [BAYES, PATH])
+def test_a_run_is_taken_up_where_it_was(options: RunOptions) -> None:
+    random, graph = np.random.default_rng(6), graph_of(walk(2000), Neighborhood(5, 3))
+    run = Run(options, graph)
+    for row in range(700, 720):
+        run.advance(seen_at(row, 2000, random), Step())
+        run.estimate(1, alive(graph))
+    data = to_bytes(run.state())
+    assert len(data) < 16_000
+    again = Run.restored(options, graph, from_bytes(data))
+    assert (again.frames, again.unrecognized) == (run.frames, run.unrecognized)
+    for one in (run, again):
+        assert one.look(1, alive(graph)).verdict == "recognized"
+    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=1e-4)
+    following = seen_at(720, 2000, random)
+    for one in (run, again):
+        one.advance(following, Step())
+    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=1e-3)
+    assert again.belief.unknown == pytest.approx(run.belief.unknown, abs=1e-4)
+
+
+def test_a_record_that_was_changed_is_refused() -> None:
+    data = to_bytes(Run(BAYES, graph_of(walk(10))).state())
+    for bad in (b"", data[:7], data[:-1], data[:9] + b"?" + data[10:]):
+        with pytest.raises(DamagedRecord):
+            from_bytes(bad)
+
+
+def test_the_place_of_some_frames_ago_is_told_better_later() -> None:
+    graph = graph_of(walk(40))
+    run = Run(RunOptions(lag=3, stride=Stride()), graph)
+    verdicts = []
+    for rows in ((10, 30), (11, 31), (12,), (13,), (14,)):
+        assert run.earlier(1, alive(graph)) is None or run.frames > 3
+        run.advance(shows(*rows, gain=2), Step())
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    told = run.earlier(2, alive(graph))
+    assert told is not None and told.candidates[0].row in (10, 11, 12)
+    assert verdicts[1] == "ambiguous" and told.verdict == "recognized"
