@@ -36,8 +36,13 @@ TAGS = [
     {"name": "maps", "description": "A map is one environment, bound for life to one encoder."},
     {"name": "places", "description": "A place is one enrolled reference frame."},
     {"name": "sequences", "description": "A sequence is one traverse: it is listed and deleted as a whole."},
+    {"name": "cameras", "description": "What of a camera's frames is to be ignored."},
     {"name": "queries", "description": "A query is one frame, answered with ranked matches and a verdict."},
+    {"name": "calibration", "description": "When the answers of a map are to be believed, measured on the map itself."},
+    {"name": "sessions", "description": "A session is a robot's run: a belief over places, frame by frame."},
     {"name": "frames", "description": "What the encoder makes of a frame, without a map."},
+    {"name": "upkeep", "description": "Making a map anew, its health, pruning, merging."},
+    {"name": "jobs", "description": "Long work: it goes on in the background and is told as it does."},
     {"name": "encoders", "description": "Models and vocabularies installed."},
     {"name": "service", "description": "Health, counters, version."},
 ]
@@ -59,7 +64,7 @@ class Published:
         self.app, self.root_path = app, root_path
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
+        if scope["type"] in ("http", "websocket"):
             path: str = scope["path"]
             if not path.startswith(self.root_path + "/"):
                 path = self.root_path + path

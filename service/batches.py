@@ -7,7 +7,7 @@ import logging
 from starlette.requests import Request
 
 from core import errors
-from service.faults import Fault, InvalidRequest, UnsupportedMediaType
+from service.faults import Fault, FrameNeeded, InvalidRequest, UnsupportedMediaType
 from service.problems import Problem, request_problem
 
 OWN_ERRORS = (
@@ -15,6 +15,8 @@ OWN_ERRORS = (
     errors.NoRegions,
     errors.InvalidIdentifier,
     errors.InvalidField,
+    errors.UnknownCamera,
+    FrameNeeded,
     InvalidRequest,
     UnsupportedMediaType,
 )

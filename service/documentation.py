@@ -160,6 +160,8 @@ def _content(document: Json, content: Json) -> str:
 def _curl(method: str, path: str, operation: Json) -> str:
     """A command line that does it."""
     address = path.replace("{map}", "lab").replace("{place}", "p7").replace("{sequence}", "monday")
+    address = address.replace("{job}", "5f0c6a1de2b94c77")
+    address = address.replace("{session}", "s-4f2a9c01d37be586")
     words = ["curl"] + ([] if method == "get" else ["-X", method.upper()])
     words.append(f"'http://127.0.0.1:8000{address}'")
     body = operation.get("requestBody", {}).get("content", {})

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from contextlib import aclosing, contextmanager, suppress
 from typing import ParamSpec, TypeVar
 
 from anyio import to_thread
@@ -15,12 +16,18 @@ from anyio import to_thread
 from core.encoders import EncoderCatalogue
 from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
 from core.images import Limits
+from core.masks import Mask
 from core.storage import Atlas, Map, MapRecord
 from core.verdict import Calibration
 from service.faults import EncoderNotInstalled, NotReady
-from service.inference import Encoded, Inference, Patience
+from service.inference import Encoded, Inference, Outcomes, Patience
+from service.jobs import Jobs
 from service.metrics import MapCollector, Metrics
+from service.pictures import Pictures
+from service.searches import Searches
+from service.sessions import Sessions
 from service.settings import Settings, unknown_variables
+from service.upkeep import Upkeep
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -36,6 +43,15 @@ async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **
     return await to_thread.run_sync(lambda: work(*args, **kwargs))
 
 
+async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
+    """What to ignore in a frame of one of a map's cameras; nothing if none is named.
+
+    Raises:
+        UnknownCamera: the map has none of this name.
+    """
+    return None if camera is None else await in_thread(map_.cameras.mask, camera)
+
+
 class Engine:
     """Everything that the routes work with.
 
@@ -46,10 +62,32 @@ class Engine:
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         self.settings, self.metrics = settings, metrics
         self.atlas = Atlas(settings.data_dir)
-        self.catalogue = EncoderCatalogue(settings.models_directory)
+        self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
         self.inference = Inference(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
+        try:
+            self.jobs = Jobs(
+                settings.data_dir,
+                settings.job_workers,
+                settings.job_queue,
+                settings.job_history,
+                settings.job_watchers,
+            )
+        except BaseException:
+            self.inference.close()
+            self.atlas.close()
+            raise
+        try:
+            self.sessions = Sessions(settings)
+        except BaseException:
+            self.jobs.close(0.0)
+            self.inference.close()
+            self.atlas.close()
+            raise
+        self.searches = Searches()
+        self.upkeep = Upkeep(self)
         self._writing: dict[str, threading.Lock] = {}
+        self.pictures = Pictures()
         self._encoder_state = "loading"
         self._disk_state, self._disk_checked = "ok", 0.0
         self._loading: asyncio.Task[None] | None = None
@@ -61,13 +99,20 @@ class Engine:
         for name in unknown_variables():
             log.warning("the environment sets %s, which is no setting", name)
         self._loading = asyncio.create_task(self._load_default())
+        self.loop = asyncio.get_running_loop()
+        self.upkeep.start()
+        self.jobs.start()
 
     async def close(self) -> None:
         """Finish what runs and give the data directory back."""
         if self._loading is not None:
             self._loading.cancel()
         self.metrics.registry.unregister(self._map_collector)
+        # Jobs first: what they are at needs the encoder and the maps.
+        await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
+        await to_thread.run_sync(self.upkeep.close)
         await to_thread.run_sync(self.inference.close)
+        await to_thread.run_sync(self.sessions.close)
         await to_thread.run_sync(self.atlas.close)
 
     async def _load_default(self) -> None:
@@ -82,6 +127,9 @@ class Engine:
             self._encoder_state = "it cannot be loaded; the log says why"
             log.exception("the default encoder cannot be loaded")
         else:
+            # What is loaded by now stays: the collector need not walk over it again and again, which takes long.
+            gc.collect()
+            gc.freeze()
             self._encoder_state = "ok"
             log.info("ready", extra={"encoder": identity, "seconds": round(time.perf_counter() - began, 2)})
 
@@ -153,9 +201,11 @@ class Engine:
         Raises:
             UnknownMap, MapQuarantined: it is not there, or damaged.
         """
-        return await in_thread(self.atlas.get, map_id)
+        # Nearly always it is open: no thread has to be asked for it.
+        found = self.atlas.opened(map_id)
+        return found if found is not None else await in_thread(self.atlas.get, map_id)
 
-    async def encode_for(self, map_: Map, data: bytes, patience: Patience) -> Encoded:
+    async def encode_for(self, map_: Map, data: bytes, patience: Patience, mask: Mask | None = None) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``inference.place_in_queue``.
 
         Raises:
@@ -163,9 +213,31 @@ class Engine:
             Others: as for ``Inference.encode``.
         """
         try:
-            return await self.inference.encode(map_.record.encoder, data, patience)
+            return await self.inference.encode(map_.record.encoder, data, patience, mask)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
+
+    async def encode_many_for(
+        self, map_: Map, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+    ) -> AsyncGenerator[Outcomes]:
+        """The same for many frames, as ``Inference.encode_many`` yields them; close it, as ``aclosing`` does."""
+        async with aclosing(self.inference.encode_many(map_.record.encoder, frames, patience, masks)) as outcomes:
+            async for some in outcomes:
+                for _, outcome in some:
+                    if isinstance(outcome, UnknownEncoder):
+                        raise EncoderNotInstalled(str(outcome)) from outcome
+                yield some
+
+    async def encode_all_for(
+        self, map_: Map, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+    ) -> list[Encoded | Exception]:
+        """What became of each frame, in their order; the pixels, which would fill the memory, are not kept."""
+        made: dict[int, Encoded | Exception] = {}
+        async with aclosing(self.encode_many_for(map_, frames, patience, masks)) as outcomes:
+            async for some in outcomes:
+                for index, outcome in some:
+                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
+        return [made[index] for index in range(len(frames))]
 
     def assert_encoder(self, map_: Map, asserted: str | None) -> None:
         """See that the encoder that a caller names is the map's.

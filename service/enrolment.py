@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import aclosing
 from dataclasses import dataclass, field
 
 from core.errors import NoRegions, UnknownPlace
 from core.images import encode_thumbnail
+from core.masks import Mask
 from core.places import Place, PlaceFields
 from core.storage import Change, Enrolment, Map
 from service.engine import Engine, in_thread
+from service.faults import FrameNeeded
 from service.inference import Encoded, Patience
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One frame that a caller wants remembered as the place ``id``."""
+    """One frame that a caller wants remembered as the place ``id``.
+
+    data: the bytes of its file; None where the place is to keep the frame that it holds.
+    sha256: digest of that frame, 32 bytes; None where there are ``data``.
+    """
 
     id: str
     fields: PlaceFields
-    data: bytes
+    data: bytes | None
+    mask: Mask | None = None
+    sha256: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -35,6 +44,12 @@ class Enrolled:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
 
 
+def frame_digest(candidate: Candidate) -> bytes:
+    """What tells whether a frame has been encoded already: its bytes and, if there is one, its mask."""
+    digest = candidate.sha256 or hashlib.sha256(candidate.data or b"").digest()
+    return digest if candidate.mask is None else hashlib.sha256(digest + candidate.mask.digest.encode()).digest()
+
+
 def _raise(_index: int, error: Exception) -> None:
     raise error
 
@@ -46,7 +61,7 @@ async def enrol(
     patience: Patience,
     reject: Callable[[int, Exception], None] = _raise,
 ) -> dict[int, Enrolled]:
-    """Enrol frames; a picture that the place shows already is not encoded again.
+    """Enrol frames; one that the place holds already is not encoded again.
 
     Nothing is stored before all frames are encoded, so a request that is dropped leaves nothing.
 
@@ -61,31 +76,61 @@ async def enrol(
         QueueFull, DeadlineExceeded, ClientGone: nothing was stored.
         StorageFull, StorageFailure: nothing of the last commit was kept.
     """
-    digests = await in_thread(lambda: [hashlib.sha256(candidate.data).digest() for candidate in candidates])
+    digests = await in_thread(lambda: [frame_digest(candidate) for candidate in candidates])
     stored: dict[int, Enrolled] = {}
     open_ = set(range(len(candidates)))
     known = await in_thread(lambda: {i for i in open_ if map_.digest(candidates[i].id) == digests[i]})
     while open_:
         enrolments: dict[int, Enrolment] = {}
         times: dict[int, Mapping[str, float]] = {}
-        if open_ - known:
+        sent = [(i, data) for i in sorted(open_ - known) if (data := candidates[i].data) is not None]
+        for i in sorted(open_ - known - {i for i, _ in sent}):
+            reject(i, FrameNeeded(f"The place {candidates[i].id!r} does not hold the frame of this digest; send it."))
+        if sent:
+            new, bodies = [i for i, _ in sent], [data for _, data in sent]
+            masks = [candidates[i].mask for i in new]
             with engine.inference.place_in_queue():
-                for i in sorted(open_ - known):
-                    try:
-                        encoded = await engine.encode_for(map_, candidates[i].data, patience)
-                        enrolments[i] = await in_thread(_prepare, engine, map_, candidates[i], digests[i], encoded)
-                        times[i] = encoded.milliseconds
-                    except Exception as error:
-                        reject(i, error)
-        fields = {i: candidates[i] for i in known}
-        done = await in_thread(_commit, engine, map_, enrolments, {i: (fields[i], digests[i]) for i in fields})
+                async with aclosing(engine.encode_many_for(map_, bodies, patience, masks)) as outcomes:
+                    async for some in outcomes:
+                        frames = {new[index]: outcome for index, outcome in some}
+                        # Thumbnails are made, and pixels let go, while the encoder is at the next frames.
+                        prepared = await in_thread(_prepare_all, engine, map_, candidates, digests, frames)
+                        for i, made in prepared.items():
+                            if isinstance(made, Exception):
+                                reject(i, made)
+                            else:
+                                enrolments[i], times[i] = made
+        # In the order in which they were given: it is the order of the places in their sequence.
+        enrolments = dict(sorted(enrolments.items()))
+        done = await in_thread(
+            _commit, engine, map_, enrolments, {i: (candidates[i], digests[i]) for i in sorted(known)}
+        )
         stored.update({i: Enrolled(place, change, times.get(i, {})) for i, (place, change) in done.items()})
         # Known a moment ago, but given another picture or forgotten in between: these have to be encoded.
         open_, known = known - set(done), set()
     return stored
 
 
-def _prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
+def _prepare_all(
+    engine: Engine,
+    map_: Map,
+    candidates: Sequence[Candidate],
+    digests: Sequence[bytes],
+    frames: Mapping[int, Encoded | Exception],
+) -> dict[int, tuple[Enrolment, Mapping[str, float]] | Exception]:
+    """What to commit for each frame and its times, or why it cannot be enrolled."""
+    made: dict[int, tuple[Enrolment, Mapping[str, float]] | Exception] = {}
+    for i, outcome in frames.items():
+        try:
+            if isinstance(outcome, Exception):
+                raise outcome
+            made[i] = prepare(engine, map_, candidates[i], digests[i], outcome), outcome.milliseconds
+        except Exception as error:
+            made[i] = error
+    return made
+
+
+def prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
     """What to commit for one frame: descriptors, fields, and of the picture what the map keeps."""
     encoding, keep = encoded.encoding, map_.record.keep
     if len(encoding.regions) == 0:

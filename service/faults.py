@@ -65,3 +65,67 @@ class NotReady(Fault):
 
 class EncoderNotInstalled(Fault):
     """The map is bound to an encoder that this installation lacks."""
+
+
+class FrameNeeded(Fault):
+    """A place was to keep its frame, which was named by a digest, but holds another one or is not there."""
+
+
+class UnknownExplanation(Fault):
+    """There is no picture of an explanation under this name, or not any more."""
+
+
+class PlaceTaken(Fault):
+    """The id is that of a place with another frame, which is not to be replaced."""
+
+
+class UnknownJob(Fault):
+    """There is no job of this id, or it ended so long ago that it is forgotten."""
+
+
+class JobEnded(Fault):
+    """The job has ended, so there is nothing to cancel."""
+
+
+class JobQueueFull(Fault):
+    """So many jobs wait that one more is not taken."""
+
+
+class JobLost(Fault):
+    """The service ended before the job did, and a job of this kind cannot be taken up again."""
+
+
+class ImagesMissing(Fault):
+    """The map does not keep the image of every place, so it cannot be encoded anew."""
+
+
+class MergeConflict(Fault):
+    """The maps cannot be merged as they are: ids, sequences or cameras of the same name mean different things."""
+
+
+class NothingToMeasure(Fault):
+    """The map holds no frames by which the recall could be measured."""
+
+
+class TooManyWatchers(Fault):
+    """So many follow jobs already that one more is not served."""
+
+
+class UnknownSession(Fault):
+    """The map has no session of this id."""
+
+
+class SessionExpired(Fault):
+    """The session is over: nothing came for too long, or its map is another one now."""
+
+
+class TooManySessions(Fault):
+    """So many sessions are kept, or they hold so much memory, that one more has to wait for another to end."""
+
+
+class FrameOutOfOrder(Fault):
+    """The frame is older than one that the session has taken in, or was taken in already."""
+
+
+class StreamTaken(Fault):
+    """Another connection streams into the session."""

@@ -1,43 +1,36 @@
-"""The encoder's turn: one frame at a time in a thread of its own, behind a bounded queue.
-
-torch uses every core for one frame, so frames are encoded one after the other; the event loop only
-waits.  Grouping waiting frames into one forward pass belongs here, in ``Inference.encode``.
-"""
+"""Frames on their way through the encoder: a place in the bounded queue, a turn, patience that may end before it."""
 
 from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 
-from core.encoder import Encoder, Encoding
+from core.encoder import Encoder
 from core.encoders import EncoderCatalogue
-from core.images import Limits, decode
-from core.preprocessing import Pixels
-from service.faults import ClientGone, DeadlineExceeded, QueueFull
+from core.images import Limits
+from core.masks import Mask
+from core.threads import share_cores
+from service.faults import ClientGone, QueueFull
 from service.metrics import Metrics
+from service.microbatches import MOST_BULK, Encoded, MicroBatches, Turn, late
 
-Result = TypeVar("Result")
+__all__ = ["Encoded", "Inference", "Outcomes", "Patience"]
+
+Outcomes = list[tuple[int, Encoded | Exception]]
+"""What became of some frames of many, each with its index."""
+
+AHEAD = 3 * MOST_BULK
+"""Frames of one bulk request that wait at a time: enough that the encoder never waits for it."""
 
 
-@dataclass(frozen=True)
-class Encoded:
-    """A frame, decoded and encoded.
-
-    pixels: H x W x 3 uint8, BGR.
-    milliseconds: of ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad``.
-    """
-
-    pixels: Pixels
-    encoding: Encoding
-    encoder: Encoder
-    milliseconds: dict[str, float]
+UNWATCHED = 0.02
+"""Seconds for which nobody looks whether the caller of one frame is still there: most have their answer by then."""
 
 
 @dataclass(frozen=True)
@@ -65,25 +58,29 @@ class Inference:
     def __init__(
         self, catalogue: EncoderCatalogue, limits: Limits, queue_length: int, threads: int, metrics: Metrics
     ) -> None:
-        self._catalogue, self._limits, self._metrics = catalogue, limits, metrics
+        self._catalogue, self._metrics = catalogue, metrics
         self._queue_length, self._waiting = queue_length, 0
         self._loaded: dict[str, Encoder] = {}
-        if threads:
-            torch.set_num_threads(threads)
-        self._worker = ThreadPoolExecutor(1, "encoder")
+        share_cores(threads or torch.get_num_threads())
+        self._batches = MicroBatches(self._load, limits, metrics.encoded_together.observe)
 
     def close(self) -> None:
         """Drop what waits and end the thread."""
-        self._worker.shutdown(wait=True, cancel_futures=True)
+        self._batches.close()
 
     def check_room(self) -> None:
         """Raise QueueFull if there is no place in the queue now; cheap, for before a body is read."""
         if self._waiting >= self._queue_length:
             raise QueueFull("Too many requests wait for the encoder; send this one again in a moment.")
 
+    @property
+    def waiting(self) -> int:
+        """Requests that have a place in the queue now."""
+        return self._waiting
+
     @contextmanager
     def place_in_queue(self) -> Iterator[None]:
-        """A place in the queue for one request, whose frames are encoded one by one within.
+        """A place in the queue for one request, whose frames are encoded within.
 
         Raises:
             QueueFull: none is free.
@@ -106,7 +103,7 @@ class Inference:
         """
         if identity in self._loaded:
             return self._loaded[identity]
-        return await asyncio.wrap_future(self._worker.submit(self._load, identity))
+        return await asyncio.wrap_future(self._batches.call(lambda: self._load(identity)))
 
     def _load(self, identity: str) -> Encoder:
         if identity not in self._loaded:
@@ -115,7 +112,7 @@ class Inference:
             self._loaded[identity] = encoder
         return self._loaded[identity]
 
-    async def encode(self, identity: str, data: bytes, patience: Patience) -> Encoded:
+    async def encode(self, identity: str, data: bytes, patience: Patience, mask: Mask | None = None) -> Encoded:
         """Decode and encode one frame when its turn comes; call it within ``place_in_queue``.
 
         Raises:
@@ -123,38 +120,84 @@ class Inference:
             InvalidImage: it cannot be decoded.
             UnknownEncoder, InvalidModel: as for ``load``.
         """
-        queued = time.perf_counter()
-
-        def work() -> Encoded:
-            return self._encode(identity, data, 1e3 * (time.perf_counter() - queued))
-
-        encoded = await self._in_turn(work, patience)
+        if patience.left() <= 0:
+            raise late()
+        turn = Turn(identity, data, mask, patience.deadline)
+        self._batches.put([turn])
+        result = asyncio.wrap_future(turn.result)
+        gone: asyncio.Future[Any] | None = None
+        try:
+            await asyncio.wait({result}, timeout=min(UNWATCHED, patience.left()))
+            if not result.done():
+                gone = asyncio.ensure_future(patience.hung_up())
+                waited: set[asyncio.Future[Any]] = {result, gone}
+                left = max(0.0, patience.left())
+                await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            # A frame that the encoder has begun is finished: dropping it would save nothing.
+            if not result.done() and turn.result.cancel():
+                raise _gone() if gone is not None and gone.done() else late()
+            encoded = await result
+        finally:
+            if gone is not None:
+                gone.cancel()
+            result.cancel()
         self._metrics.observe_stages(encoded.milliseconds)
         return encoded
 
-    def _encode(self, identity: str, data: bytes, wait: float) -> Encoded:
-        encoder = self._load(identity)
-        began = time.perf_counter()
-        pixels = decode(data, self._limits)
-        decoded = 1e3 * (time.perf_counter() - began)
-        encoding = encoder.encode(pixels)
-        return Encoded(pixels, encoding, encoder, {"wait": wait, "decode": decoded, **encoding.milliseconds})
+    async def encode_many(
+        self,
+        identity: str,
+        frames: Sequence[bytes],
+        patience: Patience,
+        masks: Sequence[Mask | None] | None = None,
+    ) -> AsyncGenerator[Outcomes]:
+        """Encode the frames of a bulk request, some ahead at a time; call it within ``place_in_queue``.
 
-    async def _in_turn(self, work: Callable[[], Result], patience: Patience) -> Result:
-        if patience.left() <= 0:
-            raise DeadlineExceeded("The request's time was up before its frame was encoded.")
-        job = self._worker.submit(work)
-        result = asyncio.wrap_future(job)
+        They share forward passes with one another and with what others ask for, and a robot's frame goes first.
+        What is given up, for whatever reason, is taken out of the queue.
+
+        Yields:
+            What became of frames, with their indices, as they get done: in order but for those that fail. An
+            error is that of ``encode`` and one frame's own, or everyone's (a deadline, an encoder that is damaged).
+        """
+        hidden = [None] * len(frames) if masks is None else masks
+        open_: dict[asyncio.Future[Encoded], tuple[int, Turn]] = {}
+        begun, bulk = 0, len(frames) > 1
         gone = asyncio.ensure_future(patience.hung_up())
         try:
-            waited: set[asyncio.Future[Any]] = {result, gone}
-            await asyncio.wait(waited, timeout=patience.left(), return_when=asyncio.FIRST_COMPLETED)
-            # A frame that the encoder has begun is finished: dropping it would save nothing.
-            if not result.done() and job.cancel():
-                if gone.done():
-                    raise ClientGone("The caller hung up before its frame was encoded.")
-                raise DeadlineExceeded("The request's time was up before its frame was encoded.")
-            return await result
+            while begun < len(frames) or open_:
+                following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
+                turns = [Turn(identity, frames[i], hidden[i], patience.deadline, bulk) for i in following]
+                self._batches.put(turns)
+                open_ |= {asyncio.wrap_future(turn.result): (i, turn) for i, turn in zip(following, turns, strict=True)}
+                begun = following.stop
+                waited: set[asyncio.Future[Any]] = {*open_, gone}
+                await asyncio.wait(waited, timeout=max(0.0, patience.left()), return_when=asyncio.FIRST_COMPLETED)
+                done = [(future, *open_.pop(future)) for future in [*open_] if future.done()]
+                if not done and (begun < len(frames) or any(turn.result.cancel() for _, turn in open_.values())):
+                    raise _gone() if gone.done() else late()
+                if not done:  # all that is left was begun before the time was up
+                    await asyncio.wait(open_)
+                    continue
+                for future, _, _ in done:
+                    if future.exception() is None:
+                        self._metrics.observe_stages(future.result().milliseconds)
+                yield [(i, _outcome(future)) for future, i, _ in done]
         finally:
             gone.cancel()
-            result.cancel()
+            for future, (_, turn) in open_.items():
+                turn.result.cancel()
+                future.cancel()
+
+
+def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:
+    error = future.exception()
+    if error is None:
+        return future.result()
+    if isinstance(error, Exception):
+        return error
+    raise error
+
+
+def _gone() -> ClientGone:
+    return ClientGone("The caller hung up before its frame was encoded.")

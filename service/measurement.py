@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 import numpy as np
 import torch
 from torch import nn
 
-from core.encoder import Encoder
+from core.encoder import Encoder, Encoding
 from core.images import decode
 from core.preprocessing import Pixels, prepare
+from core.storage.descriptors import ROWS_PER_SEGMENT
+from core.storage.snapshot import Snapshot
+from core.storage.spots import Spot
+from core.threads import each
+from core.verdict import NO_POSE
+from service.localization import examine
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
 
@@ -88,6 +94,21 @@ def encoding_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], objec
         "decode": lambda: decode(data),
         "regions": lambda: encoder.extractor.regions(activations),
     }
+
+
+def encode_batch(encoder: Encoder, frames: Sequence[bytes]) -> list[Encoding]:
+    """Decode and encode frames as fast as this process can: the cores decode some each, and encode some each."""
+    return encoder.encode_batch(each(decode, frames, torch.get_num_threads()))
+
+
+def search_run(encoder: Encoder, places: int) -> Callable[[], object]:
+    """A search of both stages among so many places of random values, one of which is asked for."""
+    random, middle = np.random.default_rng(0), places // 2
+    known = random.standard_normal((places, encoder.dimension), np.float32)
+    local = random.integers(-127, 128, (places, *encoder.local_shape), np.int8)
+    empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape)
+    snapshot = empty.appended(list(known), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
+    return lambda: examine(encoder, snapshot, local[middle], snapshot.search(known[middle]))
 
 
 def better_forward(times: Mapping[str, float]) -> float:

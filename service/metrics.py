@@ -15,6 +15,7 @@ from core.verdict import Verdict
 FAST = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5)
 SECONDS = (*FAST, 5.0, 10.0, 30.0)
 SCORES = tuple(round(0.05 * step, 2) for step in range(-2, 21))
+TOGETHER = (1, 2, 4, 8, 16, 32, 64, 128)
 ITEMS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -44,6 +45,8 @@ class Metrics:
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry(auto_describe=False)
+        self._requests: dict[tuple[str, str, int], Histogram] = {}
+        self._stages: dict[str, Histogram] = {}
         ProcessCollector(registry=self.registry)
         self.requests = Histogram(
             "placerec_request_seconds",
@@ -65,6 +68,12 @@ class Metrics:
             buckets=FAST,
             registry=self.registry,
         )
+        self.encoded_together = Histogram(
+            "placerec_encoded_together",
+            "Frames that waited together and were encoded together.",
+            buckets=TOGETHER,
+            registry=self.registry,
+        )
         self.searches = Histogram(
             "placerec_search_seconds", "Time of a search in one map.", buckets=FAST, registry=self.registry
         )
@@ -82,10 +91,19 @@ class Metrics:
             "placerec_verdicts", "Queries by their verdict.", ["map", "verdict"], registry=self.registry
         )
 
+    def observe_request(self, route: str, method: str, status: int, seconds: float) -> None:
+        """Count one request."""
+        key = (route, method, status)
+        if key not in self._requests:  # looking a series up costs more than counting in it
+            self._requests[key] = self.requests.labels(route, method, str(status))
+        self._requests[key].observe(seconds)
+
     def observe_stages(self, milliseconds: Mapping[str, float]) -> None:
         """Count the stages of one encoding."""
         for stage, duration in milliseconds.items():
-            self.stages.labels(stage).observe(duration / 1e3)
+            if stage not in self._stages:
+                self._stages[stage] = self.stages.labels(stage)
+            self._stages[stage].observe(duration / 1e3)
 
     def observe_answer(self, map_id: str, verdict: str, score: float | None) -> None:
         """Count the answer to one query."""

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 from service.parameters import BatchItem
 from service.problems import MEDIA_TYPE, Problem, problem_examples
+from service.schemas.calibration import CalibrationOrder
 from service.settings import Settings
 from service.uploads import FORM, FORMATS
 
@@ -39,6 +40,18 @@ def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
     content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
     content[FORM] = {"schema": form, "encoding": {"image": {"contentType": ", ".join(FORMATS)}}}
     return {"requestBody": {"required": True, "description": "A JPEG, PNG or WebP file.", "content": content}}
+
+
+def frames_body(parameters: type[BaseModel]) -> dict[str, Any]:
+    """The body of an operation on the frames of one moment: a raw one, or a form of one part for each camera."""
+    form = {
+        "type": "object",
+        "properties": _form_fields(parameters),
+        "additionalProperties": {**BINARY, "description": "One camera's frame, under any name."},
+    }
+    content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
+    content[FORM] = {"schema": form}
+    return {"requestBody": {"required": True, "description": "JPEG, PNG or WebP files.", "content": content}}
 
 
 def form_body(description: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
@@ -85,8 +98,10 @@ def document(app: FastAPI) -> dict[str, Any]:
             routes=app.routes,
         )
         schemas = made["components"]["schemas"]
-        for model in (Problem, BatchItem):
-            schemas[model.__name__] = model.model_json_schema(ref_template=COMPONENT + "{model}")
+        for model in (Problem, BatchItem, CalibrationOrder):
+            described = model.model_json_schema(ref_template=COMPONENT + "{model}")
+            schemas.update(described.pop("$defs", {}))
+            schemas[model.__name__] = described
         made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
         made["components"]["examples"] = problem_examples()
         for unused in ("HTTPValidationError", "ValidationError"):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
+from core.places import Camera, Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.bodies import json_size
 from service.faults import InvalidRequest
 from service.problems import invalid_request
@@ -62,6 +62,11 @@ class Parameters(BaseModel):
         return validated(type(self), {**given, **fields})
 
 
+CameraName = Annotated[
+    Camera | None, Field(description="The camera of the map that took the frame; its mask is applied.")
+]
+
+
 class PlaceDescription(Parameters):
     """Pose, time and traverse of a frame, flat."""
 
@@ -86,6 +91,7 @@ class PlaceDescription(Parameters):
     sequence: Sequence | None = Field(
         default=None, description="The traverse that the frame belongs to.", examples=["monday"]
     )
+    camera: CameraName = None
 
     def fields(self, metadata: dict[str, Any], settings: Settings) -> PlaceFields:
         """What of it a place keeps.
@@ -99,6 +105,7 @@ class PlaceDescription(Parameters):
             pose=validated(Pose, pose) if pose else None,
             timestamp=self.timestamp,
             sequence=self.sequence,
+            camera=self.camera,
             metadata=metadata,
         )
 
@@ -128,23 +135,28 @@ class BatchParameters(Parameters):
 
 
 class BatchItem(PlaceDescription):
-    """One place of a batch; ``file`` names the form's part that holds the frame."""
+    """One place of a batch: its frame is in a part of the form, or is the one that the place holds already."""
 
     id: str = Field(description="Id of the place.", examples=["p7"])
-    file: str = Field(description="Name of the file part.", examples=["frame7"])
+    file: str | None = Field(default=None, description="Name of the file part.", examples=["frame7"])
+    sha256: str | None = Field(
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        description="Instead of a file: digest of the bytes of the frame that the place holds. If it does, its fields "
+        "are replaced and nothing has to be sent; 409 frame-needed if it does not.",
+    )
     metadata: Annotated[dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)] = Field(
         default_factory=dict
     )
 
+    @model_validator(mode="after")
+    def _names_its_frame(self) -> BatchItem:
+        if (self.file is None) == (self.sha256 is None):
+            raise ValueError("name the frame's part as file, or give its digest as sha256")
+        return self
+
 
 Matches = Annotated[int, Field(ge=1, le=100, description="How many matches to list.")]
-
-
-class QueryParameters(Parameters):
-    """Beside a query."""
-
-    k: Matches = 5
-    encoder: EncoderAssertion = None
 
 
 class EncoderParameters(Parameters):
@@ -152,6 +164,17 @@ class EncoderParameters(Parameters):
 
     encoder: str | None = Field(
         default=None, max_length=256, description="Name or identity; the default encoder if left out."
+    )
+
+
+class MatchParameters(EncoderParameters):
+    """How to compare two frames."""
+
+    explain: bool = Field(default=False, description="Say which words, regions and cells carried the score.")
+    format: Literal["json", "png"] | None = Field(
+        default=None,
+        description="png: both frames side by side, what answers each other joined by lines; if left out, the Accept "
+        "header decides, and json is the default.",
     )
 
 

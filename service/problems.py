@@ -84,8 +84,24 @@ KINDS: dict[type[Exception], Kind] = {
     errors.MapExists: Kind(409, "map-exists", "The map exists already"),
     errors.UnknownPlace: Kind(404, "unknown-place", "No such place"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "No such sequence"),
+    errors.UnknownCamera: Kind(404, "unknown-camera", "No such camera"),
+    faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
     errors.NoThumbnail: Kind(404, "no-thumbnail", "No picture is kept of the place"),
+    errors.CalibrationImpossible: Kind(422, "calibration-impossible", "The map cannot be calibrated so"),
     errors.RevisionMismatch: Kind(412, "revision-mismatch", "The map was changed in between"),
+    # Jobs and upkeep
+    faults.ImagesMissing: Kind(409, "images-missing", "The map lacks images"),
+    faults.MergeConflict: Kind(409, "merge-conflict", "The maps cannot be merged as they are"),
+    faults.NothingToMeasure: Kind(422, "nothing-to-measure", "There is nothing to measure the recall by"),
+    faults.UnknownJob: Kind(404, "unknown-job", "No such job"),
+    faults.JobEnded: Kind(409, "job-ended", "The job has ended already"),
+    faults.JobLost: Kind(503, "job-lost", "The service ended before the job did"),
+    # Sessions
+    faults.UnknownSession: Kind(404, "unknown-session", "No such session"),
+    faults.SessionExpired: Kind(410, "session-expired", "The session is over"),
+    faults.TooManySessions: Kind(429, "too-many-sessions", "Too many sessions"),
+    faults.FrameOutOfOrder: Kind(409, "frame-out-of-order", "The frame comes too late"),
+    faults.StreamTaken: Kind(409, "stream-taken", "Another connection streams into the session"),
     # Storage
     errors.StorageFull: Kind(507, "storage-full", "The disk is full"),
     errors.StorageFailure: Kind(500, "storage-failure", "The disk failed"),
@@ -101,10 +117,14 @@ KINDS: dict[type[Exception], Kind] = {
     faults.InvalidRequest: INVALID_REQUEST,
     faults.UnsupportedMediaType: Kind(415, "unsupported-media-type", "The content type is not taken here"),
     faults.BodyTooLarge: Kind(413, "body-too-large", "The body has too many bytes"),
+    faults.FrameNeeded: Kind(409, "frame-needed", "The place does not hold this frame"),
+    faults.UnknownExplanation: Kind(404, "unknown-explanation", "No such picture, or not any more"),
     # The moment
     faults.QueueFull: Kind(503, "queue-full", "Too many requests wait"),
     faults.MemoryFull: Kind(503, "memory-full", "Too many uploads at one time"),
     faults.DeadlineExceeded: Kind(503, "deadline-exceeded", "The time was up"),
+    faults.JobQueueFull: Kind(503, "job-queue-full", "Too many jobs wait"),
+    faults.TooManyWatchers: Kind(503, "too-many-watchers", "Too many follow jobs"),
     faults.NotReady: Kind(503, "not-ready", "The service is not ready"),
     faults.ClientGone: Kind(499, "client-gone", "The caller hung up"),
 }
@@ -117,7 +137,15 @@ BY_STATUS: dict[int, Kind] = {
 }
 """Kinds of the problems that the framework finds by itself."""
 
-RETRY_LATER = (faults.QueueFull, faults.MemoryFull, faults.DeadlineExceeded, faults.NotReady)
+RETRY_LATER = (
+    faults.QueueFull,
+    faults.MemoryFull,
+    faults.DeadlineExceeded,
+    faults.NotReady,
+    faults.JobQueueFull,
+    faults.TooManyWatchers,
+    faults.TooManySessions,
+)
 
 
 def kind_of(error: Exception) -> Kind:

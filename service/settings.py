@@ -49,6 +49,12 @@ class Settings(BaseSettings):
         description="Encoder that is loaded at start and used where none is named.",
     )
     threads: int = Field(default=0, ge=0, le=1024, description="Threads of one forward pass; 0 uses every core.")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        default="auto",
+        description="Of the forward pass. auto: a lower one only where descriptors stay what they are, measured at "
+        "start; bfloat16: that or no start.",
+    )
+    device: Literal["cpu", "cuda"] = Field(default="cpu", description="Where forward passes are computed.")
     storage_threads: int = Field(
         default=8, ge=1, le=256, description="Searches, reads and writes of maps that run at once."
     )
@@ -81,6 +87,26 @@ class Settings(BaseSettings):
         default=16 * 1024, ge=2, le=MIB, description="Largest metadata of one place, as JSON bytes."
     )
     thumbnail_side: int = Field(default=320, ge=16, le=2048, description="Longer side of a kept thumbnail, in pixels.")
+    job_workers: int = Field(default=1, ge=1, le=16, description="Jobs that run at one time; at most one of each map.")
+    job_queue: int = Field(
+        default=32, ge=1, le=10_000, description="Jobs that may wait; one more is answered with 503."
+    )
+    job_history: int = Field(default=200, ge=1, le=100_000, description="Jobs that have ended and can still be read.")
+    job_watchers: int = Field(default=64, ge=1, le=10_000, description="Clients that may follow jobs at one time.")
+    statistics_seconds: Seconds = Field(
+        default=30.0, description="Seconds between two writings of what queries were answered; a crash loses the last."
+    )
+    max_sessions: int = Field(default=256, ge=1, le=100_000, description="Sessions of all maps together.")
+    max_session_memory: int = Field(
+        default=256 * MIB, ge=MIB, description="Bytes that the beliefs of all sessions may hold; more are refused."
+    )
+    session_expiry: float = Field(
+        default=900.0,
+        gt=0,
+        le=7 * 24 * 3600,
+        allow_inf_nan=False,
+        description="Seconds without a frame after which a session ends; one may ask for less.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least level that is logged."
     )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import typer
 
 from service.commands.bench import bench
+from service.commands.calibrate import calibrate
 from service.commands.console import Commands
 from service.commands.enroll import enroll
 from service.commands.evaluate import evaluate
+from service.commands.jobs import jobs
 from service.commands.maps import maps
 from service.commands.model import model
 from service.commands.query import query
@@ -22,8 +24,9 @@ application = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (serve, enroll, query, evaluate, bench, settings):
+for command in (serve, enroll, query, evaluate, calibrate, bench, settings):
     application.command()(command)
 application.add_typer(maps, name="maps")
+application.add_typer(jobs, name="jobs")
 application.add_typer(vocabulary, name="vocabulary")
 application.add_typer(model, name="model")

@@ -1,74 +1,140 @@
-"""``placerec bench``: how fast this machine recognizes places."""
+"""``placerec bench``: how fast this machine recognizes places, by itself or as a running service."""
 
 from __future__ import annotations
 
 import json
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.client import read_bytes
-from service.commands.console import number, progress, show, table, write_file
+from service.commands.client import Target, ask, path_of, read_bytes
+from service.commands.console import Failure, number, progress, show, table, write_file
 from service.commands.models import ModelsDir, default_encoder, open_catalogue
+
+if TYPE_CHECKING:
+    from core.encoder import Encoder
+
+PICTURES = 16
+"""Frames that the robots send in turn, if none is given."""
 
 
 def bench(
-    image: Annotated[Path | None, typer.Option(help="Frame to encode; default: a 640x480 JPEG made here.")] = None,
+    image: Annotated[Path | None, typer.Option(help="Frame to encode; default: 640x480 JPEGs made here.")] = None,
     encoder: Annotated[str | None, typer.Option(help="Encoder by name or identity.", show_default=False)] = None,
     places: Annotated[int, typer.Option(min=1, help="Places to search among.")] = 1622,
     rounds: Annotated[int, typer.Option(min=3, help="Runs of each; the median counts.")] = 30,
     threads: Annotated[int, typer.Option(min=0, help="Threads of a forward pass; 0 uses every core.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures.")] = None,
     models_dir: ModelsDir = None,
+    url: Annotated[str | None, typer.Option(help="Measure the service at this address instead.")] = None,
+    map_id: Annotated[
+        str | None, typer.Option("--map", "-m", help="With --url: the map to ask; else frames are only encoded.")
+    ] = None,
+    robots: Annotated[
+        list[int] | None, typer.Option(min=1, max=1000, help="With --url: so many at a time; several times.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.2, max=600, help="With --url: for each number of robots.")] = 5.0,
 ) -> None:
-    """Measure encoding against the bare forward pass, the region pass, and a search of both stages, in this process.
+    """Measure encoding stage by stage, in batches, and a search of both stages, in this process.
 
-    What is compared runs interleaved. The scripts in benchmarks/ measure the rest: queries over HTTP, the region
-    pass against its reference, start and memory.
+    With --url: what 1, 4 and 16 robots see of a running service, each of which sends its next frame when it has the
+    answer to the last. It asks and changes nothing.
     """
+    if url is None:
+        figures = _measure_here(image, encoder, places, rounds, threads, models_dir)
+    else:
+        figures = _measure_service(url, map_id, image, robots or [1, 4, 16], seconds)
+    if json_file is not None:
+        write_file(json_file, json.dumps(figures, indent=2) + "\n")
+
+
+def _measure_here(
+    image: Path | None, encoder: str | None, places: int, rounds: int, threads: int, models_dir: Path | None
+) -> dict[str, Any]:
     # Imported here because they take a second.
-    import numpy as np
     import torch
 
-    from core.storage.descriptors import ROWS_PER_SEGMENT
-    from core.storage.snapshot import Snapshot, Spot
-    from core.verdict import NO_POSE
-    from service.localization import examine
-    from service.measurement import better_forward, encoding_runs, jpeg, medians, sample_picture
+    from core.threads import share_cores
+    from service.measurement import (
+        better_forward,
+        encode_batch,
+        encoding_runs,
+        jpeg,
+        medians,
+        sample_picture,
+        search_run,
+    )
 
-    if threads:
-        torch.set_num_threads(threads)
-    chosen = open_catalogue(models_dir).get(encoder or default_encoder())
+    share_cores(threads or torch.get_num_threads())
+    chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
     data = jpeg(sample_picture()) if image is None else read_bytes(image)
     with progress() as bar:
         bar.add_task("Measuring", total=None)
-        random, middle = np.random.default_rng(0), places // 2
-        known = random.standard_normal((places, chosen.dimension), np.float32)
-        local = random.integers(-127, 128, (places, *chosen.local_shape), np.int8)
-        nowhere = Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)
-        empty = Snapshot(chosen.dimension, ROWS_PER_SEGMENT, local_shape=chosen.local_shape)
-        snapshot = empty.appended(list(known), [nowhere] * places, list(local))
-
-        def search() -> object:
-            return examine(chosen, snapshot, local[middle], snapshot.search(known[middle]))
-
-        times = medians({**encoding_runs(chosen, data), "search": search}, rounds)
+        batch = {"batch": lambda: encode_batch(chosen, [data] * PICTURES)}
+        times = medians({**encoding_runs(chosen, data), **batch, "search": search_run(chosen, places)}, rounds)
+        times["batch"] /= PICTURES
     forward = better_forward(times)
-    figures = {
+    shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {torch.get_num_threads()} threads")
+    for name, milliseconds in [("bare forward pass", forward), *times.items()]:
+        called = {"search": f"search of {places}", "batch": f"encode, {PICTURES} together, each"}.get(name, name)
+        shown.add_row(called, number(milliseconds, 2), number(milliseconds / forward, 2))
+    show(shown)
+    return {
         "encoder": chosen.identity,
         "threads": torch.get_num_threads(),
         "places": places,
         "milliseconds": {"forward": forward, **times},
         "ratio": {"encode": times["encode"] / forward},
+        "batched_frames_per_second": 1e3 / times["batch"],
     }
-    shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {figures['threads']} threads")
-    for name, milliseconds in [("bare forward pass", forward), *times.items()]:
-        shown.add_row(
-            f"search of {places}" if name == "search" else name,
-            number(milliseconds, 2),
-            number(milliseconds / forward, 2),
-        )
+
+
+def _measure_service(
+    url: str, map_id: str | None, image: Path | None, robots: list[int], seconds: float
+) -> dict[str, Any]:
+    import subprocess
+
+    from service.load import measure
+    from service.measurement import jpeg, sample_picture
+
+    path = "/v1/encode" if map_id is None else path_of("maps", map_id, "query")
+    version = ask(Target(url, None), "GET", "/version").json()
+    frames = [read_bytes(image)] if image else [jpeg(sample_picture(index)) for index in range(PICTURES)]
+    seen: dict[str, Any] = {}
+    shown = table("robots", "#answers/s", "#p50 ms", "#p95 ms", "#p99 ms", "#refused", title=f"{url}{path}")
+    with tempfile.TemporaryDirectory() as text, progress() as bar:
+        folder = Path(text)
+        for index, data in enumerate(frames):
+            # One that the service cannot take is refused before it is measured.
+            ask(Target(url, None), "POST", path, content=data, headers={"Content-Type": "image/jpeg"})
+            (folder / f"{index}.jpg").write_bytes(data)
+        task = bar.add_task("Driving", total=len(robots))
+        for count in robots:
+            try:
+                found = measure(url, path, folder, count, seconds)
+            except subprocess.CalledProcessError as error:
+                raise Failure(f"{url} hung up on the robots: is it still there?") from error
+            seen[str(count)] = one = summary(found)
+            times = (number(one[name], 1) for name in ("p50", "p95", "p99"))
+            shown.add_row(str(count), number(one["per_second"], 1), *times, str(one["refused"]))
+            bar.advance(task)
     show(shown)
-    if json_file is not None:
-        write_file(json_file, json.dumps(figures, indent=2) + "\n")
+    return {"url": url, "path": path, "service": version, "seconds": seconds, "robots": seen}
+
+
+def summary(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Percentiles in milliseconds, answers a second, and how many were none, of what ``service.load`` measured."""
+    import numpy as np
+
+    times = np.array(found["milliseconds"])
+    statuses: Mapping[str, int] = found["statuses"]
+    return {
+        "answers": len(times),
+        "per_second": len(times) / found["seconds"],
+        **{f"p{p}": float(np.percentile(times, p)) for p in (50, 95, 99)},
+        "statuses": statuses,
+        "refused": sum(count for status, count in statuses.items() if status != "200"),
+    }

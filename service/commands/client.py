@@ -77,7 +77,14 @@ class Service:
         self._client, self._name = client, name
 
     async def request(
-        self, method: str, path: str, *, patience: float = 0.0, headers: dict[str, str] | None = None, **options: Any
+        self,
+        method: str,
+        path: str,
+        *,
+        patience: float = 0.0,
+        final: frozenset[str] = frozenset(),
+        headers: dict[str, str] | None = None,
+        **options: Any,
     ) -> httpx.Response:
         """Send a request and return its successful answer.
 
@@ -85,6 +92,7 @@ class Service:
             path: below the service's root, such as ``/v1/maps``.
             patience: seconds for which the request is sent again, under the same id, while the
                 service is overloaded, starts, or cannot be reached.
+            final: problems after which it is not sent again all the same, by the last part of their type.
             options: as for ``httpx.AsyncClient.request``.
 
         Raises:
@@ -109,9 +117,9 @@ class Service:
             else:
                 if response.is_success:
                     return response
-                failure = refusal(response)
+                failure = refused = refusal(response)
                 wait = retry_after(response, pause)
-                if not is_passing(response):
+                if not is_passing(response) or refused.slug in final:
                     raise failure
             if time.monotonic() + wait > until:
                 raise failure

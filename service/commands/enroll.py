@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -13,25 +12,10 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from service.commands.client import (
-    DataDir,
-    Refused,
-    Service,
-    Target,
-    Url,
-    media_type,
-    open_service,
-    path_of,
-    run,
-)
+from service.commands.bulk import Outcome, enrol_frames
+from service.commands.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress, remark
 from service.commands.manifest import Frame, read_traverse, unlisted
-
-PATIENCE = 120.0
-"""Seconds for which a frame is sent again while the service is overloaded or restarts."""
-
-OF_THE_FRAME = frozenset({400, 413, 415, 422})
-"""Statuses that concern one frame; with any other the rest would most likely fail as well."""
 
 
 @dataclass
@@ -40,7 +24,17 @@ class Report:
 
     changes: Counter[str] = field(default_factory=Counter)
     posed: int = 0
+    uploaded: int = 0
     failures: list[tuple[Path, str]] = field(default_factory=list)
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one frame."""
+        self.uploaded += outcome.uploaded
+        if outcome.change is None:
+            self.failures.append((outcome.frame.path, str(outcome.refusal)))
+        else:
+            self.changes[outcome.change] += 1
+            self.posed += outcome.posed
 
 
 def enroll(
@@ -83,17 +77,21 @@ async def _enroll(
     report = Report()
     async with open_service(target) as service:
         await _ready_map(service, map_id, create, {key: value for key, value in wanted.items() if value is not None})
-        await _check_ids(service, map_id, frames)
+        known = await _check_ids(service, map_id, frames)
         with progress() as bar:
-            # One after the other: the order of enrolment is the order of the frames in their sequence.
-            for frame in bar.track(frames, description=f"Enrolling into {escape(map_id)}"):
-                try:
-                    await _send(service, map_id, frame, wanted["encoder"], report)
-                except Failure as failure:
-                    done = sum(report.changes.values())
-                    raise Failure(
-                        f"{failure} {done} of {len(frames)} frames are enrolled; the same command goes on from there."
-                    ) from failure
+            task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
+
+            def tell(outcome: Outcome) -> None:
+                report.add(outcome)
+                bar.advance(task)
+
+            try:
+                await enrol_frames(service, map_id, frames, known, wanted["encoder"], tell)
+            except Failure as failure:
+                done = sum(report.changes.values())
+                raise Failure(
+                    f"{failure} {done} of {len(frames)} frames are enrolled; the same command goes on from there."
+                ) from failure
     return report
 
 
@@ -109,11 +107,12 @@ async def _ready_map(service: Service, map_id: str, create: bool, settings: dict
         await service.request("POST", path_of("maps"), json={"id": map_id, **settings})
 
 
-async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> None:
-    """Refuse to overwrite the places of another traverse whose files have the same names."""
+async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> frozenset[str]:
+    """Which of the frames' ids the map has; refuses to overwrite the places of another traverse with the same names."""
+    wanted = {frame.id for frame in frames}
     known: dict[str, Any] = {}
     async for page in service.pages(path_of("maps", map_id, "places")):
-        known.update({place["id"]: place["sequence"] for place in page["items"]})
+        known.update({place["id"]: place["sequence"] for place in page["items"] if place["id"] in wanted})
     taken = [frame for frame in frames if frame.id in known and known[frame.id] != frame.sequence]
     if taken:
         other = known[taken[0].id]
@@ -122,29 +121,7 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> 
             f"{'no sequence' if other is None else repr(other)}). Give --id-prefix, for instance "
             f"--id-prefix {taken[0].sequence}-, or the right --sequence."
         )
-
-
-async def _send(service: Service, map_id: str, frame: Frame, encoder: str | None, report: Report) -> None:
-    try:
-        data = await asyncio.to_thread(frame.path.read_bytes)
-        parameters = frame.parameters(data)
-        answer = await service.request(
-            "PUT",
-            path_of("maps", map_id, "places", frame.id),
-            params=parameters if encoder is None else {**parameters, "encoder": encoder},
-            content=data,
-            headers={"Content-Type": media_type(data)},
-            patience=PATIENCE,
-        )
-    except Refused as refused:
-        if refused.status not in OF_THE_FRAME and refused.slug != "internal-error":
-            raise
-        report.failures.append((frame.path, str(refused)))
-    except OSError as error:
-        report.failures.append((frame.path, f"it cannot be read: {error.strerror}."))
-    else:
-        report.changes[answer.json()["change"]] += 1
-        report.posed += len(parameters.keys() & {"x", "latitude"})
+    return frozenset(known)
 
 
 def _show(report: Report, map_id: str, frames: Sequence[Frame], seconds: float) -> None:
@@ -152,7 +129,8 @@ def _show(report: Report, map_id: str, frames: Sequence[Frame], seconds: float) 
     counts = ", ".join(f"{count} {change}" for change, count in sorted(report.changes.items()))
     output.print(
         f"{done} of {len(frames)} frames are places of {map_id}, sequence {frames[0].sequence}"
-        f"{f': {counts}' if counts else ''}; {report.posed} with a pose; {seconds:.1f} s.",
+        f"{f': {counts}' if counts else ''}; {report.posed} with a pose; "
+        f"{report.uploaded} sent in {seconds:.1f} s.",
         soft_wrap=True,
         markup=False,
         highlight=False,

@@ -20,7 +20,7 @@ from service.commands.client import (
     read_bytes,
     run,
 )
-from service.commands.console import complain, number, show, table
+from service.commands.console import Failure, complain, number, show, table
 
 PATIENCE = 30.0
 """Seconds for which a frame is sent again while the service is overloaded."""
@@ -30,6 +30,19 @@ def query(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE…", help="Frames to localize.", show_default=False)],
     map_id: Annotated[str, typer.Option("--map", "-m", help="The map to search.", show_default=False)],
     k: Annotated[int, typer.Option("-k", min=1, max=100, help="How many matches to ask for.")] = 5,
+    near: Annotated[
+        str | None, typer.Option(help="X,Y in metres, or LATITUDE,LONGITUDE with --geographic; with --radius.")
+    ] = None,
+    radius: Annotated[float | None, typer.Option(min=0, help="Metres around --near where the place is.")] = None,
+    geographic: Annotated[bool, typer.Option("--geographic", help="--near is in degrees.")] = False,
+    bbox: Annotated[str | None, typer.Option(help="WEST,SOUTH,EAST,NORTH in degrees.")] = None,
+    sequences: Annotated[str | None, typer.Option(help="Traverses, with commas, of which the place is.")] = None,
+    after: Annotated[str | None, typer.Option(help="The place was taken at this time or later.")] = None,
+    before: Annotated[str | None, typer.Option(help="The place was taken at this time or earlier.")] = None,
+    where: Annotated[str | None, typer.Option(help="JSON object: what the place's metadata has.")] = None,
+    soft: Annotated[
+        str | None, typer.Option(help="What of this is no filter but a prior: position, bbox, sequences, time, where.")
+    ] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a frame and line.")] = False,
@@ -38,19 +51,40 @@ def query(
 
     An unknown place is an answer, not an error; the exit status is 1 only if an image got none.
     """
-    failures = run(_query(Target(url, data_dir), map_id, images, k, as_json))
+    known: dict[str, Any] = {
+        "bbox": bbox,
+        "sequences": sequences,
+        "after": after,
+        "before": before,
+        "where": where,
+        "soft": soft,
+    }
+    known |= {"radius": radius, **_position(near, geographic)}
+    parameters = {"k": k, **{name: value for name, value in known.items() if value is not None}}
+    failures = run(_query(Target(url, data_dir), map_id, images, parameters, as_json))
     if failures:
         raise typer.Exit(1)
 
 
-async def _query(target: Target, map_id: str, images: list[Path], k: int, as_json: bool) -> int:
+def _position(near: str | None, geographic: bool) -> dict[str, Any]:
+    if near is None:
+        return {}
+    parts = near.split(",")
+    if len(parts) != 2:
+        raise Failure(f"--near {near} is not two numbers with a comma between them.")
+    return dict(zip(("latitude", "longitude") if geographic else ("x", "y"), parts, strict=True))
+
+
+async def _query(target: Target, map_id: str, images: list[Path], parameters: dict[str, Any], as_json: bool) -> int:
     failures = 0
-    rows = table("image", "verdict", "place", "#score", "#margin", "best match", "#ms", title=f"Map {map_id}")
+    rows = table(
+        "image", "verdict", "place", "#probability", "#score", "#margin", "best match", "#ms", title=f"Map {map_id}"
+    )
     async with open_service(target) as service:
         for image in images:
             data = read_bytes(image)
             try:
-                answer = await _ask(service, map_id, data, k)
+                answer = await _ask(service, map_id, data, parameters)
             except Refused as refused:
                 if refused.status not in (400, 413, 415, 422):
                     raise
@@ -66,11 +100,11 @@ async def _query(target: Target, map_id: str, images: list[Path], k: int, as_jso
     return failures
 
 
-async def _ask(service: Service, map_id: str, data: bytes, k: int) -> dict[str, Any]:
+async def _ask(service: Service, map_id: str, data: bytes, parameters: dict[str, Any]) -> dict[str, Any]:
     response = await service.request(
         "POST",
         path_of("maps", map_id, "query"),
-        params={"k": k},
+        params=parameters,
         content=data,
         headers={"Content-Type": media_type(data)},
         patience=PATIENCE,
@@ -84,6 +118,7 @@ def _cells(answer: dict[str, Any]) -> list[str]:
     return [
         answer["verdict"],
         answer["place"]["id"] if answer["place"] else "–",
+        number(answer["probability"]),
         number(answer["score"]),
         number(answer["margin"]),
         matches[0]["place"]["id"] if matches else "–",

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 KEEP_ALIVE_SECONDS = 75
 """A robot that sends a frame now and then keeps its connection."""
 
+STOP_POLL_SECONDS = 0.1
+
 
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on; else PLACEREC_HOST.")] = None,
@@ -56,7 +58,9 @@ def _serve(settings: Settings) -> None:
         log_config=None,
         access_log=False,
         server_header=False,
-        ws="none",
+        ws="websockets-sansio",
+        ws_max_size=settings.max_image_bytes,
+        ws_per_message_deflate=False,  # frames are compressed already
         lifespan="off",  # kept by _run, so that an error at the start ends in its sentence
         timeout_keep_alive=KEEP_ALIVE_SECONDS,
         timeout_graceful_shutdown=math.ceil(settings.shutdown_timeout),
@@ -75,4 +79,15 @@ async def _run(application: Any, server: Any, socket: Any) -> None:
         # without handlers of ours the process would end there, and not close its maps.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)
-        await server.serve(sockets=[socket])
+        watch = asyncio.create_task(_stop_early(application.state.engine, server))
+        try:
+            await server.serve(sockets=[socket])
+        finally:
+            watch.cancel()
+
+
+async def _stop_early(engine: Any, server: Any) -> None:
+    """Tell jobs, and those who follow them, when the server begins to stop: it waits for them, but not for ever."""
+    while not server.should_exit:
+        await asyncio.sleep(STOP_POLL_SECONDS)
+    engine.jobs.stop_soon()

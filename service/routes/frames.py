@@ -12,6 +12,7 @@ from starlette.responses import JSONResponse, Response
 from core import errors
 from service.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
 from service.engine import in_thread
+from service.explanations import drawing, explained
 from service.faults import (
     BodyTooLarge,
     DeadlineExceeded,
@@ -23,7 +24,7 @@ from service.faults import (
 from service.inference import Encoded
 from service.negotiation import preferred
 from service.openapi import BINARY, form_body, frame_body
-from service.parameters import EncoderParameters, RegionsParameters
+from service.parameters import EncoderParameters, MatchParameters, RegionsParameters
 from service.problems import problem_documentation
 from service.regions import boxes, draw, layer_grids, strongest
 from service.schemas.frames import Box, Descriptor, Layer, MatchScore, Region, RegionsView
@@ -135,26 +136,46 @@ async def regions(
 
 @router.post(
     "/match",
-    openapi_extra=form_body("Two frames.", {"a": BINARY, "b": BINARY, "encoder": {"type": "string"}}, ["a", "b"]),
+    response_model=MatchScore,
+    openapi_extra=form_body(
+        "Two frames.",
+        {
+            "a": BINARY,
+            "b": BINARY,
+            "encoder": {"type": "string"},
+            "explain": {"type": "boolean"},
+            "format": {"type": "string", "enum": ["json", "png"]},
+        },
+        ["a", "b"],
+    ),
+    responses={200: {"description": "The score.", "content": {PNG: {"schema": BINARY}}}},
 )
 async def match(
-    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
-) -> MatchScore:
+    options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+) -> Response:
     """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
     itself reach where parts of it are plain."""
     engine.inference.check_room()
     first, second, fields = await read_pair(request, engine.settings)
-    identity = await in_thread(engine.resolve, options.joined(fields).encoder)
+    options = options.joined(fields)
+    identity = await in_thread(engine.resolve, options.encoder)
     with engine.inference.place_in_queue():
         a = await engine.inference.encode(identity, first, patience)
         b = await engine.inference.encode(identity, second, patience)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
-    return MatchScore(
+    wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
+    explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None
+    if explanation is not None and wanted == "png":
+        drawn = await in_thread(drawing, explanation, a.pixels, b.pixels)
+        return Response(drawn, headers={"X-Encoder": identity, "X-Score": str(explanation.score)}, media_type=PNG)
+    score = MatchScore(
         score=a.encoder.score(a.encoding, b.encoding),
         encoder=identity,
         regions={"a": len(a.encoding.regions), "b": len(b.encoding.regions)},
+        explanation=explanation,
         milliseconds=rounded({**both, "total": milliseconds_since(started(request))}),
     )
+    return JSONResponse(score.model_dump(exclude_none=True))
 
 
 def _times(request: Request, encoded: Encoded) -> dict[str, float]:

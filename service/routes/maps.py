@@ -48,7 +48,13 @@ def show_map(engine: Engine, map_: Map) -> MapView:
     """A map as callers see it."""
     record = map_.record
     calibration = record.calibration or engine.default_calibration(record.encoder)
-    return MapView(**record.model_dump(exclude={"calibration"}), calibration=calibration, places=map_.count_places())
+    return MapView(
+        **record.model_dump(exclude={"calibration", "index", "precision"}),
+        calibration=calibration,
+        index=map_.index_status(),
+        storage=map_.storage_status(),
+        places=map_.count_places(),
+    )
 
 
 @router.post(
@@ -64,8 +70,11 @@ def create_map(new: NewMap, engine: EngineDep, response: Response) -> MapView:
     check_map_id(new.id)
     identity = engine.resolve(new.encoder)
     encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
-    settings = MapSettings(**new.model_dump(exclude={"id", "encoder"}))
-    map_ = engine.atlas.create(new.id, identity, encoder.dimension, settings, encoder.local_shape)
+    settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
+    map_ = engine.atlas.create(
+        new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
+    )
+    map_.open()
     response.headers["ETag"] = entity_tag(map_.record.revision)
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
     return show_map(engine, map_)

@@ -9,6 +9,7 @@ from starlette.responses import Response
 
 from core import errors
 from core.places import check_place_id
+from core.storage import Map
 from core.storage.patches import merge_patch
 from service.batches import item_problem
 from service.bodies import StrictRoute
@@ -24,7 +25,7 @@ from service.dependencies import (
     single_values,
     started,
 )
-from service.engine import Engine
+from service.engine import Engine, camera_mask, in_thread
 from service.enrolment import Candidate, enrol
 from service.faults import (
     BodyTooLarge,
@@ -52,6 +53,7 @@ router = APIRouter(
 ENROLMENT_PROBLEMS = problem_documentation(
     MalformedBody,
     errors.UnknownMap,
+    errors.UnknownCamera,
     errors.WrongEncoder,
     BodyTooLarge,
     UnsupportedMediaType,
@@ -102,7 +104,8 @@ async def enrol_place(
     options = options.joined(frame.fields)
     engine.assert_encoder(map_, options.encoder)
     fields = options.place_fields(engine.settings)
-    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data)], patience))[0]
+    mask = await camera_mask(map_, fields.camera)
+    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data, mask)], patience))[0]
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "change": stored.change}
     return EnrolledPlace(
@@ -121,12 +124,17 @@ async def enrol_places(
     engine: EngineDep,
     patience: PatienceDep,
 ) -> BatchResults:
-    """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit."""
+    """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
+
+    To go on with a traverse that was broken off, name what the places should hold by `sha256` first: only the frames
+    answered with `frame-needed` have to be sent.
+    """
     engine.inference.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)
     _check_batch(entries, files, engine)
+    await in_thread(map_.cameras.all)  # from disk, if they are not in memory yet
     engine.metrics.batches.labels("enrol").observe(len(entries))
 
     results: list[BatchResult | None] = [None] * len(entries)
@@ -135,13 +143,15 @@ async def enrol_places(
         problem = item_problem(request, error)
         results[position] = BatchResult(id=_given_id(entries[position]), status=problem.status, problem=problem)
 
+    ids: set[str] = set()
     candidates: dict[int, Candidate] = {}
     by_name = {part.name: part for part in files}
     for position, entry in enumerate(entries):
         try:
-            candidate = _candidate(entry, by_name, engine)
-            if any(candidate.id == other.id for other in candidates.values()):
+            candidate = _candidate(entry, by_name, map_, engine)
+            if candidate.id in ids:
                 raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
+            ids.add(candidate.id)
             candidates[position] = candidate
         except Exception as error:
             reject(position, error)
@@ -175,15 +185,19 @@ def _check_batch(entries: Any, files: list[Part], engine: Engine) -> None:
         raise InvalidRequest(f"No place of the batch names the file part {spare[0][:80]!r}.")
 
 
-def _candidate(entry: Any, files: dict[str, Part], engine: Engine) -> Candidate:
+def _candidate(entry: Any, files: dict[str, Part], map_: Map, engine: Engine) -> Candidate:
     item = validated(BatchItem, entry)
     check_place_id(item.id)
     fields = item.fields(item.metadata, engine.settings)
+    if item.file is None:
+        return Candidate(
+            item.id, fields, None, map_.cameras.mask(fields.camera), sha256=bytes.fromhex(str(item.sha256))
+        )
     if item.file not in files:
         raise InvalidRequest(f"file: the form has no part named {item.file[:80]!r}.")
     part = files[item.file]
     check_part(part, engine.settings)
-    return Candidate(item.id, fields, part.data)
+    return Candidate(item.id, fields, part.data, map_.cameras.mask(fields.camera))
 
 
 def _given_id(entry: Any) -> str | None:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
+from service.schemas.explanations import ExplanationView
 from service.schemas.fields import Milliseconds
 
 
@@ -68,4 +69,7 @@ class MatchScore(BaseModel):
     )
     encoder: str
     regions: dict[str, int] = Field(description="Of each frame; one without regions scores 0.")
+    explanation: ExplanationView | None = Field(
+        default=None, description="With `explain`: why; a is the query, b the match."
+    )
     milliseconds: Milliseconds

@@ -7,7 +7,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.places import Timestamp
-from core.storage import Keep, MapSettings, SequenceSummary
+from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, SequenceSummary, StorageStatus, TierSetting
+from core.storage.tiers import COMPACT_FROM, INVERTED_FROM
 from core.verdict import Calibration
 from service.schemas.fields import IDENTITY_EXAMPLE, Cursor
 
@@ -25,6 +26,23 @@ MAP_EXAMPLE: dict[str, Any] = {
         "margin": 0.004,
         "background_mean": 0.07,
         "background_deviation": 0.014,
+    },
+    "index": {
+        "setting": "auto",
+        "tier": "exact",
+        "wanted": "exact",
+        "state": "ready",
+        "progress": 1.0,
+        "rows_indexed": 0,
+        "recall": None,
+        "bytes_in_memory": 10902753,
+    },
+    "storage": {
+        "precision": "half",
+        "bytes_per_place": 68742,
+        "descriptors": 7245776,
+        "index": 0,
+        "database": 384512,
     },
     "places": 111,
     "revision": 1,
@@ -49,6 +67,8 @@ class MapView(BaseModel):
         description="When a match is believed; its source is encoder-default until the map has its own. "
         "Null if its encoder is not installed."
     )
+    index: IndexStatus = Field(description="How it is searched; its `setting` is set by sending `index`.")
+    storage: StorageStatus = Field(description="What it takes on disk.")
     places: int
     revision: int = Field(description="Counts the edits; the ETag is made of it.")
     created_at: Timestamp
@@ -83,6 +103,7 @@ class NewMap(MapSettings):
     encoder: str | None = Field(
         default=None, max_length=256, description="Name or full identity; the default encoder if left out."
     )
+    precision: NewPrecision = Field(default="half", description="How its descriptors are kept, for good.")
 
 
 class CalibrationChanges(BaseModel):
@@ -106,6 +127,10 @@ class MapChanges(BaseModel):
     keep: Keep | None = None
     same_place_radius: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     same_place_frames: int | None = Field(default=None, ge=0, le=2**31)
+    index: TierSetting | None = Field(
+        default=None,
+        description=f"auto, exact, compact (auto from {COMPACT_FROM} places on) or inverted (from {INVERTED_FROM}).",
+    )
     calibration: CalibrationChanges | None = None
 
 

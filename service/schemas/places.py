@@ -16,6 +16,7 @@ PLACE_EXAMPLE: dict[str, Any] = {
     "pose": {"x": 1.5, "y": 2.0, "heading": 90.0},
     "timestamp": "2026-11-20T10:00:00Z",
     "sequence": "monday",
+    "camera": None,
     "metadata": {"camera": "front"},
     "regions": 600,
     "picture": "thumbnail",
@@ -36,6 +37,7 @@ class PlaceView(BaseModel):
     pose: ShownPose | None
     timestamp: Timestamp | None = Field(description="When the frame was taken.")
     sequence: str | None = Field(description="The traverse that it belongs to.")
+    camera: str | None = Field(description="Whose mask was applied to the frame.")
     metadata: dict[str, Any]
     regions: int = Field(description="Regions of interest found in the frame.")
     picture: Keep = Field(description="What is kept of the frame.")

@@ -49,7 +49,7 @@ def busy(inference: Inference) -> Iterator[threading.Event]:
         begun.set()
         done.wait(30)
 
-    inference._worker.submit(work)
+    inference._batches.call(work)
     assert begun.wait(5)
     yield done
     done.set()

@@ -19,7 +19,12 @@ OPERATIONS = {
     "create_map", "list_maps", "read_map", "edit_map", "delete_map", "verify_map",
     "enrol_place", "enrol_places", "list_places", "read_place", "edit_place", "forget_place", "see_thumbnail",
     "list_sequences", "delete_sequence",
-    "query", "query_batch", "encode", "regions", "match", "list_encoders",
+    "put_camera", "list_cameras", "read_camera", "forget_camera",
+    "query", "query_batch", "query_maps", "query_or_enrol", "see_explanation",
+    "create_session", "list_sessions", "read_session", "delete_session", "send_frame",
+    "calibrate_map", "reencode_map", "check_health", "prune_map", "merge_map",
+    "list_jobs", "read_job", "follow_job", "cancel_job",
+    "encode", "regions", "match", "list_encoders",
 }  # fmt: skip
 FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")
 

@@ -10,7 +10,7 @@ import pytest
 from tests.service.commands.conftest import Placerec
 from tests.service.server import ROOT
 
-COMMANDS = ["serve", "enroll", "query", "evaluate", "vocabulary", "model", "maps", "bench", "settings"]
+COMMANDS = ["serve", "enroll", "query", "evaluate", "calibrate", "vocabulary", "model", "maps", "bench", "settings"]
 
 
 def test_help_names_every_command(placerec: Placerec) -> None:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import http.server
 import io
 import json
+import re
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,9 +17,10 @@ import httpx
 import pytest
 from PIL import ExifTags, Image
 
+from service.commands.bulk import FIRST_BATCH
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
-from tests.service.server import Server
+from tests.service.server import ROOT, Server
 
 HEADER = "file,id,x,y,z,heading,latitude,longitude,timestamp\n"
 
@@ -163,7 +168,7 @@ def test_a_directory_without_images_is_refused(placerec: Placerec, tmp_path: Pat
 
 
 class FullAfterOne(http.server.BaseHTTPRequestHandler):
-    """A service whose disk is full after the first frame."""
+    """A service whose disk is full after the first batch."""
 
     protocol_version = "HTTP/1.1"
     taken = 0
@@ -179,11 +184,12 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         self.answer(200, "application/json", {"items": [], "next_cursor": None})
 
-    def do_PUT(self) -> None:
-        self.rfile.read(int(self.headers["Content-Length"]))
+    def do_POST(self) -> None:
+        frames = self.rfile.read(int(self.headers["Content-Length"])).count(b"filename=")
         type(self).taken += 1
         if self.taken == 1:
-            self.answer(201, "application/json", {"change": "created"})
+            items = [{"id": None, "status": 201, "change": "created"}] * frames
+            self.answer(200, "application/json", {"items": items})
         else:
             problem = {"type": "urn:placerec:problem:storage-full", "detail": "The disk is full."}
             self.answer(507, "application/problem+json", problem)
@@ -192,13 +198,81 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
         """Nothing: the test's output stays readable."""
 
 
-def test_a_full_disk_ends_the_run(placerec: Placerec, monday: Path) -> None:
+def test_a_full_disk_ends_the_run(placerec: Placerec, tmp_path: Path) -> None:
+    folder = many(tmp_path / "many", 3 * FIRST_BATCH + 1)
     with http.server.HTTPServer(("127.0.0.1", 0), FullAfterOne) as full:
         threading.Thread(target=full.serve_forever, daemon=True).start()
-        stopped = placerec("enroll", monday, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
+        stopped = placerec("enroll", folder, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
         full.shutdown()
-    assert "The disk is full. 1 of 4 frames are enrolled; the same command goes on from there." in stopped.stderr
-    assert FullAfterOne.taken == 2  # the third and fourth were not sent
+    assert f"The disk is full. {FIRST_BATCH} of 49 frames are enrolled; the same command goes on" in stopped.stderr
+    assert FullAfterOne.taken == 2  # what comes after was not sent
+
+
+def many(folder: Path, count: int) -> Path:
+    """A traverse of so many different small frames."""
+    folder.mkdir()
+    for index in range(count):
+        (folder / f"{index}.jpg").write_bytes(jpeg(index, 96, 72))
+    return folder
+
+
+def test_many_frames_keep_their_order_and_are_not_sent_twice(
+    placerec: Placerec, tmp_path: Path, server: Server, map_id: str
+) -> None:
+    folder, url = many(tmp_path / "many", 60), server.client.base_url
+    (folder / "17.jpg").write_bytes(b"not an image")
+    first = placerec("enroll", folder, "--map", map_id, "--url", url, status=1)
+    assert "59 of 60 frames are places" in first.stdout and "60 sent" in first.stdout
+    assert "Error: 17.jpg: " in first.stderr
+    items = server.client.get(f"/v1/maps/{map_id}/places", params={"limit": 100}).json()["items"]
+    assert [place["id"] for place in items] == [str(index) for index in range(60) if index != 17]
+
+    (folder / "17.jpg").write_bytes(jpeg(170, 96, 72))
+    (folder / "30.jpg").write_bytes(jpeg(300, 96, 72))
+    second = placerec("enroll", folder, "--map", map_id, "--url", url)
+    assert "60 of 60 frames are places" in second.stdout
+    assert "1 created, 1 replaced, 58 unchanged" in second.stdout and "2 sent" in second.stdout
+
+    (folder / "places.csv").write_text(HEADER + "5.jpg,,1,2,,,,,\n")
+    moved = placerec("enroll", folder, "--map", map_id, "--url", url)
+    assert "1 updated" in moved.stdout and "0 sent" in moved.stdout
+    assert server.client.get(f"/v1/maps/{map_id}/places/5").json()["pose"]["x"] == 1.0
+
+
+def test_a_service_that_takes_little_at_a_time(
+    placerec: Placerec, tmp_path: Path, tight_server: Server, tight_map: str
+) -> None:
+    folder = many(tmp_path / "many", 14)
+    done = placerec("enroll", folder, "--map", tight_map, "--url", tight_server.client.base_url)
+    assert "14 of 14 frames are places" in done.stdout
+    items = tight_server.client.get(f"/v1/maps/{tight_map}/places").json()["items"]
+    assert [place["id"] for place in items] == [str(index) for index in range(14)]
+
+
+@pytest.mark.soak
+def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) -> None:
+    """Of the command's process, whatever the number of frames; what the service holds grows with its maps alone."""
+    peaks = []
+    for count in (100, 1200):
+        folder, name = tmp_path / str(count), f"soak-{count}"
+        folder.mkdir()
+        for index in range(count):
+            # 300 KB each: all of the larger folder would be 360 MB.
+            (folder / f"{index}.jpg").write_bytes(jpeg(index % 40, 96, 72) + index.to_bytes(4) + bytes(300_000))
+        words = ["enroll", str(folder), "--map", name, "--create", "--url", str(server.client.base_url)]
+        process = subprocess.Popen([sys.executable, "-m", "service.commands", *words], cwd=ROOT)
+        peak = 0
+        while process.poll() is None:
+            status = Path(f"/proc/{process.pid}/status").read_text()
+            found = re.search(r"VmHWM:\s+(\d+)", status)
+            peak = max(peak, int(found[1]) if found else 0)
+            time.sleep(0.05)
+        assert process.returncode == 0
+        assert server.client.get(f"/v1/maps/{name}").json()["places"] == count
+        peaks.append(peak)
+        server.client.delete(f"/v1/maps/{name}")
+    # Kilobytes. A batch, its form, what the client sends of it and the next batch: some 16 MiB each.
+    assert peaks[1] < peaks[0] + 128_000, peaks
 
 
 def test_the_data_of_a_running_service_is_left_alone(

@@ -66,3 +66,19 @@ def test_what_stops_it(placerec: Placerec, server: Server, tmp_path: Path) -> No
     missing = placerec("query", tmp_path / "missing.jpg", "-m", "nowhere", "--url", url, status=1)
     assert "cannot be read" in missing.stderr
     assert placerec("query", image, "-m", "lab", "-k", 101, status=2).exit_code == 2
+
+
+def test_what_is_known_of_the_place(placerec: Placerec, server: Server, traverse: str, tmp_path: Path) -> None:
+    (tmp_path / "again.jpg").write_bytes(encoded(seen_again(scene(5))))
+    asked = ("query", tmp_path / "again.jpg", "-m", traverse, "--url", server.client.base_url, "--json", "-k", 100)
+
+    def ids(*options: object) -> set[str]:
+        (line,) = placerec(*asked, *options).stdout.splitlines()
+        return {match["place"]["id"] for match in json.loads(line)["matches"]}
+
+    assert ids("--near", "10,0", "--radius", 2) == {"p4", "p5", "p6"}
+    assert ids("--near", "10,0", "--radius", 2, "--soft", "position") == {f"p{number}" for number in range(8)}
+    assert ids("--sequences", "tuesday") == ids("--where", '{"floor": 2}') == ids("--bbox", "0,0,1,1") == set()
+    assert ids("--near", "10,0", "--radius", 2, "--geographic") == set()
+    assert "two numbers" in placerec(*asked, "--near", "10", "--radius", 2, status=1).stderr
+    assert "radius" in placerec(*asked, "--near", "10,0", status=1).stderr

@@ -1,0 +1,101 @@
+"""From what was located to what callers are told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from core.position import PoseEstimate
+from core.storage import Map
+from service.dependencies import rounded
+from service.engine import Engine
+from service.inference import Encoded
+from service.localization import Located, calibration_of
+from service.schemas.places import PlaceView
+from service.schemas.queries import EstimatedPose, Match, QueryAnswer
+from service.selection import Selection
+
+
+async def answer_queries(
+    engine: Engine, map_: Map, encoded: Sequence[Encoded], k: int, selection: Selection | None = None
+) -> list[QueryAnswer]:
+    """The answers to frames that were encoded by the map's encoder, in their order; counted.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    seen = [one for one in encoded if len(one.encoding.regions)]
+    encodings = [one.encoding for one in seen]
+    located = await engine.searches.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+    remaining = iter(located)
+    answers = []
+    for one in encoded:
+        answer = answer_of(one, next(remaining)) if len(one.encoding.regions) else blank_answer(map_, one)
+        count_answer(engine, map_, answer)
+        answers.append(answer)
+    return answers
+
+
+def count_answer(engine: Engine, map_: Map, answer: QueryAnswer) -> None:
+    """Count an answer in the service's figures and in those of the map's health."""
+    engine.metrics.observe_answer(map_.record.id, answer.verdict, answer.score)
+    engine.upkeep.observe(map_.record.id, answer)
+    if "search" in answer.milliseconds:
+        engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
+
+
+def answer_of(encoded: Encoded, located: Located) -> QueryAnswer:
+    """The answer to a frame that was searched for."""
+    judgement = located.judgement
+    weights: Sequence[float | None] = located.weights or [None] * len(located.matches)
+    matches = [
+        Match(rank=rank, score=score, weight=weight, place=PlaceView.of(place))
+        for rank, ((score, place), weight) in enumerate(zip(located.matches, weights, strict=True), start=1)
+    ]
+    recognized = judgement.verdict == "recognized"
+    return QueryAnswer(
+        verdict=judgement.verdict,
+        place=matches[0].place if recognized else None,
+        probability=judgement.probability,
+        pose=estimated_pose(located.pose, matches[0].place) if recognized else None,
+        score=judgement.score,
+        margin=judgement.margin,
+        decision=judgement.decision,
+        threshold=located.calibration.threshold,
+        reason=None if matches else "no-place-allowed" if located.scored.places else "empty-map",
+        matches=matches,
+        encoder=encoded.encoder.identity,
+        milliseconds=rounded({**encoded.milliseconds, "search": located.search}),
+    )
+
+
+def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedPose | None:
+    """An estimate as callers see it; in the plane where the best match's pose is."""
+    if estimate is None:
+        return None
+    pose = estimate.pose
+    if best.pose is not None and best.pose.z is None:
+        pose = pose.model_copy(update={"z": None})
+    return EstimatedPose(
+        **pose.model_dump(exclude_none=True),
+        spread=estimate.spread,
+        heading_spread=estimate.heading_spread,
+        places=estimate.places,
+    )
+
+
+def blank_answer(map_: Map, encoded: Encoded) -> QueryAnswer:
+    """The answer to a frame without regions: there is nothing to compare."""
+    return QueryAnswer(
+        verdict="unknown",
+        place=None,
+        probability=None,
+        pose=None,
+        score=None,
+        margin=None,
+        decision=None,
+        threshold=calibration_of(map_, encoded.encoder).threshold,
+        reason="no-regions",
+        matches=[],
+        encoder=encoded.encoder.identity,
+        milliseconds=rounded(encoded.milliseconds),
+    )

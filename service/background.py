@@ -1,0 +1,71 @@
+"""Encoding for jobs: whoever waits for an answer goes first."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from contextlib import aclosing
+from typing import TYPE_CHECKING
+
+from core.masks import Mask
+from service.faults import ClientGone
+from service.inference import Encoded, Patience
+from service.jobs import JobContext
+
+if TYPE_CHECKING:
+    from service.engine import Engine
+
+POLL_SECONDS = 0.2
+"""A job that is to stop gives its frames up within this time."""
+
+STANDING_BACK_SECONDS = 1.0
+"""While requests wait for the encoder a job holds its frames back, but not for longer: it is to end some day."""
+
+LONGEST_SECONDS = 3600.0
+
+
+def stand_back(engine: Engine, context: JobContext) -> None:
+    """Wait while requests wait for the encoder, up to a bound.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+    until = time.monotonic() + STANDING_BACK_SECONDS
+    context.check_cancelled()
+    while engine.inference.waiting and time.monotonic() < until:
+        context.pause(0.01)
+
+
+def encode_behind(
+    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
+) -> list[Encoded | Exception]:
+    """What becomes of frames, in their order, without their pixels; blocks the job's thread.
+
+    They take no place in the queue, which is for requests, and join forward passes as bulk does.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+    stand_back(engine, context)
+    try:
+        return asyncio.run_coroutine_threadsafe(_encode(engine, context, identity, frames, masks), engine.loop).result()
+    except ClientGone:
+        context.check_cancelled()
+        raise
+
+
+async def _encode(
+    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
+) -> list[Encoded | Exception]:
+    async def stopped() -> None:
+        while not (context.cancelled or engine.jobs.stopping):
+            await asyncio.sleep(POLL_SECONDS)
+
+    patience = Patience(time.monotonic() + LONGEST_SECONDS, stopped)
+    made: dict[int, Encoded | Exception] = {}
+    async with aclosing(engine.inference.encode_many(identity, frames, patience, masks)) as outcomes:
+        async for some in outcomes:
+            for index, outcome in some:
+                made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
+    return [made[index] for index in range(len(frames))]

@@ -1,0 +1,126 @@
+"""``placerec calibrate``: when a map's answers are to be believed, measured on the map."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.commands.client import AsJson, DataDir, Target, Url, ask, media_type, path_of, read_bytes
+from service.commands.console import Failure, number, output, remark, show, show_json, table
+
+SHOWN_POINTS = 9
+
+
+def calibrate(
+    map_id: Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)],
+    frames: Annotated[
+        Path | None,
+        typer.Option(help="CSV with the columns file,place: labelled frames beside it; no place: the map lacks it."),
+    ] = None,
+    sequence: Annotated[str | None, typer.Option(help="A traverse of the map, held against its others.")] = None,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(help="CSV with the columns place,shows: what each place of the sequence shows; default: by pose."),
+    ] = None,
+    itself: Annotated[bool, typer.Option("--itself", help="By the map's own frames: better than nothing.")] = False,
+    precision: Annotated[float | None, typer.Option(help="So many of the answers believed are right (0.95).")] = None,
+    false_accept_rate: Annotated[
+        float | None, typer.Option(help="At most so many unknown places are believed.")
+    ] = None,
+    mean_of_negatives: Annotated[bool, typer.Option("--mean-of-negatives", help="The rule of the thesis.")] = False,
+    most: Annotated[int | None, typer.Option(help="Stored frames to ask, spread evenly.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and tell, store nothing.")] = False,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Choose a map's threshold, margin and probabilities by frames whose place is known."""
+    if (frames is not None) + (sequence is not None) + itself != 1:
+        raise typer.BadParameter("name one of --frames, --sequence and --itself")
+    if pairs is not None and sequence is None:
+        raise typer.BadParameter("--pairs goes with --sequence")
+    order: dict[str, Any] = {"target": _target(precision, false_accept_rate, mean_of_negatives), "dry_run": dry_run}
+    order |= {} if most is None else {"most": most}
+    target, path = Target(url, data_dir), path_of("maps", map_id, "calibrate")
+    if frames is not None:
+        rows = _rows(frames, ("file", "place"))
+        names = [f"frame-{index}" for index in range(len(rows))]
+        order |= {
+            "method": "frames",
+            "labels": [{"file": name, "place": place or None} for name, (_, place) in zip(names, rows, strict=True)],
+        }
+        parts: list[tuple[str, Any]] = [("calibration", (None, json.dumps(order), "application/json"))]
+        for name, (file, _) in zip(names, rows, strict=True):
+            data = read_bytes(frames.parent / file)
+            parts.append((name, (file, data, media_type(data))))
+        report = ask(target, "POST", path, files=parts).json()
+    else:
+        order |= {"method": "map"} if itself else {"method": "sequence", "sequence": sequence}
+        if pairs is not None:
+            order["pairs"] = {place: shown or None for place, shown in _rows(pairs, ("place", "shows"))}
+        report = ask(target, "POST", path, json=order).json()
+    show_json(report) if as_json else _show(report)
+
+
+def _target(precision: float | None, false_accept_rate: float | None, mean_of_negatives: bool) -> dict[str, Any]:
+    if (precision is not None) + (false_accept_rate is not None) + mean_of_negatives > 1:
+        raise typer.BadParameter("name one of --precision, --false-accept-rate and --mean-of-negatives")
+    if mean_of_negatives:
+        return {"rule": "mean_of_negatives"}
+    if false_accept_rate is not None:
+        return {"rule": "false_accept_rate", "value": false_accept_rate}
+    return {"rule": "precision", "value": 0.95 if precision is None else precision}
+
+
+def _rows(path: Path, columns: tuple[str, str]) -> list[tuple[str, str]]:
+    """The two columns of a CSV file with a header; the second may be empty.
+
+    Raises:
+        Failure: it cannot be read, lacks a column, or has no row.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file)
+            if not set(columns) <= set(reader.fieldnames or ()):
+                raise Failure(f"{path} needs the columns {','.join(columns)}.")
+            rows = [((row[columns[0]] or "").strip(), (row[columns[1]] or "").strip()) for row in reader]
+    except OSError as error:
+        raise Failure(f"{path} cannot be read: {error.strerror}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise Failure(f"{path} is not a CSV file in UTF-8: {error}.") from error
+    if not rows:
+        raise Failure(f"{path} has no row.")
+    return rows
+
+
+def _show(report: dict[str, Any]) -> None:
+    calibration, measured, held = report["calibration"], report["measurement"], report["measurement"]["cross_validated"]
+    for warning in report["warnings"]:
+        remark(warning)
+    done = "is calibrated" if report["stored"] else "would be calibrated"
+    output.print(
+        f"The map {report['map']} {done} by {measured['frames']} frames: threshold {number(calibration['threshold'])}, "
+        f"margin {number(calibration['margin'])}.",
+        highlight=False,
+    )
+    figures = table("figure", "#value", "#from", "#to")
+    for name in ("precision", "recall", "false_accept_rate"):
+        share = held[name]
+        figures.add_row(name.replace("_", " "), number(share["value"]), number(share["low"]), number(share["high"]))
+    for name, value in (
+        ("area under the ROC", measured["auc_roc"]),
+        ("area under the PR curve", measured["auc_pr"]),
+        ("calibration error", held["reliability"]["ece"]),
+        ("Brier score", held["reliability"]["brier"]),
+    ):
+        figures.add_row(name, number(value), "", "")
+    show(figures)
+    points = table("#threshold", "#precision", "#recall", "#false accepts")
+    shown = measured["points"]
+    for point in shown[:: max(1, len(shown) // SHOWN_POINTS)]:
+        points.add_row(*(number(point[name]) for name in ("threshold", "precision", "recall", "false_accept_rate")))
+    show(points)

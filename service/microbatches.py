@@ -1,0 +1,265 @@
+"""The encoder's thread: frames that wait together are encoded together, a few to a forward pass and a pass to a core.
+
+It never waits for company: a frame that comes while the encoder is free is begun at once, alone.  Those that
+come meanwhile are the next batch, so that batches grow with the load and shrink with it again.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+
+from core.encoder import FRAMES_A_PASS, Encoder, Encoding
+from core.errors import InvalidImage
+from core.images import Limits, decode, read_header
+from core.masks import Mask
+from core.preprocessing import Pixels
+from core.threads import cores, each
+from service.faults import DeadlineExceeded
+
+Result = TypeVar("Result")
+
+MOST_FRAMES = FRAMES_A_PASS * max(2, cores())
+"""Frames of one batch: so many that each core has a forward pass of its own and of full size. More would gain nothing,
+and keep those who come next waiting for longer."""
+
+MOST_BULK = MOST_FRAMES // 2
+"""The same where all frames are of bulk requests, so that a robot's frame comes in between soon."""
+
+MOST_PIXELS = 40_000_000
+"""Pixels of all frames of a batch of more than one: it bounds the memory of what is decoded at one time."""
+
+BULK_SHARE = 4
+"""One frame in so many of a batch is kept for bulk requests, which would otherwise wait for as long as robots ask."""
+
+log = logging.getLogger("placerec.inference")
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A frame, decoded and encoded.
+
+    pixels: H x W x 3 uint8, BGR.
+    milliseconds: of ``wait`` (in the queue), ``decode``, ``forward`` (its share), ``regions``, ``vlad``.
+    """
+
+    pixels: Pixels
+    encoding: Encoding
+    encoder: Encoder
+    milliseconds: dict[str, float]
+
+    def without_pixels(self) -> Encoded:
+        """The same with 0 x 0 pixels: for frames that are kept for a while."""
+        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8))
+
+
+@dataclass(eq=False)
+class Turn:
+    """One frame that waits for the encoder, with the bytes of its file; cancel ``result`` to give it up.
+
+    deadline: ``time.monotonic`` after which it is not begun any more.
+    bulk: it is one of many of its request, and may wait longer than a robot's one frame.
+    """
+
+    identity: str
+    data: bytes
+    mask: Mask | None
+    deadline: float
+    bulk: bool = False
+    result: Future[Encoded] = field(default_factory=Future)
+    queued: float = field(default_factory=time.perf_counter)
+
+    def pixels(self) -> int:
+        """How many the frame has by its header; 0 where that cannot be read, which will show."""
+        try:
+            header = read_header(self.data)
+        except InvalidImage:
+            return 0
+        return header.width * header.height
+
+
+@dataclass(eq=False)
+class _Errand(Generic[Result]):
+    """Something else for the encoder's thread to do."""
+
+    work: Callable[[], Result]
+    result: Future[Result] = field(default_factory=Future)
+
+
+class MicroBatches:
+    """Queue and thread.
+
+    Args:
+        load: gives the encoder of an identity; called in the thread.
+        limits: of a frame.
+        observe: is told the number of frames of each batch.
+    """
+
+    def __init__(self, load: Callable[[str], Encoder], limits: Limits, observe: Callable[[int], None]) -> None:
+        self._load, self._limits, self._observe = load, limits, observe
+        self._errands: deque[_Errand[Any]] = deque()
+        self._robots: deque[Turn] = deque()
+        self._bulk: deque[Turn] = deque()
+        self._closed = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="encoder", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Drop what waits, and end the thread when it has finished what it is at."""
+        with self._changed:
+            self._closed = True
+            waiting: list[Turn | _Errand[Any]] = [*self._errands, *self._robots, *self._bulk]
+            for queue in (self._errands, self._robots, self._bulk):
+                queue.clear()
+            self._changed.notify()
+        for one in waiting:
+            one.result.cancel()
+        self._thread.join()
+
+    def put(self, turns: Iterable[Turn]) -> None:
+        """Let frames wait for their turn; those of one kind keep their order."""
+        with self._changed:
+            for turn in turns:
+                if self._closed:
+                    turn.result.cancel()
+                else:
+                    (self._bulk if turn.bulk else self._robots).append(turn)
+            self._changed.notify()
+
+    def call(self, work: Callable[[], Result]) -> Future[Result]:
+        """Let the thread do something else before the next batch."""
+        errand = _Errand(work)
+        with self._changed:
+            if self._closed:
+                errand.result.cancel()
+            self._errands.append(errand)
+            self._changed.notify()
+        return errand.result
+
+    def _run(self) -> None:
+        while (work := self._next()) is not None:
+            if isinstance(work, _Errand):
+                _settle(work.result, work.work)
+            elif work:
+                self._encode(work)
+
+    def _next(self) -> _Errand[Any] | list[Turn] | None:
+        """What to do now; waits for it; None at the end."""
+        with self._changed:
+            while not (self._closed or self._errands or self._robots or self._bulk):
+                self._changed.wait()
+            if self._closed:
+                return None
+            if self._errands:
+                errand = self._errands.popleft()
+                return errand if errand.result.set_running_or_notify_cancel() else []
+            return self._take()
+
+    def _take(self) -> list[Turn]:
+        """The next batch: frames of one encoder, that of whoever is first; robots before bulk, which keeps a share."""
+        first = (self._robots or self._bulk)[0]
+        most = MOST_FRAMES if self._robots else MOST_BULK
+        kept = most // BULK_SHARE if self._robots and self._bulk else 0
+        taken: list[Turn] = []
+        pixels = 0
+        for queue, limit in ((self._robots, most - kept), (self._bulk, most)):
+            passed: list[Turn] = []
+            while queue and len(taken) < limit:
+                turn = queue.popleft()
+                if turn.identity != first.identity:
+                    passed.append(turn)
+                elif taken and pixels + turn.pixels() > MOST_PIXELS:
+                    passed.append(turn)
+                    break
+                elif turn.result.set_running_or_notify_cancel():
+                    taken.append(turn)
+                    pixels += turn.pixels()
+            queue.extendleft(reversed(passed))
+        return taken
+
+    def _encode(self, batch: Sequence[Turn]) -> None:
+        """Settle each turn of a batch, one way or the other."""
+        now = time.monotonic()
+        for turn in batch:
+            if turn.deadline <= now:
+                turn.result.set_exception(late())
+        try:
+            self._encode_in_time([turn for turn in batch if turn.deadline > now])
+        except Exception as error:  # the encoder cannot be loaded, or there is a defect of ours
+            for turn in batch:
+                if not turn.result.done():
+                    turn.result.set_exception(error)
+
+    def _encode_in_time(self, batch: Sequence[Turn]) -> None:
+        if not batch:
+            return
+        began = time.perf_counter()
+        encoder = self._load(batch[0].identity)
+        decoded = each(self._decode, batch, torch.get_num_threads())
+        shown: list[tuple[Turn, Pixels, float]] = []
+        for turn, (pixels, spent) in zip(batch, decoded, strict=True):
+            if isinstance(pixels, Exception):
+                turn.result.set_exception(pixels)
+            else:
+                shown.append((turn, pixels, spent))
+        outcomes = _encode_frames(encoder, [pixels for _, pixels, _ in shown], [turn.mask for turn, _, _ in shown])
+        if shown:
+            self._observe(len(shown))
+        for (turn, pixels, spent), outcome in zip(shown, outcomes, strict=True):
+            if isinstance(outcome, Exception):
+                turn.result.set_exception(outcome)
+                continue
+            times = {"wait": 1e3 * (began - turn.queued), "decode": spent, **outcome.milliseconds}
+            turn.result.set_result(Encoded(pixels, outcome, encoder, times))
+
+    def _decode(self, turn: Turn) -> tuple[Pixels | Exception, float]:
+        """The pixels of a frame or why there are none, and milliseconds."""
+        began = time.perf_counter()
+        try:
+            pixels: Pixels | Exception = decode(turn.data, self._limits)
+        except Exception as error:
+            if not isinstance(error, InvalidImage):
+                log.exception("a frame could not be decoded")
+            pixels = error
+        return pixels, 1e3 * (time.perf_counter() - began)
+
+
+def late() -> DeadlineExceeded:
+    """The error of a frame whose time was up before its turn."""
+    return DeadlineExceeded("The request's time was up before its frame was encoded.")
+
+
+def _encode_frames(
+    encoder: Encoder, frames: Sequence[Pixels], masks: Sequence[Mask | None]
+) -> list[Encoding | Exception]:
+    """Encode frames together; if that fails each by itself, so that only those fail whose fault it is."""
+    if not frames:
+        return []
+    try:
+        return [*encoder.encode_batch(frames, masks)]
+    except Exception as error:
+        if len(frames) == 1:
+            return [error]
+        log.warning("a batch of %d frames failed and is encoded one by one: %s", len(frames), error)
+    return [
+        outcome
+        for frame, mask in zip(frames, masks, strict=True)
+        for outcome in _encode_frames(encoder, [frame], [mask])
+    ]
+
+
+def _settle(result: Future[Result], work: Callable[[], Result]) -> None:
+    try:
+        result.set_result(work())
+    except BaseException as error:
+        result.set_exception(error)

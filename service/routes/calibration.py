@@ -1,0 +1,214 @@
+"""Calibrating a map: when are its answers to be believed?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter, Depends, Request, Response
+from starlette.responses import JSONResponse
+
+from core import errors
+from core.encoder import Encoder, Encoding
+from core.storage import Map, Snapshot
+from service.bodies import json_size, parse_json
+from service.calibration import Advance, Questions, calibrated, labelled, map_itself, second_traverse, warnings_on
+from service.dependencies import EngineDep, IfMatch, MapId, PatienceDep, expected_revision, single_values
+from service.engine import Engine, camera_mask, in_thread
+from service.faults import (
+    BodyTooLarge,
+    DeadlineExceeded,
+    EncoderNotInstalled,
+    InvalidRequest,
+    JobQueueFull,
+    MalformedBody,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.inference import Patience
+from service.jobs import JobContext
+from service.localization import calibration_of
+from service.parameters import validated
+from service.problems import problem_documentation
+from service.routes.jobs import router as jobs
+from service.schemas.calibration import CalibrationOrder, CalibrationReport
+from service.schemas.jobs import JobView
+from service.uploads import FORM, check_part, is_file, json_part, media_type, read_many
+
+KIND = "calibrate"
+
+router = APIRouter(
+    prefix="/v1/maps/{map}",
+    tags=["calibration"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(
+        MalformedBody,
+        errors.UnknownMap,
+        errors.UnknownPlace,
+        errors.UnknownSequence,
+        errors.UnknownCamera,
+        errors.RevisionMismatch,
+        BodyTooLarge,
+        UnsupportedMediaType,
+        InvalidRequest,
+        errors.CalibrationImpossible,
+        errors.InvalidImage,
+        errors.NoRegions,
+        QueueFull,
+        DeadlineExceeded,
+        JobQueueFull,
+        EncoderNotInstalled,
+        errors.MapQuarantined,
+        errors.StorageFull,
+        errors.StorageFailure,
+    ),
+)
+
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": {"$ref": "#/components/schemas/CalibrationOrder"}},
+            FORM: {
+                "schema": {
+                    "type": "object",
+                    "required": ["calibration"],
+                    "properties": {"calibration": {"$ref": "#/components/schemas/CalibrationOrder"}},
+                    "additionalProperties": {"type": "string", "format": "binary"},
+                }
+            },
+        },
+    }
+}
+
+
+@router.post(
+    "/calibrate",
+    openapi_extra=BODY,
+    response_model=CalibrationReport,
+    responses={202: {"model": JobView, "description": "The job that does it, if `background` is asked for."}},
+)
+async def calibrate_map(
+    map_id: MapId, request: Request, engine: EngineDep, patience: PatienceDep, if_match: IfMatch = None
+) -> CalibrationReport | Response:
+    """Measure when a map's answers are to be believed, and make that its calibration.
+
+    A JSON body asks the map with frames that it holds: those of one traverse, held against the others, or all of
+    them. A form brings frames of its own, each a file part, and the same JSON in a part `calibration` that labels
+    them. Threshold, margin and probability curve follow from the answers; what is told of their worth is
+    cross-validated. A map that is too weak to calibrate so says so, and keeps the calibration it has.
+    """
+    map_ = await engine.map(map_id)
+    expected = expected_revision(if_match, map_.record.revision)
+    if media_type(request) == FORM:
+        order, encodings = await _labelled_frames(engine, map_, request, patience)
+    else:
+        order, encodings = await _order(request), []
+    try:
+        encoder = await in_thread(engine.catalogue.get, map_.record.encoder)
+    except errors.UnknownEncoder as error:
+        raise EncoderNotInstalled(str(error)) from error
+    request.state.noted = {"map": map_id, "method": order.method}
+    if not order.background:
+        return await in_thread(_calibrate, map_, encoder, order, encodings, expected)
+
+    def work(context: JobContext) -> dict[str, Any]:
+        def advance(done: int, total: int) -> None:
+            context.check_cancelled()
+            context.progress(done, total)
+
+        return _calibrate(engine.atlas.get(map_id), encoder, order, [], expected, advance).model_dump(mode="json")
+
+    job = await in_thread(engine.jobs.submit, KIND, map_id, work, order.model_dump(mode="json"))
+    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+
+
+def _calibrate(
+    map_: Map,
+    encoder: Encoder,
+    order: CalibrationOrder,
+    encodings: list[Encoding],
+    expected: int | None,
+    advance: Advance = lambda _done, _total: None,
+) -> CalibrationReport:
+    """Ask, measure and, unless it is a dry run, store."""
+    snapshot = map_.snapshot()
+    previous = calibration_of(map_, encoder)
+    questions = _questions(map_, snapshot, order, encodings)
+    source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
+    found = calibrated(map_, encoder, snapshot, questions, order.target, source, advance)
+    if not order.dry_run:
+        map_.edit({"calibration": found.calibration}, expected)
+    return CalibrationReport(
+        map=map_.record.id,
+        encoder=encoder.identity,
+        method=order.method,
+        target=order.target,
+        stored=not order.dry_run,
+        calibration=found.calibration,
+        previous=previous,
+        measurement=found.measurement,
+        warnings=warnings_on(found, order.method),
+    )
+
+
+def _questions(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: list[Encoding]) -> Questions:
+    if order.method == "frames":
+        assert order.labels is not None
+        return labelled(map_, snapshot, encodings, [label.place for label in order.labels])
+    if order.method == "sequence":
+        assert order.sequence is not None
+        return second_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
+    return map_itself(map_, snapshot, order.most)
+
+
+async def _order(request: Request) -> CalibrationOrder:
+    """The JSON body of a request.
+
+    Raises:
+        UnsupportedMediaType, MalformedBody, InvalidRequest.
+    """
+    kind = media_type(request)
+    if kind != "application/json":
+        raise UnsupportedMediaType(f"It is sent as application/json or {FORM}, not as {kind[:80] or 'nothing'}.")
+    value = parse_json(await request.body(), "The body")
+    json_size(value, "The body")
+    order = validated(CalibrationOrder, value)
+    if order.method == "frames":
+        raise InvalidRequest("method: frames come in a form, with the order in its part 'calibration'.")
+    return order
+
+
+async def _labelled_frames(
+    engine: Engine, map_: Map, request: Request, patience: Patience
+) -> tuple[CalibrationOrder, list[Encoding]]:
+    """The order and the encoded frames of a form, in the order of its labels.
+
+    Raises:
+        InvalidRequest: the labels are not one for each frame.
+        UnknownCamera: the map has none of a label's name.
+        InvalidImage, NoRegions: one cannot be used; nothing is calibrated then.
+    """
+    engine.inference.check_room()
+    value, others = json_part(await read_many(request, engine.settings), "calibration")
+    json_size(value, "The part 'calibration'")
+    order = validated(CalibrationOrder, value)
+    if order.method != "frames" or order.labels is None:
+        raise InvalidRequest("method: a form brings frames; the other methods are asked for by a JSON body.")
+    files = {part.name: part for part in others}
+    wanted = [label.file for label in order.labels]
+    if not all(is_file(part) for part in others) or len(files) != len(others) or sorted(files) != sorted(wanted):
+        raise InvalidRequest("labels: there must be one for each file part of the form, by its name.")
+    for label in wanted:
+        check_part(files[label], engine.settings)
+    masks = [await camera_mask(map_, label.camera) for label in order.labels]
+    with engine.inference.place_in_queue():
+        outcomes = await engine.encode_all_for(map_, [files[name].data for name in wanted], patience, masks)
+    encodings = []
+    for name, outcome in zip(wanted, outcomes, strict=True):
+        if isinstance(outcome, Exception):
+            raise outcome
+        if not len(outcome.encoding.regions):
+            raise errors.NoRegions(f"The frame {name[:80]!r} shows nothing to compare.")
+        encodings.append(outcome.encoding)
+    return order, encodings

@@ -1,0 +1,39 @@
+"""The pictures of explanations: a query and its best match, side by side."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path
+from starlette.responses import Response
+
+from core import errors
+from service.dependencies import EngineDep, MapId, single_values
+from service.faults import UnknownExplanation
+from service.openapi import BINARY
+from service.problems import problem_documentation
+
+router = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
+
+
+@router.get(
+    "/{explanation}",
+    response_class=Response,
+    responses={
+        200: {"description": "Both frames side by side.", "content": {"image/png": {"schema": BINARY}}},
+        **problem_documentation(errors.UnknownMap, UnknownExplanation, errors.MapQuarantined, errors.StorageFailure),
+    },
+)
+def see_explanation(
+    map_id: MapId,
+    name: Annotated[str, Path(alias="explanation", max_length=64, description="As the answer to the query named it.")],
+    engine: EngineDep,
+) -> Response:
+    """See a query beside its best match: cells (or regions) that answer each other are joined by lines.
+
+    `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
+    """
+    engine.atlas.find(map_id)
+    return Response(
+        engine.pictures.fetch(map_id, name), media_type="image/png", headers={"Cache-Control": "private, max-age=600"}
+    )

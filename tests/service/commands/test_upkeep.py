@@ -1,0 +1,79 @@
+"""``placerec maps health|re-encode|prune|merge`` and ``placerec jobs``: on the data directory and over HTTP."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.service.commands.conftest import Placerec
+from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.scenes import encoded, scene
+from tests.service.server import Server
+
+
+@pytest.fixture(params=["here", "over HTTP"])
+def where(request: pytest.FixtureRequest, tmp_path: Path) -> list[str]:
+    """The words that choose the mode; both have the coarse encoder."""
+    if request.param == "here":
+        install_coarse_encoder(tmp_path / "models")
+        return []
+    running: Server = request.getfixturevalue("server")
+    return ["--url", str(running.client.base_url)]
+
+
+@pytest.fixture
+def tuesday(tmp_path: Path) -> Path:
+    """Another traverse, of two other scenes."""
+    folder = tmp_path / "tuesday"
+    folder.mkdir()
+    for index in (5, 6):
+        (folder / f"{index}.jpg").write_bytes(encoded(scene(index)))
+    return folder
+
+
+def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, tuesday: Path) -> None:
+    lab, hall, anew = (f"{name}-{len(where)}" for name in ("looked-after", "taken-in", "made-anew"))
+    for name, folder in ((lab, monday), (hall, tuesday)):
+        placerec("maps", "create", name, "--encoder", COARSE, "--keep", "image", *where)
+        placerec("enroll", folder, "--map", name, *where)
+
+    told = placerec("maps", "merge", lab, hall, "--json", *where)
+    assert json.loads(told.stdout)["result"]["coming"] == 2
+    merged = placerec("maps", "merge", lab, hall, "--yes", "--json", *where)
+    assert json.loads(merged.stdout)["result"]["places"] == 6
+    placerec("maps", "merge", lab, lab, *where, status=1)
+
+    made = placerec("maps", "re-encode", lab, anew, "--encoder", "m-region-vlad", *where)
+    assert "succeeded" in made.stdout
+    assert json.loads(placerec("maps", "show", anew, "--json", *where).stdout)["places"] == 6
+    taken = placerec("maps", "re-encode", lab, anew, *where, status=1)
+    assert anew in taken.stderr
+
+    report = placerec("maps", "health", lab, *where).stdout
+    assert "places" in report and "6" in report
+    assert json.loads(placerec("maps", "health", lab, "--json", *where).stdout)["places"] == 6
+
+    pruned = placerec("maps", "prune", lab, "--similarity", 2, "--yes", "--json", *where)
+    assert json.loads(pruned.stdout)["result"]["removed"] == 0, "nothing is so alike"
+    assert "sequence" in placerec("maps", "prune", lab, "--sequence", "none", *where, status=1).stderr
+
+    listed = json.loads(placerec("jobs", "list", "--map", lab, "--json", *where).stdout)
+    assert [job["kind"] for job in listed] == ["prune", "re-encode", "merge", "merge"]
+    assert "re-encode" in placerec("jobs", "list", "--map", lab, "--state", "succeeded", *where).stdout
+    shown = placerec("jobs", "show", listed[0]["id"], "--json", *where)
+    assert json.loads(shown.stdout) == listed[0]
+    assert "succeeded" in placerec("jobs", "wait", listed[0]["id"], *where).stdout
+    assert "already" in placerec("jobs", "cancel", listed[0]["id"], *where, status=1).stderr
+    placerec("jobs", "show", "none", *where, status=1)
+
+
+def test_a_job_that_fails_ends_in_a_sentence(placerec: Placerec, where: list[str]) -> None:
+    name = f"empty-{len(where)}"
+    placerec("maps", "create", name, "--encoder", COARSE, *where)
+    assert "Traceback" not in placerec("maps", "prune", name, *where, status=1).stderr
+
+
+def test_without_a_service_jobs_are_waited_for(placerec: Placerec) -> None:
+    assert "--url" in placerec("maps", "prune", "lab", "--no-wait", status=1).stderr

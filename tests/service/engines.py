@@ -1,0 +1,66 @@
+"""The engine without HTTP and without its event loop, for jobs that encode nothing, and maps of made-up descriptors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from core.places import PlaceFields, Pose
+from core.storage import Enrolment
+from service.engine import Engine
+from service.job_records import Job
+from service.metrics import Metrics
+from service.settings import Settings
+
+ENCODER = "some@" + "0" * 64
+
+
+@contextmanager
+def engine_at(folder: Path) -> Iterator[Engine]:
+    """The real thing, but for its event loop: a merge encodes nothing."""
+    engine = Engine(Settings(data_dir=folder / "data"), Metrics())
+    engine.jobs.start()
+    try:
+        yield engine
+    finally:
+        engine.jobs.close(10)
+        engine.upkeep.close()
+        engine.inference.close()
+        engine.atlas.close()
+
+
+def enrolments(first: int, count: int, name: str, sequence: str) -> list[Enrolment]:
+    random = np.random.default_rng(first)
+    made = []
+    for number in range(first, first + count):
+        picture = f"picture {number}".encode()
+        fields = PlaceFields(pose=Pose(x=number, y=0), sequence=sequence, metadata={"number": number})
+        descriptor = random.normal(size=8).astype(np.float32)
+        digest = number.to_bytes(32, "big")
+        made.append(Enrolment(f"{name}{number}", fields, descriptor, 5, digest, thumbnail=picture))
+    return made
+
+
+def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
+    """All that a map holds: places, order, pictures and descriptors."""
+    map_ = engine.atlas.get(map_id)
+    outline, snapshot = map_.transfer.outline(), map_.snapshot()
+    rows = np.array([place.row for place in outline], np.int64)
+    descriptors = snapshot.descriptors_at(rows)
+    return [
+        (map_.place(place.id), place.ordinal, map_.transfer.picture(place.id), descriptor.tobytes())
+        for place, descriptor in zip(outline, descriptors, strict=True)
+    ]
+
+
+def end_of(engine: Engine, job: Job) -> Job:
+    until = time.monotonic() + 30
+    while not (found := engine.jobs.get(job.id)).ended:
+        assert time.monotonic() < until, found
+        time.sleep(0.01)
+    return found

@@ -1,0 +1,157 @@
+"""Cameras and their masks over HTTP: kept, applied to frames of both kinds, refused where they make no sense."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from tests.service.scenes import encoded, scene
+from tests.service.server import Server, assert_problem
+
+LOWER = 0.6
+MASK: dict[str, Any] = {"polygons": [[[0, LOWER], [1, LOWER], [1, 1], [0, 1]]]}
+
+
+def behind(number: int, vehicle: int) -> bytes:
+    """A scene of which the lower part shows the vehicle from which it is seen."""
+    pixels = scene(number)
+    height, width = pixels.shape[:2]
+    start = round(LOWER * height)
+    pixels[start:] = cv2.resize(scene(vehicle), (width, height - start))
+    return encoded(np.ascontiguousarray(pixels))
+
+
+def put(client: httpx.Client, map_id: str, name: str, mask: Any) -> httpx.Response:
+    return client.put(f"/v1/maps/{map_id}/cameras/{name}", json={"mask": mask})
+
+
+def test_a_camera_is_made_replaced_listed_and_forgotten(client: httpx.Client, map_id: str) -> None:
+    assert put(client, map_id, "front", None).status_code == 201
+    replaced = put(client, map_id, "front", MASK)
+    assert replaced.status_code == 200 and replaced.json()["mask"] == MASK
+    put(client, map_id, "back", None)
+    listed = client.get(f"/v1/maps/{map_id}/cameras").json()
+    assert [camera["name"] for camera in listed["items"]] == ["back", "front"] and listed["next_cursor"] is None
+    assert client.get(f"/v1/maps/{map_id}/cameras/front").json()["mask"] == MASK
+    assert client.delete(f"/v1/maps/{map_id}/cameras/front").status_code == 204
+    for method in ("GET", "DELETE"):
+        gone = client.request(method, f"/v1/maps/{map_id}/cameras/front")
+        assert_problem(gone, 404, "unknown-camera")
+
+
+def test_the_mask_is_applied_at_enrolment_and_at_query(server: Server, map_id: str) -> None:
+    put(server.client, map_id, "front", MASK)
+    for number in range(8):
+        enrolled = server.enrol(map_id, f"p{number}", behind(number, vehicle=50), camera="front")
+        assert enrolled.status_code == 201 and enrolled.json()["camera"] == "front"
+    # Another vehicle: without the mask it is another picture, with it the same place.
+    with_mask = server.query(map_id, behind(3, vehicle=60), camera="front")
+    assert with_mask["matches"][0]["place"]["id"] == "p3"
+    without = server.query(map_id, behind(3, vehicle=60))
+    assert with_mask["score"] > without["score"] + 0.03
+    same = server.query(map_id, behind(3, vehicle=50), camera="front")
+    assert same["score"] == pytest.approx(with_mask["score"], abs=0.02)
+
+
+def test_the_same_bytes_under_another_mask_are_encoded_again(server: Server, map_id: str) -> None:
+    put(server.client, map_id, "front", MASK)
+    put(server.client, map_id, "plain", None)
+    frame = behind(1, vehicle=50)
+    assert server.enrol(map_id, "p", frame).json()["change"] == "created"
+    # A camera without a mask changes a field, one with a mask the descriptor.
+    assert server.enrol(map_id, "p", frame, camera="plain").json()["change"] == "updated"
+    assert server.enrol(map_id, "p", frame, camera="front").json()["change"] == "replaced"
+    assert server.enrol(map_id, "p", frame, camera="front").json()["change"] == "unchanged"
+    wider = {"polygons": [[[0, 0.5], [1, 0.5], [1, 1], [0, 1]]]}
+    put(server.client, map_id, "front", wider)
+    assert server.enrol(map_id, "p", frame, camera="front").json()["change"] == "replaced"
+
+
+def test_a_batch_names_the_camera_of_each_frame(server: Server, map_id: str) -> None:
+    put(server.client, map_id, "front", MASK)
+    places = [
+        {"id": "a", "file": "one", "camera": "front"},
+        {"id": "b", "file": "two"},
+        {"id": "c", "file": "two", "camera": "back"},
+    ]
+    files: dict[str, Any] = {
+        "places": (None, json.dumps(places), "application/json"),
+        "one": ("one.jpg", behind(1, 50), "image/jpeg"),
+        "two": ("two.jpg", behind(2, 50), "image/jpeg"),
+    }
+    enrolled = server.client.post(f"/v1/maps/{map_id}/places", files=files)
+    assert enrolled.status_code == 200, enrolled.text
+    items = enrolled.json()["items"]
+    assert [item["status"] for item in items] == [201, 201, 404]
+    assert [item["place"]["camera"] for item in items[:2]] == ["front", None]
+    assert items[2]["problem"]["type"].endswith("unknown-camera")
+    answers = server.client.post(
+        f"/v1/maps/{map_id}/query:batch",
+        params={"camera": "front"},
+        files={"f": ("f.jpg", behind(1, 60), "image/jpeg")},
+    ).json()
+    assert answers["items"][0]["answer"]["matches"][0]["place"]["id"] == "a"
+
+
+def test_a_camera_that_is_not_there_is_refused(server: Server, map_id: str) -> None:
+    refused = server.enrol(map_id, "p", behind(1, 50), camera="front")
+    assert_problem(refused, 404, "unknown-camera")
+    url = f"/v1/maps/{map_id}/query"
+    asked = server.client.post(
+        url, params={"camera": "front"}, content=behind(1, 50), headers={"Content-Type": "image/jpeg"}
+    )
+    assert_problem(asked, 404, "unknown-camera")
+    assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
+
+
+def test_the_camera_of_a_place_cannot_be_patched(server: Server, map_id: str) -> None:
+    server.enrol(map_id, "p", behind(1, 50))
+    patched = server.client.patch(f"/v1/maps/{map_id}/places/p", json={"camera": "front"})
+    assert_problem(patched, 422, "invalid-request")
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        {"polygons": []},
+        {"polygons": [[[0, 0], [1, 1]]]},
+        {"polygons": [[[0, 0], [2, 0], [1, 1]]]},
+        {"polygons": [[[0, 0], [1, 0], [1, 1], [0, 1]]]},
+        {"polygons": [[[0, 0], [1, 0], [1, 0.5]]], "colour": "red"},
+        "everything",
+    ],
+)
+def test_a_bad_mask_is_refused_and_nothing_is_kept(client: httpx.Client, map_id: str, mask: Any) -> None:
+    assert_problem(put(client, map_id, "front", mask), 422, "invalid-request")
+    assert client.get(f"/v1/maps/{map_id}/cameras").json()["items"] == []
+
+
+def test_a_map_has_a_limit_of_cameras(client: httpx.Client, map_id: str) -> None:
+    for number in range(256):
+        assert put(client, map_id, f"c{number}", None).status_code == 201
+    assert_problem(put(client, map_id, "one-more", None), 422, "invalid-field")
+    assert put(client, map_id, "c7", MASK).status_code == 200
+
+
+@pytest.mark.parametrize("name", ["-front", "a" * 65, "fr:ont"])
+def test_a_camera_needs_a_name_of_the_form(client: httpx.Client, map_id: str, name: str) -> None:
+    assert_problem(put(client, map_id, name, None), 422, "invalid-request")
+
+
+def test_cameras_outlive_the_process(tmp_path: Any) -> None:
+    running = Server(tmp_path).wait()
+    running.create_map("lab")
+    put(running.client, "lab", "front", MASK)
+    assert running.enrol("lab", "p", behind(1, 50), camera="front").status_code == 201
+    running.kill()
+    again = Server(tmp_path).wait()
+    try:
+        assert again.client.get("/v1/maps/lab/cameras/front").json()["mask"] == MASK
+        assert again.enrol("lab", "p", behind(1, 50), camera="front").json()["change"] == "unchanged"
+    finally:
+        assert again.stop() == 0

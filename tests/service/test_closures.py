@@ -1,0 +1,122 @@
+"""Query, and enrol if unknown: one step, repeatable; over HTTP."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+import httpx
+
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem, text, typed
+
+BACKGROUND = range(40, 48)
+
+
+def close(server: Server, map_id: str, place_id: str, data: bytes, **parameters: object) -> httpx.Response:
+    return server.client.post(
+        f"/v1/maps/{map_id}/query:enrol", params=text({"id": place_id, **parameters}), content=data, headers=typed(data)
+    )
+
+
+def count(server: Server, map_id: str) -> int:
+    places: int = server.client.get(f"/v1/maps/{map_id}").json()["places"]
+    return places
+
+
+def fill(server: Server, map_id: str) -> None:
+    for number in BACKGROUND:
+        server.enrol(map_id, f"b{number}", jpeg(number), x=100 * number, y=0)
+
+
+def test_what_nobody_knows_becomes_a_place(server: Server, map_id: str) -> None:
+    response = close(
+        server, map_id, "p1", jpeg(1), x=3, y=4, heading=90, sequence="run", timestamp="2026-11-20T10:00:00Z",
+        metadata={"floor": 2},
+    )  # fmt: skip
+    assert response.status_code == 201, response.text
+    answer = response.json()
+    assert (answer["verdict"], answer["reason"], answer["place"], answer["change"]) == (
+        "unknown", "empty-map", None, "created",
+    )  # fmt: skip
+    stored = server.client.get(f"/v1/maps/{map_id}/places/p1").json()
+    assert stored == answer["enrolled"]
+    assert stored["pose"] == {"x": 3, "y": 4, "heading": 90} and stored["metadata"] == {"floor": 2}
+    assert (stored["sequence"], stored["timestamp"]) == ("run", "2026-11-20T10:00:00Z")
+
+
+def test_what_is_known_does_not(server: Server, map_id: str) -> None:
+    fill(server, map_id)
+    server.enrol(map_id, "p1", jpeg(1), x=0, y=0)
+    before = count(server, map_id)
+    response = close(server, map_id, "p2", encoded(seen_again(scene(1))))
+    answer = response.json()
+    assert response.status_code == 200 and answer["verdict"] == "recognized" and answer["place"]["id"] == "p1"
+    assert (answer["change"], answer["enrolled"]) == (None, None)
+    assert count(server, map_id) == before
+    assert server.client.get(f"/v1/maps/{map_id}/places/p2").status_code == 404
+
+
+def test_a_request_can_be_repeated(server: Server, map_id: str) -> None:
+    fill(server, map_id)
+    first = close(server, map_id, "p1", jpeg(1), x=0, y=0)
+    again = close(server, map_id, "p1", jpeg(1), x=0, y=0)
+    assert (first.status_code, again.status_code) == (201, 200)
+    assert (again.json()["verdict"], again.json()["change"]) == ("unknown", "unchanged")
+    assert again.json()["enrolled"] == first.json()["enrolled"]
+    assert again.json()["score"] == first.json()["score"], "it does not find itself"
+    assert_problem(close(server, map_id, "p1", jpeg(2)), 409, "place-taken")
+    assert count(server, map_id) == len(BACKGROUND) + 1
+
+
+def test_of_eight_robots_at_one_new_place_one_enrols_it(server: Server, map_id: str) -> None:
+    fill(server, map_id)
+    looks = [encoded(seen_again(scene(1), seed)) for seed in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        responses = list(pool.map(lambda i: close(server, map_id, f"robot-{i}", looks[i], x=0, y=0), range(8)))
+    answers = [response.json() for response in responses]
+    created = [answer["enrolled"]["id"] for answer in answers if answer["change"] == "created"]
+    assert len(created) == 1, answers
+    assert sorted(response.status_code for response in responses) == [200] * 7 + [201]
+    others = [answer for answer in answers if answer["change"] is None]
+    assert [answer["verdict"] for answer in others] == ["recognized"] * 7
+    assert {answer["place"]["id"] for answer in others} == set(created)
+    assert count(server, map_id) == len(BACKGROUND) + 1
+
+
+def test_a_robot_does_not_find_what_it_has_just_enrolled(server: Server, map_id: str) -> None:
+    fill(server, map_id)
+    looks = [encoded(seen_again(scene(1), seed)) for seed in range(3)]
+    for second, look in enumerate(looks[:2]):
+        parameters = {"sequence": "run", "timestamp": f"2026-11-20T10:00:0{second}Z", "exclude_seconds": 30}
+        answer = close(server, map_id, f"r{second}", look, **parameters).json()
+        assert (answer["verdict"], answer["change"]) == ("unknown", "created"), "it stands still"
+    later = {"sequence": "run", "timestamp": "2026-11-20T10:09:00Z", "exclude_seconds": 30}
+    answer = close(server, map_id, "r2", looks[2], **later).json()
+    assert answer["matches"][0]["place"]["id"] in {"r0", "r1"} and answer["change"] is None, "the loop is closed"
+    behind = close(server, map_id, "r3", looks[2], sequence="run", exclude_frames=2).json()
+    assert (behind["verdict"], behind["change"]) == ("unknown", "created")
+
+
+def test_a_blank_frame_is_no_place(server: Server, map_id: str) -> None:
+    response = close(server, map_id, "p1", encoded(blank()))
+    answer = response.json()
+    assert response.status_code == 200
+    assert (answer["verdict"], answer["reason"], answer["change"], answer["enrolled"]) == (
+        "unknown", "no-regions", None, None,
+    )  # fmt: skip
+    assert count(server, map_id) == 0
+
+
+def test_what_cannot_be(server: Server, map_id: str) -> None:
+    data = jpeg(1)
+    path = f"/v1/maps/{map_id}/query:enrol"
+    assert_problem(server.client.post(path, content=data, headers=typed(data)), 422, "invalid-request")
+    assert_problem(close(server, map_id, "a/b", data), 422, "invalid-identifier")
+    assert_problem(close(server, map_id, "p", data, x=1), 422, "invalid-request")
+    assert_problem(close(server, map_id, "p", data, metadata="[]"), 422, "invalid-request")
+    assert_problem(close(server, map_id, "p", data, camera="front"), 404, "unknown-camera")
+    assert_problem(close(server, map_id, "p", data, encoder="other"), 409, "wrong-encoder")
+    assert_problem(close(server, map_id, "p", data, exclude_frames=3), 422, "invalid-request")
+    assert_problem(close(server, "no-such-map", "p", data), 404, "unknown-map")
+    assert_problem(close(server, map_id, "p", b"plainly no picture"), 422, "not-an-image")
+    assert count(server, map_id) == 0
