@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from core.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, MapSettings
+from core.storage import Atlas, Enrolment, MapSettings, NewPrecision
 from service.measurement import sample_picture
 
 ROOT = Path(__file__).parents[1]
@@ -40,18 +40,31 @@ class Process:
 
     def peak_memory(self) -> float:
         """The most memory that it has had resident, in MB (10^6 bytes)."""
-        lines = Path(f"/proc/{self.pid}/status").read_text().splitlines()
-        kilobytes = next(line.split()[1] for line in lines if line.startswith("VmHWM:"))
-        return int(kilobytes) * 1024 / 1e6
+        return peak_memory(self.pid)
+
+
+def peak_memory(pid: int) -> float:
+    """The most memory that a process has had resident, in MB (10^6 bytes); 0 if it has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    kilobytes = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), "0")
+    return int(kilobytes) * 1024 / 1e6
 
 
 @contextmanager
-def service(data_dir: Path, threads: int = 0) -> Iterator[Process]:
-    """``placerec serve`` on a directory, until the block ends; ``threads`` of a forward pass, 0 for torch's choice."""
+def service(data_dir: Path, threads: int = 0, settings: Mapping[str, object] | None = None) -> Iterator[Process]:
+    """``placerec serve`` on a directory, until the block ends.
+
+    Args:
+        threads: of a forward pass, 0 for torch's choice.
+        settings: others, by their variables without the prefix.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    own = {"DATA_DIR": data_dir, "THREADS": threads, "LOG_LEVEL": "warning"}
+    own = {"DATA_DIR": data_dir, "THREADS": threads, "LOG_LEVEL": "warning", **(settings or {})}
     environment = {**os.environ, **{f"PLACEREC_{name}": str(value) for name, value in own.items()}}
     command = [sys.executable, "-m", "service.commands", "serve", "--host", "127.0.0.1", "--port", str(port)]
     began = time.monotonic()
@@ -95,14 +108,26 @@ def descriptors(
         yield descriptor.reshape(-1), np.where(cells_from_a[:, None], real[a][1], real[b][1])
 
 
-def fill_map(data_dir: Path, map_id: str, encoder: Encoder, places: int) -> None:
-    """A map of so many places, written through the storage itself."""
+def one_sequence(_index: int) -> PlaceFields:
+    """All places are of one traverse, and nothing else is known of them."""
+    return PlaceFields(sequence="benchmark")
+
+
+def fill_map(
+    data_dir: Path,
+    map_id: str,
+    encoder: Encoder,
+    places: int,
+    precision: NewPrecision = "half",
+    fields: Callable[[int], PlaceFields] = one_sequence,
+) -> None:
+    """A map of so many places, written through the storage itself; ``fields`` tells what is said of each."""
     atlas = Atlas(data_dir)
     settings = MapSettings(keep="none")
-    made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape)
+    made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape, precision=precision)
     batch: list[Enrolment] = []
     for index, (descriptor, local) in enumerate(descriptors(encoder, places)):
-        batch.append(_enrolment(index, descriptor, local))
+        batch.append(_enrolment(index, descriptor, local, fields(index)))
         if len(batch) == BATCH:
             made.enrol(batch)
             batch = []
@@ -111,10 +136,10 @@ def fill_map(data_dir: Path, map_id: str, encoder: Encoder, places: int) -> None
     atlas.close()
 
 
-def _enrolment(index: int, descriptor: NDArray[np.float32], local: NDArray[np.int8]) -> Enrolment:
+def _enrolment(index: int, descriptor: NDArray[np.float32], local: NDArray[np.int8], fields: PlaceFields) -> Enrolment:
     return Enrolment(
         id=f"p{index:05d}",
-        fields=PlaceFields(sequence="benchmark"),
+        fields=fields,
         descriptor=descriptor,
         local=local,
         regions=600,

@@ -1,110 +1,283 @@
-"""How long one query takes against a map, before any second stage: our snapshot, one plain FAISS index, and NumPy.
+"""How long one query takes against a map, and what it finds, by the number of places and the tier.
 
-    python -m benchmarks.search [--places 100 1622 5000] [--dimension 16384] [--rounds 30] [--json OUT.json]
+    python -m benchmarks.search [--places 1000 10000 100000] [--rounds 30] [--queries 1040] [--keep FOLDER]
+    python -m benchmarks.search --million --keep FOLDER    # up to 1M places: a long run, 20 GB of disk
 
-The three are measured in turns, so that whatever else the machine does falls on all of them alike;
-what is shown are medians, and in the JSON the quartiles too.  All three answer with every place,
-ranked.  A dead row in twenty shows what forgotten places cost.
+Maps are written through the storage (``core.storage``), of real places and distractors synthesized from real
+descriptors (:mod:`benchmarks.references`), and searched as the service searches them: the first stage, and the exact
+comparison of the shortlist with what the disk holds; the encoder's second stage is not in it.  Flat is FAISS's
+IndexFlatIP over float32; over more than 20 000 places its time is that of 20 000, scaled linearly.  All are measured
+in turns, so that whatever else the machine does falls on all of them alike; what is shown are medians.
+
+The truth is the best of all references by float32 inner products, computed while they are written; recall@1 is how
+often just that row comes first.  ``python -m benchmarks.search_plots`` draws the figures.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
+import hashlib
 import statistics
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 import faiss
 import numpy as np
+import torch
+import typer
 from numpy.typing import NDArray
+from rich.progress import Progress
 
-from core.storage.descriptors import ROWS_PER_SEGMENT
-from core.storage.snapshot import Snapshot, Spot
+from benchmarks.references import Material, material
+from benchmarks.report import report, verdict
+from core.encoder import Encoder
+from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.errors import UnknownMap
+from core.places import PlaceFields
+from core.storage import Atlas, Enrolment, Map, MapSettings, NewPrecision
+from core.storage.descriptors import Layout
+from core.storage.snapshot import Snapshot
+from core.threads import cores, share_cores
 
 Array = NDArray[np.float32]
 
-PAUSE = 0.2
+FLAT_PLACES = 20_000
+MILLION = 1_000_000
+PAUSE = 0.05
 """Seconds between two measurements: the threads of a BLAS go on spinning for a while after their work."""
+BLOCK = 2000
 
 
-def made_up_descriptors(places: int, dimension: int) -> Array:
-    """Unit vectors; float32 [places, dimension]."""
-    descriptors = np.random.default_rng(0).standard_normal((places, dimension), dtype=np.float32)
-    descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return descriptors
+@dataclass(frozen=True)
+class Bar:
+    """Times faster than flat and recall@1, at least; bytes of a place in memory and on disk, at most."""
+
+    faster: float
+    recall: float
+    memory: float
+    disk: float
 
 
-def snapshot_of(descriptors: Array) -> Snapshot:
-    """A map as it is after as many enrolments."""
-    snapshot = Snapshot(descriptors.shape[1], ROWS_PER_SEGMENT)
-    for row, descriptor in enumerate(descriptors):
-        snapshot = snapshot.appended([descriptor], [Spot(0, (0.0, 0.0, 0.0), -1, row)])
-    return snapshot
+BARS = {100_000: Bar(50.0, 0.995, 8192, 98_000), MILLION: Bar(200.0, 0.98, 8000, 32_768)}
+GROWTH = 4.0
+"""A query against a million places is to take at most so many times as long as one against a hundred thousand."""
 
 
-def contenders(descriptors: Array) -> dict[str, Callable[[Array], object]]:
-    """What is compared, by name; each takes one query, float32 [D]."""
-    places = len(descriptors)
-    snapshot = snapshot_of(descriptors)
-    forgetful = snapshot.without(list(range(0, places, 20)))
-    plain = faiss.IndexFlatIP(descriptors.shape[1])
-    plain.add(descriptors)
+@dataclass(frozen=True)
+class Best:
+    """The best of the references seen so far, of each query: inner products float32 [q] and rows int64 [q]."""
 
-    def with_numpy(query: Array) -> Array:
-        products: Array = descriptors @ query
-        ranked: Array = products[np.argsort(-products, kind="stable")]
-        return ranked
+    products: Array
+    rows: NDArray[np.int64]
 
-    expected, found = with_numpy(descriptors[0]), snapshot.search(descriptors[0])[1]
-    assert np.allclose(expected, found, atol=1e-5), "the snapshot does not agree with NumPy"
-    return {
-        "snapshot": snapshot.search,
-        "snapshot, 5 % dead": forgetful.search,
-        "IndexFlatIP": lambda query: plain.search(query[np.newaxis], places),
-        "NumPy": with_numpy,
-    }
+    def of(self, queries: torch.Tensor, block: Array, first: int) -> Best:
+        """With the references ``first`` and on seen too."""
+        products, offsets = (found.numpy() for found in (queries @ torch.from_numpy(block).T).max(dim=1))
+        better = products > self.products
+        return Best(np.where(better, products, self.products), np.where(better, offsets + first, self.rows))
 
 
-def measure(runners: dict[str, Callable[[Array], object]], queries: Array, rounds: int) -> dict[str, list[float]]:
-    """Milliseconds of every round, by name; the first round is not counted."""
-    times: dict[str, list[float]] = {name: [] for name in runners}
+def write_map(folder: Path, encoder: Encoder, of: Material, places: int, precision: NewPrecision) -> None:
+    """A map of the first references, and the truth beside it, unless both are there; goes on where it broke off."""
+    done = folder / f"truth-{places}.npz"
+    best, first = Best(np.full(len(of.queries), -np.inf, np.float32), np.zeros(len(of.queries), np.int64)), 0
+    if done.exists():
+        with np.load(done) as kept:
+            best, first = Best(kept["products"], kept["rows"]), int(kept["seen"])
+    if first == places:
+        return
+    atlas = Atlas(folder)
+    try:
+        map_ = atlas.get(_name(places))
+    except UnknownMap:
+        settings = MapSettings(keep="none")
+        map_ = atlas.create(_name(places), encoder.identity, encoder.dimension, settings, precision=precision)
+    queries = torch.from_numpy(of.queries)
+    with Progress() as progress:
+        task = progress.add_task(f"{places:,} places", total=places, completed=first)
+        for start, block in of.blocks(places, BLOCK, first):
+            best = best.of(queries, block, start)
+            map_.enrol([_enrolment(start + offset, row) for offset, row in enumerate(block)])
+            progress.advance(task, len(block))
+            if (start + len(block)) % (25 * BLOCK) == 0 or start + len(block) == places:
+                np.savez(done, products=best.products, rows=best.rows, seen=start + len(block))
+    atlas.close()
+
+
+def _name(places: int) -> str:
+    return f"search-{places}"
+
+
+def _enrolment(row: int, descriptor: Array) -> Enrolment:
+    return Enrolment(f"r{row}", PlaceFields(), descriptor, 600, hashlib.sha256(str(row).encode()).digest())
+
+
+def indexed(map_: Map) -> tuple[Snapshot, float]:
+    """The map with inverted lists, and the seconds that making what was not there took."""
+    began = time.monotonic()
+    map_.edit({"index": "inverted"})
+    while (status := map_.index_status()).state == "building" or status.tier != "inverted":
+        time.sleep(0.1)
+    return map_.snapshot(), time.monotonic() - began
+
+
+def flat_index(of: Material, places: int) -> faiss.IndexFlatIP:
+    """FAISS's exact search over the first references."""
+    index = faiss.IndexFlatIP(of.dimension)
+    for _, block in of.blocks(places, BLOCK):
+        index.add(block)
+    return index
+
+
+@dataclass(frozen=True)
+class Contender:
+    """Something that is searched; ``scale`` is what its time is multiplied by."""
+
+    places: int
+    name: str
+    search: Callable[[Array], object]
+    scale: float = 1.0
+
+
+def measure(contenders: Sequence[Contender], queries: Array, rounds: int) -> list[list[float]]:
+    """Milliseconds of every round, by contender; each round asks another query, and the first is not counted."""
+    times: list[list[float]] = [[] for _ in contenders]
     for turn in range(rounds + 1):
-        for name, run in runners.items():
-            query = queries[turn % len(queries)]
+        for contender, its_times in zip(contenders, times, strict=True):
+            query = queries[turn * 7 % len(queries)]
             time.sleep(PAUSE)
-            start = time.perf_counter()
-            run(query)
-            elapsed = 1000 * (time.perf_counter() - start)
+            began = time.perf_counter()
+            contender.search(query)
+            elapsed = 1e3 * (time.perf_counter() - began)
             if turn:
-                times[name].append(elapsed)
+                its_times.append(contender.scale * elapsed)
     return times
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Time one query against a map.")
-    parser.add_argument("--places", type=int, nargs="+", default=[100, 1622, 5000])
-    parser.add_argument("--dimension", type=int, default=16384)
-    parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
-    cores = len(os.sched_getaffinity(0))
-    results = []
-    print(f"one query, {arguments.dimension} values, {cores} cores, medians of {arguments.rounds} rounds in ms")
-    for places in arguments.places:
-        descriptors = made_up_descriptors(places, arguments.dimension)
-        times = measure(contenders(descriptors), descriptors, arguments.rounds)
-        for name, each in times.items():
-            low, median, high = statistics.quantiles(each, n=4)
-            results.append({"places": places, "name": name, "median": median, "quartiles": [low, high]})
-            print(f"{places:>8} places  {name:<20} {median:8.2f}   ({low:.2f} to {high:.2f})")
-    if arguments.json:
-        about = {"dimension": arguments.dimension, "cores": cores, "machine": platform.machine()}
-        arguments.json.write_text(json.dumps({**about, "rounds": arguments.rounds, "milliseconds": results}, indent=2))
+def recall(snapshot: Snapshot, queries: Array, truth: NDArray[np.int64]) -> float:
+    """How often the first of the ranking is the one that exact float32 products put first."""
+    found = [int(snapshot.search(query)[0][0]) for query in queries]
+    return float(np.mean(np.array(found) == truth))
+
+
+def disk_bytes(map_: Map, encoder: Encoder, precision: NewPrecision, rows_per_segment: int) -> int:
+    """Of a place, with the second stage's cells, which the map measured is spared."""
+    layouts = [
+        Layout(encoder.dimension, encoder.identity, rows_per_segment, shape, precision).record.itemsize
+        for shape in (encoder.local_shape, (0, 0))
+    ]
+    return map_.storage_status().bytes_per_place + layouts[0] - layouts[1]
+
+
+def run(
+    folder: Path, encoder: Encoder, of: Material, sizes: Sequence[int], precision: NewPrecision, rounds: int
+) -> list[dict[str, Any]]:
+    """The figures of every size and tier."""
+    contenders: list[Contender] = []
+    facts: list[dict[str, Any]] = []
+    flats = {places: flat_index(of, places) for places in sorted({min(size, FLAT_PLACES) for size in sizes})}
+    atlas = Atlas(folder)
+    for places in sizes:
+        map_, truth = atlas.get(_name(places)), np.load(folder / f"truth-{places}.npz")["rows"]
+        inverted, seconds = indexed(map_)
+        flat = flats[min(places, FLAT_PLACES)]
+        contenders.append(
+            Contender(
+                places,
+                "flat",
+                lambda query, flat=flat: flat.search(query[np.newaxis], 1),  # type: ignore[misc]
+                places / flat.ntotal,
+            )
+        )
+        facts.append({"memory": 4 * of.dimension, "recall": 1.0})
+        for tier, snapshot in (("compact", replace(inverted, lists=None)), ("inverted", inverted)):
+            contenders.append(Contender(places, tier, snapshot.search))
+            facts.append(
+                {
+                    "memory": snapshot.memory / places,
+                    "disk": disk_bytes(map_, encoder, precision, inverted.rows_per_segment),
+                    "recall": recall(snapshot, of.queries, truth),
+                    "build_seconds": seconds,
+                }
+            )
+    rows = []
+    for contender, times, known in zip(contenders, measure(contenders, of.queries, rounds), facts, strict=True):
+        low, middle, high = statistics.quantiles(times, n=4)
+        about = {"places": contender.places, "tier": contender.name, "milliseconds": middle, "quartiles": [low, high]}
+        rows.append({**about, "scaled_by": contender.scale, **known})
+    atlas.close()
+    return rows
+
+
+def bars(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """What is asked of the larger sizes, and whether it is reached: what, measured, verdict."""
+    found = []
+    for row in rows:
+        bar = BARS.get(row["places"])
+        if bar is None or row["tier"] == "flat":
+            continue
+        name = f"{row['places']:,} {row['tier']}"
+        found += [
+            [f"{name}: times faster than flat", f"{row['faster']:.0f}", verdict(row["faster"], bar.faster, True)],
+            [f"{name}: recall@1", f"{row['recall']:.4f}", verdict(row["recall"], bar.recall, True)],
+            [f"{name}: bytes in memory a place", f"{row['memory']:.0f}", verdict(row["memory"], bar.memory)],
+            [f"{name}: bytes on disk a place", f"{row['disk']:.0f}", verdict(row["disk"], bar.disk)],
+        ]
+    times = {(row["places"], row["tier"]): row["milliseconds"] for row in rows}
+    for tier in ("compact", "inverted"):
+        if (MILLION, tier) in times and (100_000, tier) in times:
+            growth = times[MILLION, tier] / times[100_000, tier]
+            found.append([f"growth from 100,000 to 1,000,000, {tier}", f"{growth:.2f}", verdict(growth, GROWTH)])
+    return found
+
+
+def show(name: str, rows: Sequence[dict[str, Any]], figures: dict[str, Any]) -> None:
+    """Print the tables and keep the figures."""
+    flat = {row["places"]: row["milliseconds"] for row in rows if row["tier"] == "flat"}
+    table = []
+    for row in rows:
+        row["faster"] = flat[row["places"]] / row["milliseconds"]
+        scaled = ", scaled" if row["scaled_by"] > 1 else ""
+        kept = [f"{row['memory']:.0f}", f"{row.get('disk', 0):.0f}"]
+        what = f"{row['places']:,} {row['tier']}{scaled}"
+        table.append([what, row["milliseconds"], f"{row['faster']:.1f}", f"{row['recall']:.4f}", *kept])
+    columns = ["places and tier", "ms", "times faster", "recall@1", "memory, B", "disk, B"]
+    title = f"one query; medians of {figures['rounds']} rounds; memory and disk of a place"
+    report(name, title, columns, table, {"rows": rows, **figures})
+    for line in bars(rows):
+        print(f"{line[0]:<50} {line[1]:>8}   {line[2]}")
+
+
+def main(
+    places: Annotated[list[int] | None, typer.Option(help="Sizes; default 1 000, 10 000 and 100 000.")] = None,
+    million: Annotated[bool, typer.Option("--million", help="100 000 and 1 000 000 places, compressed.")] = False,
+    rounds: int = 30,
+    queries: Annotated[int, typer.Option(help="Spread evenly over all there are.")] = 1040,
+    datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+    keep: Annotated[Path | None, typer.Option(help="Where maps lie, used again when they are there.")] = None,
+) -> None:
+    """Measure and report."""
+    share_cores(cores())
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    of = material(datasets, encoder, cache)
+    asked = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
+    of = replace(of, queries=of.queries[asked], walks=of.walks[asked])
+    sizes = [100_000, MILLION] if million else places or [1000, 10_000, 100_000]
+    precision: NewPrecision = "compressed" if million else "half"
+    with ExitStack() as stack:
+        folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        for size in sizes:
+            write_map(folder, encoder, of, size, precision)
+        rows = run(folder, encoder, of, sizes, precision, rounds)
+    figures = {"encoder": encoder.identity, "precision": precision, "rounds": rounds, "queries": len(of.queries)}
+    show("search-million" if million else "search", rows, figures)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -1,0 +1,188 @@
+"""What following a run is worth: recall@1 of single frames, of the filter and of the path search; and what it costs.
+
+    python -m benchmarks.sequences --data ../shared/datasets/eval
+
+Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
+training/alignment.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
+bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
+Nothing is told of the motion, and no map has poses.  Beside it, over 5 000 places with poses, the time that one
+frame's belief takes, against encoding a frame in the same minute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from benchmarks.report import report, verdict
+from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, evidence, place_graph
+from core.encoder import Encoder
+from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.examination import examine
+from core.images import decode
+from core.storage import MapSettings
+from core.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
+from service.measurement import jpeg, medians, sample_picture
+from training.alignment import aligned_truth
+from training.photographs import find_photographs, read
+from training.validation import Shown, describe
+
+Truth = NDArray[np.bool_]
+
+HEAD = 500
+SAME_PLACE = Neighborhood(MapSettings().same_place_radius, MapSettings().same_place_frames)
+FRAMES = 15
+"""Tolerance of nordland_tiny, as is customary."""
+
+TRAVERSES = {
+    "lip6_outdoor": ("query", "reference"),
+    "nordland_tiny": ("winter", "summer"),
+    "corridor": ("query", "ref"),
+}
+FILTERS = {"bayes": RunOptions(), "path": RunOptions(filter="path")}
+HALVED, RECALL, SHARE = 0.5, 0.9, 0.2
+
+
+def walked(count: int) -> Whereabouts:
+    """One sequence without poses."""
+    return Whereabouts(
+        np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), np.zeros(count, np.int32), np.arange(count)
+    )
+
+
+def evidences(
+    encoder: Encoder, queries: Shown, references: Shown, where: Whereabouts
+) -> Iterator[tuple[int, Evidence]]:
+    """Of each query in turn: its best reference alone, and what it says of all, both stages as the service has them."""
+    for descriptor, local in zip(queries.descriptors, queries.local, strict=True):
+        scores = encoder.scores_from_inner_products(references.descriptors @ descriptor)
+        rows = np.argsort(-scores, kind="stable")[:HEAD]
+
+        def gains(positions: NDArray[np.int64], local: Any = local, rows: Any = rows) -> NDArray[np.float32]:
+            return encoder.agreement(local, references.local[rows[positions]])
+
+        found = examine(scores[rows], where.take(rows), SAME_PLACE, encoder.candidates, gains)
+        ranked = rows[found.order]
+        seen = evidence(ranked, found.scores, where.take(ranked), encoder.calibration, SAME_PLACE, found.examined)
+        yield int(ranked[0]), seen
+
+
+def followed(told: list[tuple[int, Evidence]], graph: PlaceGraph, options: RunOptions) -> list[int]:
+    """The place believed most after each frame."""
+    run, alive, best = Run(options, graph), np.ones(len(graph), np.bool_), []
+    for _, seen in told:
+        run.advance(seen, Step())
+        best.append(run.estimate(1, alive).candidates[0].row)
+    return best
+
+
+def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -> dict[str, Truth]:
+    """What is right, by each truth that there is."""
+    if name == "nordland_tiny":
+        apart = np.abs(np.arange(len(queries))[:, None] - np.arange(len(references)))
+        return {f"±{FRAMES}": apart <= FRAMES}
+    stated = np.zeros((len(queries), len(references)), np.bool_)
+    rows = np.loadtxt(folder / "ground_truth.csv", np.int64, delimiter=",", skiprows=1)
+    stated[rows[:, 0], rows[:, 1]] = True
+    if name != "lip6_outdoor":
+        return {"stated": stated}
+    return {"put right": aligned_truth(queries, references, stated), "stated": stated}
+
+
+def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) -> dict[str, dict[str, Any]]:
+    """By each truth of a pair of traverses: queries, and wrong answers of single frames and of each filter.
+
+    Args:
+        frames: of each traverse only the first so many.
+    """
+    folder = data / name
+    asked, known = ([read(path) for path in find_photographs(folder / part)][:frames] for part in TRAVERSES[name])
+    where = walked(len(known))
+    graph = place_graph(where, np.arange(len(known)), len(known), SAME_PLACE)
+    told = list(evidences(encoder, describe(encoder, asked), describe(encoder, known), where))
+    answers = {"single": [best for best, _ in told]}
+    answers |= {filter_: followed(told, graph, options) for filter_, options in FILTERS.items()}
+    everyone = np.arange(len(asked))
+    return {
+        truth: {"queries": len(asked)} | {how: int((~right[everyone, best]).sum()) for how, best in answers.items()}
+        for truth, right in truths(name, folder, asked, known).items()
+    }
+
+
+def costs(encoder: Encoder, places: int, rounds: int) -> dict[str, float]:
+    """Milliseconds of encoding a frame, and of one frame's belief by each kind of motion; medians in one run."""
+    random = np.random.default_rng(0)
+    lanes = 1000
+    number = np.arange(places)
+    position = np.stack([2.0 * (number % lanes), 6.0 * (number // lanes), np.zeros(places)], axis=1)
+    where = Whereabouts(np.full(places, METRIC, np.int8), position, (number // lanes).astype(np.int32), number % lanes)
+    graph = place_graph(where, number, places, SAME_PLACE)
+    alive = np.ones(places, np.bool_)
+    background = encoder.calibration.background_mean + encoder.calibration.background_deviation * random.normal(
+        size=(rounds + 8, HEAD)
+    )
+    scores = -np.sort(-background.astype(np.float32), axis=1)
+    rows = np.stack([random.permutation(places)[:HEAD] for _ in scores])
+    examined = np.arange(HEAD) < (encoder.candidates or 0)
+    steps = {
+        "sequence": (RunOptions(), Step()),
+        "speed limit": (RunOptions(), Step(reach=4.0)),
+        "odometry": (RunOptions(), Step(odometry=Odometry(2.0, variance=0.04))),
+        "odometry, lag 5": (RunOptions(lag=5), Step(odometry=Odometry(2.0, variance=0.04))),
+        "path": (FILTERS["path"], Step()),
+    }
+    data = jpeg(sample_picture(7))
+    runs: dict[str, Any] = {"encode": lambda: encoder.encode(decode(data))}
+    for name, (options, step) in steps.items():
+        run, turns = Run(options, graph), iter(range(len(scores)))
+
+        def advance(run: Run = run, step: Step = step, turns: Iterator[int] = turns) -> None:
+            turn = next(turns)
+            best = rows[turn]
+            seen = evidence(best, scores[turn], where.take(best), encoder.calibration, SAME_PLACE, examined)
+            run.advance(seen, step)
+            run.estimate(5, alive)
+            run.earlier(5, alive)
+
+        runs[name] = advance
+    return medians(runs, rounds)
+
+
+def main(
+    data: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets/eval"),
+    encoder: str = DEFAULT_ENCODER,
+    dataset: Annotated[list[str] | None, typer.Option(help="One of them alone; more than once for several.")] = None,
+    places: Annotated[int, typer.Option(min=1000)] = 5000,
+    rounds: Annotated[int, typer.Option(min=5)] = 60,
+) -> None:
+    """Print the table and keep the figures."""
+    chosen = EncoderCatalogue().get(encoder)
+    rows: list[tuple[object, ...]] = []
+    figures: dict[str, Any] = {"encoder": chosen.identity, "recall": {}, "milliseconds": {}}
+    for name in dataset if dataset is not None else list(TRAVERSES):
+        figures["recall"][name] = recalls(chosen, name, data)
+        for truth, counts in figures["recall"][name].items():
+            queries, single = counts["queries"], counts["single"]
+            for how in ("single", *FILTERS):
+                held = ""
+                if how == "bayes" and truth == "put right":
+                    held = "errors " + verdict(counts[how] / single, HALVED)
+                elif how == "bayes" and name == "nordland_tiny":
+                    held = verdict(1 - counts[how] / queries, RECALL, at_least=True)
+                rows.append((f"{name}, {truth}: {how}", f"{1 - counts[how] / queries:.3f}", counts[how], held))
+    times = costs(chosen, places, rounds)
+    figures |= {"milliseconds": times, "places": places}
+    for name, milliseconds in times.items():
+        # Looking back is asked for apart, and paid for apart.
+        held = "" if name in ("encode", "odometry, lag 5") else verdict(milliseconds / times["encode"], SHARE)
+        rows.append((f"{name}, {places} places" if name != "encode" else "encode", f"{milliseconds:.2f} ms", "", held))
+    report("sequences", chosen.name, ["", "recall@1, time", "wrong", ""], rows, figures)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,39 @@
+"""What following a run is worth, on the real walks where they are at hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.sequences import FILTERS, HALVED, RECALL, SHARE, costs, recalls
+from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from tests.service.server import ROOT
+
+DATA = ROOT.parent / "shared" / "datasets" / "eval"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the evaluation images are not at hand")
+
+
+@needs_data
+def test_a_stretch_of_railway_in_another_season() -> None:
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    (counts,) = recalls(encoder, "nordland_tiny", DATA, frames=250).values()
+    assert counts["single"] > 0.1 * counts["queries"], "or there would be nothing to gain"
+    assert 1 - counts["bayes"] / counts["queries"] >= RECALL
+
+
+@needs_data
+@pytest.mark.soak
+@pytest.mark.timeout(1500)
+def test_the_bars() -> None:
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    walk = recalls(encoder, "lip6_outdoor", DATA)["put right"]
+    assert walk["bayes"] <= HALVED * walk["single"]
+    (railway,) = recalls(encoder, "nordland_tiny", DATA).values()
+    assert 1 - railway["bayes"] / railway["queries"] >= RECALL
+
+
+@pytest.mark.benchmark
+def test_a_frames_belief_is_cheap() -> None:
+    times = costs(EncoderCatalogue().get(DEFAULT_ENCODER), 5000, 40)
+    for name in ("sequence", "speed limit", "odometry", "path"):
+        assert times[name] <= SHARE * times["encode"], name
+    assert set(FILTERS) == {"bayes", "path"}
