@@ -70,16 +70,17 @@ class InvertedLists:
         n = len(table)
         if not n:
             raise ValueError("there is nothing to list")
-        progress(0, n)
-        count = max(1, int(_LISTS_PER_ROOT * np.sqrt(n)))
+        count = min(n, int(_LISTS_PER_ROOT * np.sqrt(n)))
         generator = np.random.default_rng(seed)
         sampled = np.sort(generator.choice(n, min(n, count * _SAMPLED_PER_LIST), replace=False))
         sample = _as_signs(table.sketches_at(sampled).sketches)
-        clustering = faiss.Kmeans(
-            GROUP_BITS, count, niter=_ROUNDS, seed=seed, spherical=True, min_points_per_centroid=1
-        )
-        clustering.train(sample)
-        empty = cls._arranged(table, np.asarray(clustering.centroids, np.float32), np.empty(0, np.int64))
+        clustering = faiss.Kmeans(GROUP_BITS, count, niter=1, seed=seed, spherical=True, min_points_per_centroid=1)
+        centers = None
+        for _ in range(_ROUNDS):  # one by one, for in a map of a million rows each takes seconds, and may be stopped
+            progress(0, n)
+            clustering.train(sample, init_centroids=centers)
+            centers = clustering.centroids
+        empty = cls._arranged(table, np.asarray(centers, np.float32), np.empty(0, np.int64))
         return empty.extended(table, progress)
 
     @classmethod

@@ -46,7 +46,8 @@ class Cameras:
     def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
         self._reading, self._writing = reading, writing
         self._known: dict[str, CameraRecord] | None = None
-        self._lock = threading.Lock()
+        self._changes = 0  # counted, so that what was read before one is not taken for what is there after it
+        self._lock = threading.Lock()  # of both; held for no reading or writing, which wait for locks of their own
 
     def all(self) -> list[CameraRecord]:
         """By name."""
@@ -78,7 +79,7 @@ class Cameras:
             InvalidField: the map has too many.
         """
         made = CameraRecord(name=name, mask=mask, updated_at=datetime.now(UTC))
-        with self._lock, self._writing() as write:
+        with self._writing() as write:
             known = _read(write.connection)
             if name not in known and len(known) >= MOST_CAMERAS:
                 raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
@@ -86,7 +87,7 @@ class Cameras:
                 "INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)",
                 (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
             )
-        self._known = None
+        self._forget_known()
         return made, name not in known
 
     def forget(self, name: str) -> None:
@@ -95,15 +96,24 @@ class Cameras:
         Raises:
             UnknownCamera: the map has none of this name.
         """
-        with self._lock, self._writing() as write:
+        with self._writing() as write:
             if not write.connection.execute("DELETE FROM cameras WHERE name = ?", (name,)).rowcount:
                 raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
-        self._known = None
+        self._forget_known()
+
+    def _forget_known(self) -> None:
+        with self._lock:
+            self._known, self._changes = None, self._changes + 1
 
     def _records(self) -> dict[str, CameraRecord]:
-        if (known := self._known) is None:
-            with self._lock, self._reading() as connection:
-                known = self._known = _read(connection)
+        with self._lock:
+            known, changes = self._known, self._changes
+        if known is None:
+            with self._reading() as connection:
+                known = _read(connection)
+            with self._lock:
+                if changes == self._changes:
+                    self._known = known
         return known
 
 

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, UnknownMap
-from core.index import Coder
+from core.index import Coder, InvertedLists
 from core.storage import Atlas, IndexStatus, Map, MapSettings, arrays, indexing, recall, snapshot, tiers
 from core.storage.descriptors import HEADER_BYTES
 from core.storage.snapshot import Snapshot
@@ -213,11 +213,12 @@ def test_a_start_reads_codes_and_makes_none(
     codes = [f"codes-00000{i}.index" for i in range(1, 6)]
     assert sorted(before) == ["coder.index", *codes, "lists.index", "recall.index"]
 
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise AssertionError
 
     monkeypatch.setattr(Coder, "encode", refuse)
     monkeypatch.setattr(Coder, "fitted", refuse)
+    monkeypatch.setattr(InvertedLists, "built", refuse)
     again = Atlas(directory)
     lab = again.get("lab")
     assert lab.snapshot().coded == PLACES  # from the first query on

@@ -48,6 +48,16 @@ def test_rows_come_in_the_order_asked_for(tmp_path: Path, precision: Precision, 
 
 
 @pytest.mark.parametrize("precision", EVERY)
+def test_a_map_without_local_descriptors_has_none_to_read(tmp_path: Path, precision: Precision) -> None:
+    layout = Layout(dimension=32, identity="encoder@1", rows_per_segment=4, precision=precision)
+    records = layout.packed([descriptor_of("a", 32)], [np.empty((0, 0), np.int8)], 0)
+    append(tmp_path, layout, 0, records)
+    shelf, row = Shelf(tmp_path, layout), np.array([0])
+    np.testing.assert_array_equal(shelf.descriptors(row, records["checksum"]), layout.descriptors_of(records))
+    assert shelf.locals(row, records["checksum"]).shape == (1, 0, 0)
+
+
+@pytest.mark.parametrize("precision", EVERY)
 def test_a_flipped_bit_is_found_when_its_row_is_read(tmp_path: Path, precision: Precision) -> None:
     shelf, records = filled(tmp_path, precision)
     path, size = tmp_path / segment_name(1), records.dtype.itemsize

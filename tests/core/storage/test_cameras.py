@@ -1,0 +1,70 @@
+"""The cameras of a map under many threads."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from sqlite3 import Connection
+
+import pytest
+
+from core.errors import UnknownCamera
+from core.masks import Mask
+from core.storage import Map
+from core.storage.writing import Write
+
+MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
+SECONDS = 30.0
+
+
+def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -> None:
+    assert lab.cameras.all() == []
+    assert lab.cameras.put("front", None)[1]
+    assert lab.cameras.mask("front") is None
+    assert not lab.cameras.put("front", MASK)[1]
+    assert lab.cameras.mask("front") == MASK
+    lab.cameras.forget("front")
+    with pytest.raises(UnknownCamera):
+        lab.cameras.mask("front")
+
+
+def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The one who keeps others from writing asks for them; neither may wait for the other."""
+    lab.cameras.put("front", None)
+    waiting, found, writing = threading.Event(), [], lab.cameras._writing
+
+    @contextmanager
+    def told() -> Iterator[Write]:
+        waiting.set()
+        with writing() as write:
+            yield write
+
+    monkeypatch.setattr(lab.cameras, "_writing", told)
+    changing = threading.Thread(target=lambda: lab.cameras.put("back", MASK), daemon=True)
+    asking = threading.Thread(target=lambda: found.append(lab.cameras.all()), daemon=True)
+    with lab.transfer.quiet():
+        changing.start()
+        assert waiting.wait(SECONDS)
+        asking.start()
+        asking.join(SECONDS)
+        assert [[camera.name for camera in cameras] for cameras in found] == [["front"]]
+    changing.join(SECONDS)
+    assert lab.cameras.mask("back") == MASK
+
+
+def test_what_was_read_before_a_change_is_not_kept(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.cameras.put("front", None)
+    reading = lab.cameras._reading
+
+    @contextmanager
+    def slow() -> Iterator[Connection]:
+        """The mask is changed between the reading and what is made of it."""
+        with reading() as connection:
+            yield connection
+        monkeypatch.undo()
+        lab.cameras.put("front", MASK)
+
+    monkeypatch.setattr(lab.cameras, "_reading", slow)
+    assert lab.cameras.mask("front") is None
+    assert lab.cameras.mask("front") == MASK
