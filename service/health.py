@@ -156,7 +156,7 @@ def _aliasing(own: OwnFrames, until: float) -> _Aliasing:
         for position, others, scores in own.search(some):
             same = own.near(position, others)
             best, found = hubness.nearest_others(scores, same, k)
-            lists.append(np.where(best == hubness.NONE, hubness.NONE, others[best])[np.newaxis])
+            lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is the index of the last
             mine = float(scores[same].max()) if same.any() else None
             has_own = same.any() or own.near(position, everything[everything != position]).any()
             if best[0] != hubness.NONE and has_own and (mine is None or found[0] > mine):

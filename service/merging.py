@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, UnknownCamera, WrongEncoder
+from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, UnknownCamera, UnknownMap, WrongEncoder
 from core.places import PlaceFields, check_place_id
 from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
@@ -294,6 +294,8 @@ def _undo(context: JobContext, map_: Map, other: Map | None, error: BaseExceptio
                 map_.cameras.forget(camera)
             except UnknownCamera:
                 continue
+    except UnknownMap:
+        return  # it was deleted, with all that had come
     except PlacerecError as further:
         raise StorageFailure(
             f"The merge ended ({error or type(error).__name__}), and what it had brought could not be taken out again "

@@ -82,7 +82,7 @@ class Turn:
         """How many the frame has by its header; 0 where that cannot be read, which will show."""
         try:
             header = read_header(self.data)
-        except InvalidImage:
+        except Exception:  # of whatever kind: the encoder's thread has to live on
             return 0
         return header.width * header.height
 

@@ -34,6 +34,7 @@ def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[
     """How many of the other map's places this one recognizes, by a sample of them spread over it."""
     encoder = load_encoder(engine, map_)
     outline, snapshot = other.transfer.outline(), other.snapshot()
+    outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
     chosen = [outline[i] for i in spread(len(outline))[: context.arguments["sample"]]]
     verdicts = {"recognized": 0, "ambiguous": 0, "unknown": 0}
     pairs: list[dict[str, Any]] = []

@@ -54,10 +54,11 @@ class OwnFrames:
     def __init__(self, map_: Map, encoder: Encoder) -> None:
         record = map_.record
         self.encoder, self.neighborhood = encoder, Neighborhood(record.same_place_radius, record.same_place_frames)
-        # In this order: a place that is listed has its row in the snapshot.
         outline = map_.transfer.outline()
         self.snapshot = map_.snapshot()
-        self.places: list[Outline] = sorted(outline, key=lambda place: place.row)
+        # One that is being written in this very moment is listed before its row is in a snapshot.
+        there = (place for place in outline if place.row < self.snapshot.rows)
+        self.places: list[Outline] = sorted(there, key=lambda place: place.row)
         self.rows = np.array([place.row for place in self.places], np.int64)
         self.where = self.snapshot.whereabouts_at(self.rows)
         self._position = np.full(self.snapshot.rows, -1, np.int64)

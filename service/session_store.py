@@ -135,7 +135,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA synchronous = FULL")  # for the tables; see above for what follows
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
         with closing(connection.execute("PRAGMA user_version")) as cursor:
@@ -149,6 +149,7 @@ def _opened(path: Path) -> sqlite3.Connection:
         elif version != FORMAT:
             raise sqlite3.DatabaseError(f"it is of format {version}, not {FORMAT}")
         connection.execute(f"SELECT {', '.join(COLUMNS)} FROM sessions LIMIT 1").fetchall()
+        connection.execute("PRAGMA synchronous = NORMAL")
     except BaseException:
         connection.close()
         raise

@@ -275,7 +275,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = NORMAL")  # a crash may lose the last counts, never the file
+        connection.execute("PRAGMA synchronous = FULL")  # for the tables
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA journal_size_limit = 1048576")
         (version,) = connection.execute("PRAGMA user_version").fetchone()
@@ -288,6 +288,7 @@ def _opened(path: Path) -> sqlite3.Connection:
         elif version != VERSION:
             raise sqlite3.DatabaseError(f"its schema is {version}, not {VERSION}")
         connection.execute("SELECT last FROM places LIMIT 0")
+        connection.execute("PRAGMA synchronous = NORMAL")  # a crash may lose the last counts, never the file
     except BaseException:
         connection.close()
         raise

@@ -21,6 +21,9 @@ def calibrate(
         Path | None,
         typer.Option(help="CSV with the columns file,place: labelled frames beside it; no place: the map lacks it."),
     ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the map that took the labelled frames; its mask is applied.")
+    ] = None,
     sequence: Annotated[str | None, typer.Option(help="A traverse of the map, held against its others.")] = None,
     pairs: Annotated[
         Path | None,
@@ -43,6 +46,8 @@ def calibrate(
         raise typer.BadParameter("name one of --frames, --sequence and --itself")
     if pairs is not None and sequence is None:
         raise typer.BadParameter("--pairs goes with --sequence")
+    if camera is not None and frames is None:
+        raise typer.BadParameter("--camera goes with --frames")
     order: dict[str, Any] = {"target": _target(precision, false_accept_rate, mean_of_negatives), "dry_run": dry_run}
     order |= {} if most is None else {"most": most}
     target, path = Target(url, data_dir), path_of("maps", map_id, "calibrate")
@@ -51,7 +56,10 @@ def calibrate(
         names = [f"frame-{index}" for index in range(len(rows))]
         order |= {
             "method": "frames",
-            "labels": [{"file": name, "place": place or None} for name, (_, place) in zip(names, rows, strict=True)],
+            "labels": [
+                {"file": name, "place": place or None, "camera": camera}
+                for name, (_, place) in zip(names, rows, strict=True)
+            ],
         }
         parts: list[tuple[str, Any]] = [("calibration", (None, json.dumps(order), "application/json"))]
         for name, (file, _) in zip(names, rows, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -51,6 +51,9 @@ def enroll(
         str | None, typer.Option(help="Name of the traverse; default: the directory's name.", show_default=False)
     ] = None,
     id_prefix: Annotated[str, typer.Option(help="Put before the ids made of file names.")] = "",
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
+    ] = None,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -60,7 +63,7 @@ def enroll(
     else from the images' EXIF data. Ids are the files' names without their ending. It can be broken off and run
     again: a frame whose bytes are known is not encoded again.
     """
-    frames = read_traverse(directory, sequence, id_prefix)
+    frames = [replace(frame, camera=camera) for frame in read_traverse(directory, sequence, id_prefix)]
     left_out = unlisted(directory, frames)
     if left_out:
         remark(f"{left_out} images of {directory} are not in places.csv and are left out.")
@@ -77,6 +80,8 @@ async def _enroll(
     report = Report()
     async with open_service(target) as service:
         await _ready_map(service, map_id, create, {key: value for key, value in wanted.items() if value is not None})
+        if (camera := frames[0].camera) is not None:
+            await service.get(path_of("maps", map_id, "cameras", camera))  # or else each frame would be refused
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))

@@ -25,6 +25,7 @@ class Frame:
     """One image to enrol.
 
     pose, timestamp: None where the file's own EXIF data decide.
+    camera: of the map, whose mask is applied; None: none.
     """
 
     path: Path
@@ -33,6 +34,7 @@ class Frame:
     listed: bool
     pose: Pose | None = None
     timestamp: Timestamp | None = None
+    camera: str | None = None
 
     def parameters(self, data: bytes) -> dict[str, str]:
         """What goes into the query string beside the frame's bytes ``data``."""
@@ -40,6 +42,8 @@ class Frame:
         given = {} if pose is None else {name: repr(value) for name, value in pose if value is not None}
         if timestamp is not None:
             given["timestamp"] = timestamp.isoformat()
+        if self.camera is not None:
+            given["camera"] = self.camera
         return {**given, "sequence": self.sequence}
 
 

@@ -43,6 +43,9 @@ def query(
     soft: Annotated[
         str | None, typer.Option(help="What of this is no filter but a prior: position, bbox, sequences, time, where.")
     ] = None,
+    camera: Annotated[
+        str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
+    ] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a frame and line.")] = False,
@@ -58,6 +61,7 @@ def query(
         "before": before,
         "where": where,
         "soft": soft,
+        "camera": camera,
     }
     known |= {"radius": radius, **_position(near, geographic)}
     parameters = {"k": k, **{name: value for name, value in known.items() if value is not None}}

@@ -116,7 +116,9 @@ async def calibrate_map(
             context.check_cancelled()
             context.progress(done, total)
 
-        return _calibrate(engine.atlas.get(map_id), encoder, order, [], expected, advance).model_dump(mode="json")
+        now = engine.atlas.get(map_id)
+        engine.assert_encoder(now, encoder.identity)  # one that was made anew meanwhile may have another
+        return _calibrate(now, encoder, order, [], expected, advance).model_dump(mode="json")
 
     job = await in_thread(engine.jobs.submit, KIND, map_id, work, order.model_dump(mode="json"))
     location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"

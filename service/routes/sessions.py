@@ -116,6 +116,7 @@ async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep
     | problem_documentation(
         MalformedBody,
         errors.UnknownMap,
+        errors.UnknownCamera,
         UnknownSession,
         errors.WrongEncoder,
         FrameOutOfOrder,

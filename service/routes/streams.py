@@ -1,8 +1,9 @@
 """A run over one WebSocket: frames one way, answers the other, without a request for each.
 
 Messages from the robot: a text message (JSON, the parameters of a frame; optional) and then a binary one, the frame.
-Messages to the robot: one text message for each frame, in their order, the answer or {"problem": …}.  The next frame
-is read when the last one is answered, so that a robot that is too fast is held back by its own connection.
+Messages to the robot: one text message for each frame, in their order, the answer or {"problem": …}.  A frame whose
+parameters were refused has had its message, and is not taken in.  The next frame is read when the last one is
+answered, so that a robot that is too fast is held back by its own connection.
 """
 
 from __future__ import annotations
@@ -69,18 +70,22 @@ async def stream_frames(socket: WebSocket) -> None:
 
 async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocket) -> None:
     told: dict[str, Any] | None = None
+    refused = False
     while True:
         message = await socket.receive()
         if message["type"] != "websocket.receive":
             return
         try:
             if message.get("bytes") is None:
-                if told is not None:
-                    told = None
+                previous, told, refused = told, None, True
+                if previous is not None:
                     raise InvalidRequest("Two text messages came without a frame between them; both are dropped.")
-                told = _parameters(message.get("text") or "", engine)
+                told, refused = _parameters(message.get("text") or "", engine), False
                 continue
             given, told = told, None
+            if refused:
+                refused = False
+                continue
             answer = await _answer(engine, map_id, session, message["bytes"], given or {})
         except (Fault, PlacerecError) as error:
             await _tell(socket, error)

@@ -108,6 +108,21 @@ def test_labelled_frames(server: Server, walked: str) -> None:
     assert again.json()["calibration"]["threshold"] == pytest.approx(report["calibration"]["threshold"], abs=1e-6)
 
 
+def test_labelled_frames_of_a_camera(server: Server, walked: str) -> None:
+    # All that the frame shows is behind the mask, so that it is blank where the mask is applied.
+    mask = {"polygons": [[[0, 0.4], [1, 0.4], [1, 1], [0, 1]]]}
+    server.client.put(f"/v1/maps/{walked}/cameras/lidded", json={"mask": mask}).raise_for_status()
+    pixels = blank(320, 240)
+    pixels[144:] = scene(0)[144:]
+    files = {"f": encoded(pixels)}
+    lidded = labelled(server.client, walked, [{"file": "f", "place": "m0", "camera": "lidded"}], files)
+    assert_problem(lidded, 422, "no-regions")
+    absent = labelled(server.client, walked, [{"file": "f", "place": "m0", "camera": "absent"}], files)
+    assert_problem(absent, 404, "unknown-camera")
+    plain = labelled(server.client, walked, [{"file": "f", "place": "m0"}], files)
+    assert_problem(plain, 422, "calibration-impossible")
+
+
 def test_the_map_itself_with_a_warning(server: Server, map_id: str) -> None:
     for number in range(12):
         for step in range(2):

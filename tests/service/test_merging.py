@@ -160,6 +160,14 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
         assert state_of(engine, "lab") == before
 
 
+def test_the_map_itself_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with engine_at(folder) as engine:
+        after_two_commits(monkeypatch, lambda _: engine.atlas.delete("lab"))
+        failed = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        assert failed.state == "failed" and failed.problem is not None
+        assert failed.problem["type"] == "urn:placerec:problem:unknown-map", "nothing remains that came"
+
+
 def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with engine_at(folder) as engine:
         hall = engine.atlas.get("hall")

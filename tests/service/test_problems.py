@@ -16,7 +16,7 @@ from service.problems import BY_STATUS, KINDS, TYPE_PREFIX, kind_of, problem_of
 from service.settings import Settings
 from tests.service.server import assert_problem
 
-CONTRACT = {400, 401, 403, 404, 405, 409, 412, 413, 415, 422, 429, 500, 503, 507}
+CONTRACT = {400, 401, 403, 404, 405, 409, 410, 412, 413, 415, 422, 429, 500, 503, 507}
 OURS = [
     cls
     for module in (errors, faults)

@@ -83,6 +83,20 @@ def test_what_is_wrong_is_told_and_the_run_goes_on(server: Server, traverse: str
         assert ask(connection, again(1), frame=8)["problem"]["status"] == 409
 
 
+def test_a_frame_has_one_message_though_its_parameters_be_refused(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        for texts in (["{"], ['{"frame": 1}', '{"frame": 2}']):
+            for message in texts:
+                connection.send(message)
+            connection.send(again(1))
+        connection.send('{"frame": 3}')
+        connection.send(again(3))
+        answers = [json.loads(connection.recv(timeout=30)) for _ in range(3)]
+        assert ["problem" in answer for answer in answers] == [True, True, False]
+        assert (answers[2]["frame"], answers[2]["frames"]) == (3, 1), "the others were not taken in"
+
+
 def test_a_session_that_is_not_there_is_refused_before_the_handshake(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     for map_id, name, status in ((traverse, "s-0", 404), ("nowhere", session, 404), ("NO", session, 422)):

@@ -42,6 +42,15 @@ def test_health_of_a_map_that_nobody_asked(server: Server) -> None:
     assert report["gaps"] == [] and report["never_matched"] is None
 
 
+def test_health_of_a_single_place(server: Server) -> None:
+    server.create_map("single", encoder=COARSE)
+    enrol_frames(server, "single", [jpeg(1)])
+    response = server.client.get("/v1/maps/single/health")
+    assert response.status_code == 200, response.text
+    aliasing = response.json()["aliasing"]
+    assert (aliasing["examined"], aliasing["aliases"], aliasing["hubs"]) == (1, [], [])
+
+
 def test_health_counts_what_was_answered(server: Server) -> None:
     server.create_map("counted", encoder=COARSE)
     enrol_frames(server, "counted", [jpeg(n) for n in range(6)], sequence="monday")

@@ -45,6 +45,26 @@ def test_over_http(placerec: Placerec, server: Server, traverse: str, tmp_path: 
     assert answer["score"] == same["score"]
 
 
+def test_the_mask_of_a_camera_is_applied(placerec: Placerec, server: Server, map_id: str, tmp_path: Path) -> None:
+    mask = {"polygons": [[[0, 0.5], [1, 0.5], [1, 1], [0, 1]]]}
+    server.client.put(f"/v1/maps/{map_id}/cameras/front", json={"mask": mask}).raise_for_status()
+    frames = tmp_path / "walk"
+    frames.mkdir()
+    (frames / "1.jpg").write_bytes(encoded(scene(1)))
+    there = ("-m", map_id, "--url", server.client.base_url)
+    placerec("enroll", frames, *there, "--camera", "back", status=1)
+    assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
+    placerec("enroll", frames, *there, "--camera", "front")
+    assert server.client.get(f"/v1/maps/{map_id}/places/1").json()["camera"] == "front"
+    assert "1 unchanged" in placerec("enroll", frames, *there, "--camera", "front").stdout
+    masked, bare = (
+        json.loads(placerec("query", frames / "1.jpg", *there, "--json", *words).stdout)
+        for words in (("--camera", "front"), ())
+    )
+    assert masked["score"] > bare["score"] + 0.03
+    placerec("query", frames / "1.jpg", *there, "--camera", "back", status=1)
+
+
 def test_an_image_that_is_refused_does_not_stop_the_others(
     placerec: Placerec, server: Server, traverse: str, tmp_path: Path
 ) -> None:
