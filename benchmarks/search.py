@@ -62,7 +62,10 @@ class Bar:
     disk: float
 
 
-BARS = {100_000: Bar(50.0, 0.995, 8192, 98_000), MILLION: Bar(200.0, 0.98, 8000, 32_768)}
+BARS = {
+    (100_000, "half"): Bar(50.0, 0.995, 8192, 98_000),
+    (MILLION, "compressed"): Bar(200.0, 0.98, 8000, 32_768),
+}
 GROWTH = 4.0
 """A query against a million places is to take at most so many times as long as one against a hundred thousand."""
 
@@ -213,11 +216,11 @@ def run(
     return rows
 
 
-def bars(rows: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """What is asked of the larger sizes, and whether it is reached: what, measured, verdict."""
+def bars(rows: Sequence[dict[str, Any]], precision: str) -> list[list[str]]:
+    """What is asked of the larger sizes, each in the precision meant for it: what, measured, verdict."""
     found = []
     for row in rows:
-        bar = BARS.get(row["places"])
+        bar = BARS.get((row["places"], precision))
         if bar is None or row["tier"] == "flat":
             continue
         name = f"{row['places']:,} {row['tier']}"
@@ -248,7 +251,7 @@ def show(name: str, rows: Sequence[dict[str, Any]], figures: dict[str, Any]) -> 
     columns = ["places and tier", "ms", "times faster", "recall@1", "memory, B", "disk, B"]
     title = f"one query; medians of {figures['rounds']} rounds; memory and disk of a place"
     report(name, title, columns, table, {"rows": rows, **figures})
-    for line in bars(rows):
+    for line in bars(rows, figures["precision"]):
         print(f"{line[0]:<50} {line[1]:>8}   {line[2]}")
 
 
