@@ -11,7 +11,6 @@ medians over the turns are shown.  The robots' own cost counts against the servi
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 import time
@@ -30,7 +29,7 @@ from core.encoder import Encoder
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.images import decode
 from core.storage import Atlas, Map
-from core.threads import share_cores
+from core.threads import cores, share_cores
 from service.load import measure
 from service.localization import locate
 from service.measurement import encode_batch
@@ -101,7 +100,7 @@ def main(
     turns: dict[int, list[dict[str, Any]]] = defaultdict(list)
     alone: list[float] = []
     batched: list[float] = []
-    cores = len(os.sched_getaffinity(0))
+    count = cores()
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
         fill_map(folder / "data", MAP, chosen, places)
@@ -169,7 +168,7 @@ def main(
             )
         )
     columns = ["", "per s", "p50 ms", "p95 ms", "p99 ms", "of batches", "refused"]
-    title = f"{chosen.name}, {places} places, {content}, {cores} cores"
+    title = f"{chosen.name}, {places} places, {content}, {count} cores"
     one = {"encode_and_search_milliseconds": here, "batched_frames_per_second": limit, "batch": BATCH}
     report(
         "service",

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, MutableMapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, MutableMapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import cache
 from typing import TypeVar
 
@@ -83,6 +84,36 @@ def _compute_alone() -> None:
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "core", _compute_alone)
+
+
+def in_turns(
+    run: Callable[[Item], object],
+    parts: Iterable[Item],
+    executor: Executor | None,
+    helpers: int,
+    calling_too: bool = True,
+) -> None:
+    """Run every part once, in so many threads of the executor and, unless told otherwise, in the calling one.
+
+    Each thread takes the next part when it has done one, so that a core that is busy elsewhere delays nothing but
+    the part it is at; where the caller works too, a helper that has not begun by the end is not waited for.
+    """
+    waiting = deque(parts)
+
+    def work() -> None:
+        while True:
+            try:
+                part = waiting.popleft()
+            except IndexError:
+                return
+            run(part)
+
+    begun = [] if executor is None else [executor.submit(work) for _ in range(helpers)]
+    if calling_too:
+        work()
+    for helper in begun:
+        if not (calling_too and helper.cancel()):
+            helper.result()
 
 
 def each(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> list[Made]:

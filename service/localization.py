@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.agreement import Cells
+from core.agreement import Cells, reranked
 from core.encoder import Encoder, Encoding
 from core.examination import examine as examined
 from core.places import Place
@@ -226,9 +226,8 @@ def examine(encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking
     """
     rows, inner_products = ranking
     scores = encoder.scores_from_inner_products(inner_products)
-    scores[: encoder.candidates] += encoder.agreement(local, snapshot.locals_at(rows[: encoder.candidates]))
-    order = np.argsort(-scores, kind="stable")
-    return rows[order], scores[order]
+    order, raised = reranked(scores, encoder.agreement(local, snapshot.locals_at(rows[: encoder.candidates])))
+    return rows[order], raised
 
 
 def _judged(map_: Map, encoder: Encoder, encoding: Encoding, scored: Scored, k: int, settle: bool) -> Located | None:

@@ -72,6 +72,15 @@ def along_sequence(p, moving, first, last, offsets, weights, least, back, moved)
 
 
 @_compiled
+def _displacement(coordinates, i, j, half_turn, shrink):  # type: ignore[no-untyped-def]
+    """From place i to place j in metres, the shorter way round the globe."""
+    dx = coordinates[j, 0] - coordinates[i, 0]
+    if abs(dx) > half_turn:
+        dx -= math.copysign(2 * half_turn, dx)
+    return dx * shrink, coordinates[j, 1] - coordinates[i, 1], coordinates[j, 2] - coordinates[i, 2]
+
+
+@_compiled
 def within_reach(  # type: ignore[no-untyped-def]
     p, starts, targets, coordinates, shrink, half_turn, reach, softness, least, back, outside, moved
 ):
@@ -88,11 +97,7 @@ def within_reach(  # type: ignore[no-untyped-def]
         total = 0.0
         for e in range(count):
             j = targets[begin + e]
-            dx = coordinates[j, 0] - coordinates[i, 0]
-            if abs(dx) > half_turn:
-                dx -= math.copysign(2 * half_turn, dx)
-            dx *= shrink[i]
-            dy, dz = coordinates[j, 1] - coordinates[i, 1], coordinates[j, 2] - coordinates[i, 2]
+            dx, dy, dz = _displacement(coordinates, i, j, half_turn, shrink[i])
             beyond = (math.sqrt(dx * dx + dy * dy + dz * dz) - reach) / softness
             weights[e] = 1.0
             if beyond > 0:
@@ -126,11 +131,7 @@ def by_odometry(  # type: ignore[no-untyped-def]
         total = 0.0
         for e in range(count):
             j = targets[begin + e]
-            dx = coordinates[j, 0] - coordinates[i, 0]
-            if abs(dx) > half_turn:
-                dx -= math.copysign(2 * half_turn, dx)
-            dx *= shrink[i]
-            dy, dz = coordinates[j, 1] - coordinates[i, 1], coordinates[j, 2] - coordinates[i, 2]
+            dx, dy, dz = _displacement(coordinates, i, j, half_turn, shrink[i])
             if known:
                 off = (dx - east) ** 2 + (dy - north) ** 2 + dz * dz
             else:

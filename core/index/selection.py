@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.index.kernels import count_from, gather_from
-from core.threads import cores
+from core.threads import cores, in_turns
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -53,24 +52,5 @@ def best_positions(estimates: Array, count: int) -> Rows:
 
 
 def together(tasks: Sequence[Callable[[], None]], executor: Executor | None) -> None:
-    """Run every task once, in the calling thread and in those of the executor.
-
-    Each thread takes the next task when it has done one; a helper that has not begun by the end is not waited for.
-    """
-    waiting = deque(tasks)
-
-    def work() -> None:
-        while True:
-            try:
-                task = waiting.popleft()
-            except IndexError:
-                return
-            task()
-
-    helpers: list[Future[None]] = []
-    if executor is not None:
-        helpers = [executor.submit(work) for _ in range(min(len(tasks), cores()) - 1)]
-    work()
-    for helper in helpers:
-        if not helper.cancel():
-            helper.result()
+    """Run every task once, in the calling thread and in those of the executor."""
+    in_turns(lambda task: task(), tasks, executor, min(len(tasks), cores()) - 1)

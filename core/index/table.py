@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.codes import CodedQuery, Coder, Codes
+from core.index.codes import CodedQuery, Coder, Codes, PlaneQuery
 from core.index.kernels import estimates_at, estimates_of
 from core.index.selection import best_first, best_positions, together
 
@@ -184,24 +184,25 @@ class CodeTable:
 
     def _sketched_at(self, query: CodedQuery, rows: Rows, executor: Executor | None) -> Array:
         """Estimates by sketch of some rows, ascending."""
-        estimates = np.empty(len(rows), np.float32)
-        planes, step, total = query.sketch.planes, query.sketch.step, query.sketch.total
-
-        def judge(codes: Codes, start: int, stop: int, first: int) -> None:
-            at = rows[start:stop] - first
-            estimates_at(codes.sketches, codes.scales[:, 0], planes, step, total, at, estimates[start:stop])
-
-        together(self._tasks_at(judge, rows), executor)
-        return estimates
+        return self._estimates_at(query.sketch, lambda codes: (codes.sketches, codes.scales[:, 0]), rows, executor)
 
     def _estimated(self, query: CodedQuery, rows: Rows, executor: Executor | None) -> Array:
         """Estimates by the full codes of some rows, ascending."""
+        return self._estimates_at(query.code, lambda codes: (codes.bits, codes.scales[:, 1]), rows, executor)
+
+    def _estimates_at(
+        self,
+        query: PlaneQuery,
+        signs_and_scales: Callable[[Codes], tuple[NDArray[np.uint64], Array]],
+        rows: Rows,
+        executor: Executor | None,
+    ) -> Array:
+        """Estimates of some rows, ascending, by one kind of their codes."""
         estimates = np.empty(len(rows), np.float32)
-        planes, step, total = query.code.planes, query.code.step, query.code.total
 
         def judge(codes: Codes, start: int, stop: int, first: int) -> None:
             at = rows[start:stop] - first
-            estimates_at(codes.bits, codes.scales[:, 1], planes, step, total, at, estimates[start:stop])
+            estimates_at(*signs_and_scales(codes), query.planes, query.step, query.total, at, estimates[start:stop])
 
         together(self._tasks_at(judge, rows), executor)
         return estimates

@@ -71,7 +71,7 @@ def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> 
         return descriptors.astype("<f2")
     n, dimension = descriptors.shape
     count = -(-dimension // BLOCK)
-    blocks = np.pad(descriptors, ((0, 0), (0, -dimension % BLOCK))).reshape(n, count, BLOCK)
+    blocks = _whole_blocks(descriptors).reshape(n, count, BLOCK)
     # Upwards, so that no value lies outside; a block of zeros has any scale.
     scales = np.nextafter((np.abs(blocks).max(axis=2) / _HIGHEST).astype("<f2"), np.float16(np.inf)).astype("<f2")
     values = np.rint(blocks / scales[:, :, np.newaxis].astype(np.float32)).reshape(n, count * BLOCK)
@@ -79,6 +79,12 @@ def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> 
     lower = codes & 3
     quarters = lower[:, ::4] | lower[:, 1::4] << 2 | lower[:, 2::4] << 4 | lower[:, 3::4] << 6
     return np.concatenate([scales.view(np.uint8), _paired(codes >> 2), quarters], axis=1)
+
+
+def _whole_blocks(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """float32 [n, D] with zeros up to the next whole block; the vectors themselves where none are missing."""
+    missing = -vectors.shape[1] % BLOCK
+    return np.pad(vectors, ((0, 0), (0, missing))) if missing else vectors
 
 
 def _paired(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -141,8 +147,7 @@ def inner_products(queries: NDArray[np.float32], kept: NDArray[Any], precision: 
         if len(queries) > _FEW_QUERIES:
             return np.asarray(queries @ unpack_descriptors(kept, precision, dimension).T)
         scales, uppers, lowers = _parts_of(kept, dimension)
-        padded = np.pad(queries, ((0, 0), (0, -dimension % BLOCK)))
-        made = [packed_products(query, scales, uppers, lowers) for query in padded]
+        made = [packed_products(query, scales, uppers, lowers) for query in _whole_blocks(queries)]
         return np.array(made, np.float32).reshape(len(queries), rows)
     if not rows:
         return np.empty((len(queries), 0), np.float32)
