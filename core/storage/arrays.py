@@ -82,13 +82,7 @@ def read_arrays(path: Path, kind: str, made_of: str) -> dict[str, NDArray[Any]]:
     Raises:
         StaleArrays: it is not.
     """
-    try:
-        with path.open("rb") as file:
-            return _read(file, os.fstat(file.fileno()).st_size, kind, made_of)
-    except FileNotFoundError as error:
-        raise StaleArrays("it is missing") from error
-    except OSError as error:
-        raise StaleArrays(f"it cannot be read: {error.strerror}") from error
+    return _read_file(path, kind, made_of)[0]
 
 
 def check_arrays(path: Path, kind: str, made_of: str) -> int:
@@ -97,8 +91,19 @@ def check_arrays(path: Path, kind: str, made_of: str) -> int:
     Raises:
         StaleArrays: as :func:`read_arrays`.
     """
-    read_arrays(path, kind, made_of)
-    return path.stat().st_size
+    return _read_file(path, kind, made_of)[1]
+
+
+def _read_file(path: Path, kind: str, made_of: str) -> tuple[dict[str, NDArray[Any]], int]:
+    """The arrays and the size of a file, which may be removed at any moment."""
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            return _read(file, size, kind, made_of), size
+    except FileNotFoundError as error:
+        raise StaleArrays("it is missing") from error
+    except OSError as error:
+        raise StaleArrays(f"it cannot be read: {error.strerror}") from error
 
 
 def _read(file: BinaryIO, size: int, kind: str, made_of: str) -> dict[str, NDArray[Any]]:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -74,3 +75,26 @@ def test_a_file_that_cannot_be_written_is_only_logged(tmp_path: Path, caplog: py
     (tmp_path / "taken").mkdir()
     assert not write_arrays(tmp_path / "taken", "codes", "", ARRAYS)
     assert os.listdir(tmp_path) == ["taken"]
+
+
+def test_a_file_may_be_removed_while_it_is_checked(path: Path) -> None:
+    content, done = path.read_bytes(), threading.Event()
+
+    def come_and_go() -> None:
+        while not done.is_set():
+            path.unlink(missing_ok=True)
+            path.write_bytes(content)
+
+    other = threading.Thread(target=come_and_go)
+    other.start()
+    try:
+        found = set()
+        for _ in range(2000):
+            try:
+                found.add(check_arrays(path, "codes", "these rows"))
+            except StaleArrays:
+                found.add(0)
+    finally:
+        done.set()
+        other.join()
+    assert found == {0, len(content)}
