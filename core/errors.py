@@ -147,6 +147,17 @@ class DataDirectoryTooNew(PlacerecError):
     """The data was written by a later version of placerec."""
 
 
+# Maps as files
+
+
+class InvalidArchive(PlacerecError):
+    """A file is not the export of a map, is cut or damaged, or holds what no map may hold."""
+
+
+class ArchiveTooNew(PlacerecError):
+    """An export was written by a later version of placerec."""
+
+
 # Evaluation
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-Coordinate = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Coordinate = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Corner = tuple[Coordinate, Coordinate]
 Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256)]
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core.errors import InvalidIdentifier
 
@@ -99,7 +99,16 @@ def _utc(moment: datetime) -> datetime:
         raise ValueError("in UTC it is before the year 1 or after the year 9999") from None
 
 
-Timestamp = Annotated[datetime, AfterValidator(_utc)]
+def _written_out(moment: object) -> object:
+    """A time as text has a date in it: a bare number could mean seconds as well as milliseconds, and is refused."""
+    if isinstance(moment, datetime) or (isinstance(moment, str) and _DATE.match(moment)):
+        return moment
+    raise ValueError("a time is written as in RFC 3339, such as 2026-11-20T10:00:00Z")
+
+
+_DATE = re.compile(r"\d{4}-\d\d-\d\d")
+
+Timestamp = Annotated[datetime, BeforeValidator(_written_out), AfterValidator(_utc)]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -165,6 +165,13 @@ class Coder:
             made.bits[rows], made.scales[rows, 1] = _signs_and_scales(rotated(padded, self.signs))
         return made
 
+    def nothing(self, n: int) -> Codes:
+        """Of ``n`` rows that have no descriptor any more, and are never asked for."""
+        sketch, code, scales = self.shape
+        return Codes(
+            np.zeros((n, sketch), np.uint64), np.zeros((n, code), np.uint64), np.zeros((n, scales), np.float32)
+        )
+
     def query(self, descriptor: Array) -> CodedQuery:
         """A query, float32 [D].
 

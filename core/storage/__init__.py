@@ -9,6 +9,7 @@ from core.storage.records import (
     Keep,
     MapRecord,
     MapSettings,
+    SameFrame,
     SequenceSummary,
     VerifyReport,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "NewPrecision",
     "Ranking",
     "Recall",
+    "SameFrame",
     "SequenceSummary",
     "Snapshot",
     "StorageStatus",

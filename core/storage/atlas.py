@@ -14,7 +14,8 @@ import os
 import secrets
 import shutil
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.records import MapRecord, MapSettings, VerifyReport
 from core.storage.resting import HALF, Precision
-from core.storage.verification import inspect_folder
+from core.storage.verification import Progress, inspect_folder, untold
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +58,7 @@ class Atlas:
         self._making = threading.Lock()  # held by the one that makes or deletes a map
         self._maps: dict[str, Map] = {}
         self._unlisted: dict[str, Map] = {}
+        self._reserved: set[str] = set()
         # Maps that could not be read at the start, and why: their files are damaged, or the disk refused.
         self._damaged: dict[str, str] = {}
         self._refused: dict[str, str] = {}
@@ -161,11 +163,8 @@ class Atlas:
         )
         with self._making, refusals(f"create map {map_id!r}"):
             self._expect_open()
+            self._expect_free(map_id)
             folder = self._folder / map_id
-            if map_id in self._maps or folder.exists():
-                raise MapExists(f"There is a map {map_id!r} already.")
-            if map_id in self._unlisted:
-                raise MapExists(f"A map {map_id!r} is being made.")
             folder = self._folder / f"{UNLISTED}{map_id}" if unlisted else folder
             unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
             try:
@@ -179,6 +178,47 @@ class Atlas:
             made = Map(folder, record)
             (self._unlisted if unlisted else self._maps)[map_id] = made
         return made
+
+    def _expect_free(self, map_id: str) -> None:
+        if map_id in self._maps or (self._folder / map_id).exists():
+            raise MapExists(f"There is a map {map_id!r} already.")
+        if map_id in self._unlisted or map_id in self._reserved:
+            raise MapExists(f"A map {map_id!r} is being made.")
+
+    @contextmanager
+    def building(self, map_id: str) -> Iterator[Path]:
+        """The path of a folder to be made within, which is listed as a map when the block ends without an error.
+
+        Before that nobody finds it, and a crash leaves nothing of it.  The id is taken meanwhile.
+
+        Raises:
+            InvalidIdentifier: the id does not have the form of one.
+            MapExists: it is taken.
+            StorageFull, StorageFailure.
+        """
+        check_map_id(map_id)
+        with self._making:
+            self._expect_open()
+            self._expect_free(map_id)
+            self._reserved.add(map_id)
+        unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
+        try:
+            with refusals(f"make map {map_id!r}"):
+                yield unfinished
+                with self._making:
+                    self._expect_open()
+                    folder = self._folder / map_id
+                    os.rename(unfinished, folder)
+                    try:
+                        made = Map(folder, *read_record(folder))
+                        sync_folder(self._folder)
+                    except BaseException:
+                        os.rename(folder, unfinished)
+                        raise
+                    self._maps[map_id] = made
+        finally:
+            self._reserved.discard(map_id)
+            shutil.rmtree(unfinished, ignore_errors=True)
 
     def unlisted(self) -> dict[str, Map]:
         """The maps that are being made, by the ids that they will have."""
@@ -277,15 +317,15 @@ class Atlas:
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
         return {**self._damaged, **self._refused, **found_later}
 
-    def verify(self, map_id: str) -> VerifyReport:
+    def verify(self, map_id: str, progress: Progress = untold) -> VerifyReport:
         """Read all of a map again, be it in service or quarantined, and say what is damaged.
 
         Raises:
             UnknownMap, StorageFailure.
         """
         with suppress(MapQuarantined):
-            return self.get(map_id).verify()
-        report = inspect_folder(self._folder / map_id)
+            return self.get(map_id).verify(progress)
+        report = inspect_folder(self._folder / map_id, progress)
         reason = f"out of service: {self.quarantined().get(map_id)}"
         return report.model_copy(update={"ok": False, "problems": [reason, *report.problems]})
 

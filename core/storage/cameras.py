@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from core.errors import InvalidField, UnknownCamera
 from core.masks import Mask
 from core.places import Camera, Timestamp
+from core.storage import seals
+from core.storage.disk import Damage
 from core.storage.ledger import moment_text
 from core.storage.writing import Write
 
@@ -84,9 +86,10 @@ class Cameras:
             if name not in known and len(known) >= MOST_CAMERAS:
                 raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
             write.connection.execute(
-                "INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)",
+                "INSERT OR REPLACE INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)",
                 (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
             )
+            seals.seal(write.connection, "cameras", "name = ?", name)
         self._forget_known()
         return made, name not in known
 
@@ -118,7 +121,10 @@ class Cameras:
 
 
 def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
-    return {
-        name: CameraRecord(name=name, mask=None if mask is None else Mask.model_validate_json(mask), updated_at=moment)
-        for name, mask, moment in connection.execute("SELECT name, mask, updated_at FROM cameras")
-    }
+    found = {}
+    for name, mask, moment, seal in connection.execute("SELECT name, mask, updated_at, seal FROM cameras").fetchall():
+        if not seals.is_sound((name, mask, moment), seal):
+            raise Damage(f"map.sqlite: camera {name!r} does not match its checksum")
+        kept = None if mask is None else Mask.model_validate_json(mask)
+        found[name] = CameraRecord(name=name, mask=kept, updated_at=moment)
+    return found

@@ -49,6 +49,8 @@ def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
     row = found[:, 0].astype(np.int64)
     if len(row) and row.max() >= rows:
         raise Damage(f"map.sqlite: a place has row {row.max()}, but there are {rows}")
+    if len(row) and row.min() < 0:
+        raise Damage("map.sqlite: a place has no row")
     kind, position = _positions(found[:, 4:9], found[:, 9])
     whereabouts = Whereabouts(
         kind,

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from core.storage import seals
 from core.storage.schema import check_schema, migrate
 
 FILE = "map.sqlite"
@@ -41,6 +42,7 @@ def connect(path: Path, create: bool = False) -> sqlite3.Connection:
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA temp_store = MEMORY")
         connection.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
+        seals.teach(connection)
     except BaseException:
         connection.close()
         raise
@@ -63,6 +65,8 @@ class Database:
         try:
             migrate(self._writer)
             check_schema(self._writer)
+            # SQLite opens a file for reading alone where writing is refused, and it would stay so when that has passed.
+            self._writer.execute("UPDATE map SET only = only WHERE false")
         except BaseException:
             self._writer.close()
             raise
@@ -70,6 +74,8 @@ class Database:
         self._idle: list[sqlite3.Connection] = []
         self._reading = 0
         self._closed = False
+        self.state = object()
+        """Another one after every transaction: whoever finds the same again knows that nothing was written."""
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
@@ -116,6 +122,8 @@ class Database:
                 if self._writer.in_transaction:
                     self._writer.execute("ROLLBACK")
             raise
+        finally:
+            self.state = object()
 
     def settle(self) -> None:
         """Empty the log after a COMMIT that failed while it was being synced.

@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.storage.disk import Damage, sync_folder, write_at
+from core.storage.disk import Damage, missing, sync_folder, write_at
 from core.storage.resting import (
     FULL,
     Descriptor,
@@ -122,6 +122,21 @@ class Layout:
             self._seal(records[i], first_row + i)
         return records
 
+    @cached_property
+    def frame(self) -> np.dtype[np.void]:
+        """The structured type of a frame at rest without the row and the checksums that a record adds to it."""
+        descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
+        return np.dtype([("descriptor", *descriptor), ("local", *local)])
+
+    def sealed(self, frames: NDArray[np.void], first_row: int) -> NDArray[np.void]:
+        """Frames at rest (:attr:`frame`) as records for the rows from ``first_row`` on, checksums included."""
+        records = np.zeros(len(frames), dtype=self.record)
+        for name in ("descriptor", "local"):
+            records[name] = frames[name]
+        for row, record in enumerate(records, start=first_row):
+            self._seal(record, row)
+        return records
+
     def _seal(self, record: np.void, row: int) -> None:
         record["row"] = row
         if self.version == _LATEST_VERSION:
@@ -190,7 +205,7 @@ def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterat
     try:
         file = path.open("rb", buffering=0)
     except FileNotFoundError as error:
-        raise Damage(f"{path.name}: the file is missing") from error
+        raise missing(path, error) from error
     with file:
         check_header(path, file.read(HEADER_BYTES), layout, number)
         step = max(1, _CHUNK_BYTES // layout.record.itemsize)

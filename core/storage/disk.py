@@ -29,6 +29,17 @@ class Damage(Exception):
     """What the disk holds of a map is not what was written there; the text says where."""
 
 
+def missing(path: Path, error: FileNotFoundError) -> Damage:
+    """What it is that a file of a map is missing: damage, unless all of its folder is out of reach.
+
+    Raises:
+        FileNotFoundError: the folder is missing, too: a disk that was taken away may be put back.
+    """
+    if not path.parent.is_dir():
+        raise error
+    return Damage(f"{path.name}: the file is missing")
+
+
 def sync_folder(folder: Path) -> None:
     """Make the names within ``folder`` durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -86,7 +97,7 @@ def _refusal(error: OSError | sqlite3.Error, action: str) -> Exception:
         return StorageFailure(f"The disk refused to {action}: {error.strerror or error}.")
     if getattr(error, "sqlite_errorcode", None) in _SQLITE_IS_FULL:
         return StorageFull(f"The disk is full: could not {action}. Make room and try again.")
-    if primary_code(error) in _SQLITE_IS_DAMAGED:
+    if primary_code(error) in _SQLITE_IS_DAMAGED or str(error).startswith("Could not decode to UTF-8"):
         return Damage(f"map.sqlite cannot be read: {error}")
     return StorageFailure(f"The disk refused to {action}: {error}.")
 
@@ -106,6 +117,8 @@ def refusals(action: str) -> Iterator[None]:
         raise
     except (sqlite3.IntegrityError, sqlite3.ProgrammingError, sqlite3.InterfaceError):
         raise  # our own mistake, not the disk's
+    except UnicodeDecodeError as error:  # SQLite names what it finds damaged, in letters that are damaged, too
+        raise Damage("map.sqlite cannot be read: its text is damaged") from error
     except (OSError, sqlite3.Error) as error:
         raise _refusal(error, action) from error
 

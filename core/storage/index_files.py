@@ -25,7 +25,7 @@ from core.storage.tiers import Recall, Tier
 GROUP_ROWS = 4096
 """Rows whose codes are one file, as far as segments divide it: some 9 MB of the default encoder's codes."""
 
-_CENTRED = "centred"
+_CENTRED, _LISTED = "centred", "listed"
 
 
 def segments_per_group(layout: Layout) -> int:
@@ -55,6 +55,7 @@ class IndexFiles:
         """Of the map in ``folder``."""
         self._folder = folder
         self._map = f"{layout.identity} {layout.dimension} {layout.precision}"
+        self._rows_per_segment = layout.rows_per_segment
         self.group_size = segments_per_group(layout)
         """Segments whose codes are one file."""
         self._coder: tuple[Coder, str] | None = None  # the last one seen, and its digest
@@ -104,22 +105,34 @@ class IndexFiles:
         arrays: Arrays = {"sketches": codes.sketches, "bits": codes.bits, "scales": codes.scales}
         return write_arrays(path, "codes", self._group_of(coder, named), arrays)
 
-    def read_lists(self, coder: Coder, rows: int) -> tuple[InvertedLists, int]:
-        """Of at most the ``rows`` rows that have codes; and how many there were when their centres were found."""
+    def read_lists(self, coder: Coder, rows: int, named: Sequence[NamedSegment]) -> tuple[InvertedLists, int]:
+        """Of at most the ``rows`` rows that have codes; and how many there were when their centres were found.
+
+        They are of these rows: the full segments among them are those that SQLite has ``named``.
+        """
         arrays = read_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
         try:
-            centred = int(arrays.pop(_CENTRED)[0])
+            centred, listed = int(arrays.pop(_CENTRED)[0]), arrays.pop(_LISTED).tobytes()
             lists = InvertedLists.of(arrays)
         except (ValueError, LookupError) as error:
             raise StaleArrays(f"it holds no lists: {error}") from error
         if lists.rows > rows:
             raise StaleArrays("it lists rows that there are not")
+        if listed != self._full_within(named, lists.rows):
+            raise StaleArrays("it lists other rows than there are")
         return lists, centred
 
-    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int) -> bool:
+    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int, named: Sequence[NamedSegment]) -> bool:
         """Keep them; whether they are kept."""
-        arrays = {**lists.tensors(), _CENTRED: np.array([centred])}
+        listed = np.frombuffer(self._full_within(named, lists.rows), np.uint8)
+        arrays = {**lists.tensors(), _CENTRED: np.array([centred]), _LISTED: listed}
         return write_arrays(self._folder / "lists.index", "lists", self._made_by(coder), arrays)
+
+    def _full_within(self, named: Sequence[NamedSegment], rows: int) -> bytes:
+        """Tells the full segments among the first ``rows`` rows from any others; full ones never change."""
+        full = named[: rows // self._rows_per_segment]
+        listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in full])
+        return hashlib.sha256(listed.encode()).digest()
 
     def read_recall(self, coder: Coder, tier: Tier) -> Recall:
         """What was measured last of this tier."""
@@ -158,6 +171,7 @@ class IndexFiles:
         if tier == "inverted":
             try:
                 checked += check_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
+                self.read_lists(coder, sum(segment.rows for segment in named), named)
             except StaleArrays as error:
                 stale.append(f"lists.index: {error}")
         return checked, stale

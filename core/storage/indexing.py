@@ -24,6 +24,7 @@ from core.storage.disk import Damage
 from core.storage.index_files import IndexFiles
 from core.storage.named import NamedSegment
 from core.storage.parallel import threads
+from core.storage.rebuilding import fitted_coder, remade
 from core.storage.recall import measured
 from core.storage.segment import Held, flat_index, vectors
 from core.storage.snapshot import Snapshot
@@ -31,11 +32,9 @@ from core.storage.tiers import IndexStatus, Recall, Tier, TierSetting, tier_for
 
 log = logging.getLogger(__name__)
 
-SAMPLE = 2000
-"""Places from which it is learnt what all codes have in common."""
-
 _ROWS_AT_ONCE = 256
 _NICENESS = 10
+_PATIENCE_SECONDS = 0.1
 _UNLISTED_SHARE = 0.02
 _GROWN = 2  # so many times as many places as when it was measured, the recall is measured again
 
@@ -78,7 +77,10 @@ class Indexer:
         self._map = of
         self._files = files
         self._lock = threading.Lock()
+        self._building = threading.Lock()  # held by the one thread that builds
         self._thread: threading.Thread | None = None
+        self.problem: str | None = None
+        """Why the last attempt to build came to no end, if it did not."""
         self._again = False
         self._stopping = threading.Event()
         self._progress = 0.0
@@ -108,11 +110,18 @@ class Indexer:
         if thread is not None and thread is not threading.current_thread():
             thread.join()
 
-    def status(self, snapshot: Snapshot) -> IndexStatus:
-        """How a snapshot of the map is searched."""
-        present = tier_of(snapshot)
+    def status(self, newest: Callable[[], Snapshot | None]) -> IndexStatus | None:
+        """How the map is searched; None where there is no snapshot any more.
+
+        Args:
+            newest: gives the newest snapshot.  It is taken when it is known whether anything is being built, or what
+                was just built could be said to be ready and not to be there.
+        """
         with self._lock:
             is_building, progress, recall = self._thread is not None, self._progress, self._recall
+        if (snapshot := newest()) is None:
+            return None
+        present = tier_of(snapshot)
         return IndexStatus(
             setting=self._map.setting(),
             tier=present,
@@ -122,6 +131,7 @@ class Indexer:
             rows_indexed=snapshot.coded,
             recall=recall[1] if recall is not None and recall[0] == present else None,
             bytes_in_memory=snapshot.memory,
+            problem=self.problem,
         )
 
     def _wanted(self, snapshot: Snapshot) -> Tier:
@@ -150,7 +160,13 @@ class Indexer:
                     return
                 self._again, self._progress = False, 0.0
             try:
-                self._settle()
+                with self._building:
+                    wanted = self._wanted(self._map.snapshot())
+                    self._settle()
+                self.problem = None
+                if self._wanted(self._map.snapshot()) != wanted:  # by a write that found nothing built yet
+                    with self._lock:
+                        self._again = True
             except (Stopped, UnknownMap, MapQuarantined):
                 pass
             except Damage as damage:
@@ -158,6 +174,7 @@ class Indexer:
             except Exception:
                 # It is tried again with the next write or start; searches go on in what there is.
                 log.exception("What a map is searched by could not be built to the end.")
+                self.problem = "what the map is searched by could not be built to the end; the log says why"
 
     def _settle(self) -> None:
         snapshot = self._map.snapshot()
@@ -183,6 +200,40 @@ class Indexer:
             raise Stopped
         self._progress = done / max(1, total)
 
+    def rebuild(self, progress: Callable[[int, int], None]) -> None:
+        """Make all of it anew from the descriptors, and put it in the place of what is there, which serves until then.
+
+        Args:
+            progress: told of rows done and of all; what it raises leaves everything as it was.
+
+        Raises:
+            Stopped: the map was closed.
+            Damage, OSError, MapQuarantined: a descriptor cannot be read.
+        """
+
+        def told(done: int, total: int) -> None:
+            progress(done, total)
+            if self._stopping.is_set():
+                raise Stopped
+
+        while not self._building.acquire(timeout=_PATIENCE_SECONDS):
+            told(0, self._map.snapshot().rows)
+        try:
+            if (wanted := self._wanted(self._map.snapshot())) == "exact":
+                return
+            made = remade(self._map.snapshot, wanted == "inverted", told)
+            self._publish(made.put_into)
+            self._files.write_coder(made.table.coder)
+            self._written.clear()
+            self._recall = None
+            self._keep_codes()
+            if made.lists is not None:
+                self._centred = made.lists.rows
+                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.named())
+        finally:
+            self._building.release()
+            self.wake()
+
     # Codes
 
     def _code_all(self) -> None:
@@ -206,9 +257,7 @@ class Indexer:
             return self._files.read_coder()
         except StaleArrays as stale:
             log.info("The codes of a map are made: coder.index: %s.", stale)
-        living = np.flatnonzero(snapshot.alive)
-        chosen = np.sort(np.random.default_rng(0).permutation(living)[:SAMPLE])
-        coder = Coder.fitted(snapshot.descriptors_at(chosen))
+        coder = fitted_coder(snapshot)
         self._files.write_coder(coder)
         return coder
 
@@ -226,9 +275,12 @@ class Indexer:
                 self._written.add(tuple(of_group))
                 return newest
         stop = min(start + _ROWS_AT_ONCE, newest.rows, (start // per_segment + 1) * per_segment)
-        codes = coder.encode(newest.descriptors_at(np.arange(start, stop)))
-        newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         number = start // per_segment
+        if newest.segments[number].removed:
+            codes = coder.nothing(stop - start)
+        else:
+            codes = coder.encode(newest.descriptors_at(np.arange(start, stop)))
+        newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None:
             newest = self._publish(lambda now: now.holding(number, None))
         if stop == sum(segment.rows for segment in named[: (group + 1) * self._files.group_size]):
@@ -270,7 +322,8 @@ class Indexer:
         lists = snapshot.lists
         if lists is None or not self._centred:  # those that the map was opened with tell when they were found
             with suppress(StaleArrays):
-                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded)
+                named = self._map.named()
+                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, named)
         # Centres fit the places there were; of twice as many they are found again.
         if lists is None or 2 * self._centred < snapshot.coded:
             lists, self._centred = InvertedLists.built(snapshot.table, progress=self._told), snapshot.coded
@@ -279,7 +332,7 @@ class Indexer:
         else:
             lists = lists.extended(snapshot.table)
         self._publish(lambda now: replace(now, lists=lists))
-        self._files.write_lists(snapshot.table.coder, lists, self._centred)
+        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.named())
 
     # Recall
 
@@ -305,7 +358,7 @@ class Indexer:
         """Every descriptor in memory, and no codes."""
         newest = self._publish(lambda now: replace(now, holds=True))
         for number, segment in enumerate(newest.segments):
-            if segment.held is None:
+            if segment.held is None and not segment.removed:
                 self._hold(number)
             self._told(number + 1, len(newest.segments))
         self._publish(lambda now: replace(now, table=None, lists=None))
@@ -327,5 +380,8 @@ class Indexer:
             vectors(index)[done:], local[done:] = now.descriptors_at(rows), now.locals_at(rows)
             return Held(index, local)
 
-        first = read(self._map.snapshot(), None)
-        self._publish(lambda now: now.holding(number, read(now, first)))
+        newest = self._map.snapshot()
+        if newest.segments[number].removed:
+            return
+        first = read(newest, None)
+        self._publish(lambda now: now if now.segments[number].removed else now.holding(number, read(now, first)))

@@ -15,17 +15,20 @@ from typing import Any
 
 from core.errors import InvalidField, UnknownPlace
 from core.places import Place, PlaceFields, Pose
+from core.storage import seals
+from core.storage.disk import Damage
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 from core.storage.schema import NO_SEQUENCE
+from core.storage.seals import SEALED
 
 DEEPEST_METADATA = 64
 """Levels of nesting; what is deeper could be stored but not be sent."""
 
 _POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 
+_COLUMNS = SEALED["places"]
 _PLACE = (
-    "SELECT p.number, p.id, p.row, p.digest, p.regions, p.picture, p.x, p.y, p.z, p.latitude, p.longitude, p.heading,"
-    " p.timestamp, s.name, p.metadata, p.created_at, p.updated_at, p.sequence, p.ordinal, p.camera"
+    f"SELECT {', '.join(f'p.{name}' for name in _COLUMNS)}, p.seal, s.name"
     " FROM places p JOIN sequences s ON s.code = p.sequence "
 )
 
@@ -43,20 +46,29 @@ class StoredPlace:
 
 
 def _stored(values: tuple[Any, ...]) -> StoredPlace:
-    pose = {name: value for name, value in zip(_POSE, values[6:12], strict=True) if value is not None}
-    place = Place(
-        id=values[1],
-        regions=values[4],
-        picture=values[5],
-        pose=Pose(**pose) if pose else None,
-        timestamp=values[12],
-        sequence=values[13],
-        camera=values[19],
-        metadata=json.loads(values[14]),
-        created_at=values[15],
-        updated_at=values[16],
+    *sealed, seal, sequence = values
+    columns = dict(zip(_COLUMNS, sealed, strict=True))
+    if not seals.is_sound(sealed, seal):
+        raise Damage(f"map.sqlite: place {columns['id']!r} does not match its checksum")
+    pose = {name: columns[name] for name in _POSE if columns[name] is not None}
+    try:
+        place = Place(
+            id=columns["id"],
+            regions=columns["regions"],
+            picture=columns["picture"],
+            pose=Pose(**pose) if pose else None,
+            timestamp=columns["timestamp"],
+            sequence=sequence,
+            camera=columns["camera"],
+            metadata=json.loads(columns["metadata"]),
+            created_at=columns["created_at"],
+            updated_at=columns["updated_at"],
+        )
+    except ValueError as error:
+        raise Damage(f"map.sqlite: place {columns['id']!r} makes no sense") from error
+    return StoredPlace(
+        columns["number"], columns["row"], columns["digest"], columns["sequence"], columns["ordinal"], place
     )
-    return StoredPlace(values[0], values[2], values[3], values[17], values[18], place)
 
 
 def moment_text(moment: datetime) -> str:
@@ -90,7 +102,12 @@ def metadata_text(metadata: dict[str, Any]) -> str:
         raise InvalidField(f"The metadata cannot be written as JSON: {error}.") from error
 
 
-def _field_columns(fields: PlaceFields) -> dict[str, Any]:
+def field_columns(fields: PlaceFields) -> dict[str, Any]:
+    """The columns of ``places`` that hold a place's fields, its sequence left out.
+
+    Raises:
+        InvalidField: the metadata cannot be written as JSON.
+    """
     columns: dict[str, Any] = {name: getattr(fields.pose, name) if fields.pose else None for name in _POSE}
     columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
     columns["camera"] = fields.camera
@@ -100,7 +117,7 @@ def _field_columns(fields: PlaceFields) -> dict[str, Any]:
 
 def same_fields(a: PlaceFields, b: PlaceFields) -> bool:
     """Whether two sets of fields are stored alike (unlike Python, JSON tells 1 from true)."""
-    return a.sequence == b.sequence and _field_columns(a) == _field_columns(b)
+    return a.sequence == b.sequence and field_columns(a) == field_columns(b)
 
 
 # Reading
@@ -224,7 +241,7 @@ def insert(
         "ordinal": _next_ordinal(connection, code),
         "created_at": moment_text(now),
         "updated_at": moment_text(now),
-        **_field_columns(item.fields),
+        **field_columns(item.fields),
     }
     names, marks = ", ".join(columns), ", ".join("?" * len(columns))
     cursor = connection.execute(f"INSERT INTO places ({names}) VALUES ({marks})", tuple(columns.values()))
@@ -236,6 +253,7 @@ def insert(
 def _set(connection: sqlite3.Connection, number: int, **columns: Any) -> None:
     assignments = ", ".join(f"{name} = ?" for name in columns)
     connection.execute(f"UPDATE places SET {assignments} WHERE number = ?", (*columns.values(), number))
+    seals.seal(connection, "places", "number = ?", number)
 
 
 def replace_descriptor(
@@ -260,7 +278,7 @@ def replace_descriptor(
 
 def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: PlaceFields, now: datetime) -> StoredPlace:
     """Other fields for a place.  It keeps its place in its sequence unless that is another one."""
-    columns = _field_columns(fields)
+    columns = field_columns(fields)
     if fields.sequence != stored.place.sequence:
         columns["sequence"] = _sequence_code(connection, fields.sequence)
         columns["ordinal"] = _next_ordinal(connection, columns["sequence"])
@@ -309,6 +327,7 @@ def insert_record(connection: sqlite3.Connection, record: MapRecord, rows_per_se
     columns = {"only": 1, "rows_per_segment": rows_per_segment, **_record_columns(record)}
     names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
     connection.execute(f"INSERT INTO map ({names}) VALUES ({marks})", tuple(columns.values()))
+    seals.seal(connection, "map")
 
 
 def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
@@ -316,6 +335,7 @@ def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
     columns = _record_columns(record)
     assignments = ", ".join(f'"{name}" = ?' for name in columns)
     connection.execute(f"UPDATE map SET {assignments}", tuple(columns.values()))
+    seals.seal(connection, "map")
 
 
 def _record_columns(record: MapRecord) -> dict[str, Any]:
@@ -337,7 +357,11 @@ def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
     if values is None:
         raise ValueError("the map's own record is missing")
     columns = {description[0]: value for description, value in zip(cursor.description, values, strict=True)}
-    rows_per_segment = int(columns.pop("rows_per_segment"))
+    if not seals.is_sound([columns[name] for name in SEALED["map"]], columns.pop("seal")):
+        raise ValueError("it does not match its checksum")
+    rows_per_segment = columns.pop("rows_per_segment")
+    if not isinstance(rows_per_segment, int):
+        raise ValueError("it does not say how many rows a segment has")
     del columns["only"]
     if columns["calibration"] is not None:
         columns["calibration"] = json.loads(columns["calibration"])

@@ -24,6 +24,7 @@ from core.errors import (
 from core.images import Limits, decode, encode_thumbnail
 from core.places import Place, PlaceFields
 from core.storage import ledger, pages
+from core.storage.archives.capture import Capturing
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
 from core.storage.database import DatabaseClosed
@@ -37,7 +38,7 @@ from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, 
 from core.storage.snapshot import Snapshot
 from core.storage.tiers import IndexStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
-from core.storage.verification import inspect
+from core.storage.verification import Progress, inspect, untold
 from core.storage.writing import Write, check_enrolment
 
 log = logging.getLogger(__name__)
@@ -65,10 +66,11 @@ class Map:
         self._damage: str | None = None
         self._end: PlacerecError | None = None
         self._doubts = Doubts(folder)
-        self._indexer: Indexer | None = None
+        self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
+        self.capturing = Capturing(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
 
@@ -104,7 +106,7 @@ class Map:
                 self._end = (
                     UnknownMap(f"There is no map {name!r}.") if deleted else StorageFailure(f"Map {name!r} is closed.")
                 )
-        if (indexer := self._indexer) is not None:
+        if (indexer := self.indexer) is not None:
             indexer.stop()
         with self._lock:
             opened, last, self._opened, self._snapshot = self._opened, self._snapshot, None, None
@@ -128,9 +130,9 @@ class Map:
                     opened, snapshot = open_map(self._folder)
                     self._opened, self._record = opened, opened.record
                     self._snapshot = replace(snapshot, guard=self._searching)
-                    self._indexer = Indexer(self._indexed(opened), opened.files)
-                    if self._indexer.needs_work(self._snapshot):
-                        self._indexer.wake()
+                    self.indexer = Indexer(self._indexed(opened), opened.files)
+                    if self.indexer.needs_work(self._snapshot):
+                        self.indexer.wake()
             return self._opened
 
     def _quarantined(self) -> MapQuarantined:
@@ -142,9 +144,11 @@ class Map:
         try:
             with refusals(f"{action} map {self._folder.name!r}"):
                 yield
-        except Damage as damage:
+        except (Damage, StorageFailure) as damage:
             if self._end is not None:
                 raise type(self._end)(*self._end.args) from damage  # its files are gone, as they must be
+            if isinstance(damage, StorageFailure):
+                raise
             self._quarantine(damage)
             raise self._quarantined() from damage
 
@@ -155,8 +159,8 @@ class Map:
             opened, self._opened, self._snapshot = self._opened, None, None
             if opened is not None:
                 opened.database.close()
-        if self._indexer is not None:
-            self._indexer.stop(wait=False)
+        if self.indexer is not None:
+            self.indexer.stop(wait=False)
 
     @contextmanager
     def _searching(self) -> Iterator[None]:
@@ -181,10 +185,9 @@ class Map:
 
     def index_status(self) -> IndexStatus:
         """How the map is searched; it is not read from disk for it."""
-        snapshot, indexer = self._snapshot, self._indexer
-        if snapshot is None or indexer is None:
-            return unopened(self._record.index, self._places)
-        return indexer.status(snapshot)
+        indexer = self.indexer
+        found = None if indexer is None else indexer.status(lambda: self._snapshot)
+        return unopened(self._record.index, self._places) if found is None else found
 
     def storage_status(self) -> StorageStatus:
         """What the map takes on disk."""
@@ -222,8 +225,8 @@ class Map:
                         self._doubts.arise(error, opened, before.rows)
                     raise
             self._snapshot, self._record = after, write.record
-            if self._indexer is not None and ((write.filled and after.coded) or self._indexer.needs_work(after)):
-                self._indexer.wake()
+            if self.indexer is not None and ((write.filled and after.coded) or self.indexer.needs_work(after)):
+                self.indexer.wake()
 
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
         """Change settings (those of MapSettings) or ``calibration`` (None: back to the encoder's).
@@ -379,7 +382,7 @@ class Map:
         # It was accepted when it was enrolled; today's limits are not its limits.
         return encode_thumbnail(decode(content, Limits(max_bytes=len(content), max_pixels=1 << 40, min_side=1)))
 
-    def verify(self) -> VerifyReport:
+    def verify(self, progress: Progress = untold) -> VerifyReport:
         """Read all of the map again and check it; writes and searches go on meanwhile.
 
         The report is of the moment of the call.  Damage is reported, not quarantined: what is
@@ -392,6 +395,6 @@ class Map:
                 connection.execute("BEGIN")
                 connection.execute("SELECT id FROM map").fetchall()  # this is when the transaction begins to see
             try:
-                return inspect(self._folder, connection, snapshot)
+                return inspect(self._folder, connection, snapshot, progress)
             finally:
                 connection.execute("ROLLBACK")

@@ -11,11 +11,12 @@ from core.storage.disk import Damage
 
 @dataclass(frozen=True)
 class NamedSegment:
-    """What SQLite says of a segment file."""
+    """What SQLite says of a segment file; of one that is ``removed`` no row is alive, and no file need be there."""
 
     number: int
     rows: int
     checksum: int
+    removed: bool = False
 
 
 def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[NamedSegment]:
@@ -24,9 +25,12 @@ def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[Named
     Raises:
         Damage: one is missing, or one that is not the last is not full.
     """
-    query = "SELECT number, rows, checksum FROM segments ORDER BY number"
-    found = [NamedSegment(*row) for row in connection.execute(query).fetchall()]
+    query = "SELECT number, rows, checksum, removed FROM segments ORDER BY number"
+    rows = connection.execute(query).fetchall()
+    found = [NamedSegment(number, count, checksum, bool(removed)) for number, count, checksum, removed in rows]
     for position, segment in enumerate(found):
+        if not all(isinstance(value, int) for value in (segment.number, segment.rows, segment.checksum)):
+            raise Damage(f"map.sqlite: what it says of segment {position + 1} makes no sense")
         full, last = segment.rows == layout.rows_per_segment, position == len(found) - 1
         if segment.number != position or segment.rows > layout.rows_per_segment or not (full or last):
             raise Damage(f"map.sqlite: segment {position + 1} is not as long as it must be")

@@ -19,17 +19,19 @@ from numpy.typing import NDArray
 
 from core.index import Codes, CodeTable
 from core.places import Pose, microseconds
-from core.storage import descriptors, ledger
+from core.storage import descriptors, ledger, seals
 from core.storage.arrays import StaleArrays
 from core.storage.columns import read_columns
 from core.storage.database import FILE, Database, connect
 from core.storage.descriptors import Layout
 from core.storage.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.storage.index_files import IndexFiles
+from core.storage.log import check_log
 from core.storage.named import NamedSegment, named_segments
 from core.storage.patches import complaint
+from core.storage.reclaiming import Remains, clear_folder
 from core.storage.records import MapRecord
-from core.storage.schema import NO_SEQUENCE, check_schema, migrate
+from core.storage.schema import NO_SEQUENCE, check_schema, contradictions, migrate
 from core.storage.segment import Held, Segment, flat_index, vectors
 from core.storage.shelf import Shelf
 from core.storage.snapshot import Snapshot
@@ -52,6 +54,7 @@ class OpenMap:
     database: Database
     shelf: Shelf
     files: IndexFiles
+    remains: Remains
 
 
 def spot_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Spot:
@@ -100,8 +103,15 @@ def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
 def _adopt(folder: Path, connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     record, layout = read_layout(connection)
     if record.id != folder.name.removeprefix(UNLISTED):
-        raise Damage(f"the folder holds the map {record.id!r}")
+        raise Damage(f"{FILE}: it is that of the map {record.id!r}")
     return record, layout
+
+
+def _check_files(folder: Path) -> None:
+    if not (folder / FILE).is_file():
+        folder.stat()  # a folder that is out of reach is no damage: it may come back
+        raise Damage(f"{FILE} is missing")
+    check_log(folder / f"{FILE}-wal")
 
 
 def read_record(folder: Path) -> tuple[MapRecord, int]:
@@ -112,14 +122,17 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
         Damage: it is not a map, or not the one its folder names.
         sqlite3.Error: it cannot be read.
     """
-    if not (folder / FILE).is_file():
-        raise Damage(f"{FILE} is missing")
+    _check_files(folder)
     connection = connect(folder / FILE)
     try:
         migrate(connection)
         check_schema(connection)
         (places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         return _adopt(folder, connection)[0], int(places)
+    except sqlite3.OperationalError as error:
+        if primary_code(error) == sqlite3.SQLITE_ERROR:  # SQL that suits our tables does not suit these
+            raise Damage(f"{FILE}: {error}") from error
+        raise
     finally:
         connection.close()
 
@@ -164,6 +177,18 @@ def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable |
     )
 
 
+def _check_rows(connection: sqlite3.Connection) -> None:
+    """All rows of a small map and their indexes, but for the pictures, which are checked as they are read."""
+    for table in ("places", "place_values", "sequences"):
+        ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
+        if line != "ok":
+            raise Damage(f"{FILE}: {line}")
+    if broken := seals.broken(connection, "places"):
+        raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
+    if found := contradictions(connection):
+        raise Damage(f"{FILE}: {found[0]}")
+
+
 def read_snapshot(
     folder: Path, layout: Layout, connection: sqlite3.Connection, record: MapRecord, shelf: Shelf, files: IndexFiles
 ) -> Snapshot:
@@ -196,15 +221,22 @@ def read_snapshot(
     for segment in named:
         first = segment.number * layout.rows_per_segment
         part = slice(first, first + segment.rows)
+        there = Whereabouts(**{name: column[part] for name, column in vars(whereabouts).items()})
+        if segment.removed:
+            if alive[part].any():
+                raise Damage(f"{FILE}: segment {segment.number + 1} is said to be removed, but has places")
+            segments.append(Segment(None, first, there, alive[part], checksums[part], removed=True))
+            continue
         if not holds:
             shelf.check(segment.number, segment.rows)
         held = _load_segment(folder, layout, segment, checksums[part]) if holds else None
-        there = Whereabouts(**{name: column[part] for name, column in vars(whereabouts).items()})
         segments.append(Segment(held, first, there, alive[part], checksums[part]))
+    if holds:
+        _check_rows(connection)
     lists = None
     if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
         with suppress(StaleArrays):
-            lists, _ = files.read_lists(table.coder, len(table))
+            lists, _ = files.read_lists(table.coder, len(table), named)
     return Snapshot(
         layout.dimension,
         layout.rows_per_segment,
@@ -227,14 +259,14 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
         Damage: what is on disk is not what was written.
         OSError, sqlite3.Error: the disk refuses.
     """
-    if not (folder / FILE).is_file():
-        raise Damage(f"{FILE} is missing")
+    _check_files(folder)
     database = Database(folder / FILE)
     try:
         with database.reading() as connection:
             record, layout = _adopt(folder, connection)
             shelf, files = Shelf(folder, layout), IndexFiles(folder, layout)
             snapshot = read_snapshot(folder, layout, connection, record, shelf, files)
+            clear_folder(folder, named_segments(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # SQLite has made the name of its log
         # Earlier versions kept the descriptors of full segments a second time, for FAISS to read.
@@ -248,7 +280,10 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     except ValueError as error:
         database.close()
         raise Damage(f"map.sqlite: {complaint(error)}") from error
+    except TypeError as error:  # a value is missing where the tables allow none
+        database.close()
+        raise Damage(f"{FILE}: a value makes no sense: {error}") from error
     except BaseException:
         database.close()
         raise
-    return OpenMap(record, layout, database, shelf, files), snapshot
+    return OpenMap(record, layout, database, shelf, files, Remains(folder, layout)), snapshot

@@ -30,9 +30,13 @@ class MapSettings(BaseModel):
         description="What is kept of each frame. A change applies to frames enrolled from then on.",
     )
     same_place_radius: float = Field(
-        default=5.0, ge=0, allow_inf_nan=False, description="Places within so many metres are the same place."
+        strict=True,
+        default=5.0,
+        ge=0,
+        allow_inf_nan=False,
+        description="Places within so many metres are the same place.",
     )
-    same_place_frames: Annotated[int, Field(ge=0, le=2**31)] = Field(
+    same_place_frames: Annotated[int, Field(strict=True, ge=0, le=2**31)] = Field(
         default=3, description="Without poses: places so many frames apart in their sequence are the same place."
     )
     index: TierSetting = Field(
@@ -95,6 +99,15 @@ class Enrolment:
     local: NDArray[np.int8] = field(default_factory=lambda: np.empty((0, 0), np.int8))
     thumbnail: bytes | None = None
     image: bytes | None = None
+
+
+@dataclass(frozen=True)
+class SameFrame:
+    """Other fields for a place, if it still shows the frame of this digest; its descriptor need not be sent again."""
+
+    id: str
+    fields: PlaceFields
+    digest: bytes
 
 
 @dataclass(frozen=True)

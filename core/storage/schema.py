@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Sequence
 
 from core.errors import DataDirectoryTooNew
+from core.storage import seals
 from core.storage.disk import Damage
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
@@ -131,7 +132,13 @@ _TIERS: Migration = (
     "ALTER TABLE map ADD COLUMN precision TEXT NOT NULL DEFAULT 'full'",
 )
 
-MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS)
+# A checksum in each row that nothing else vouches for.
+_SEALS: Migration = seals.statements()
+
+# Segments of which no place is left, and whose files are gone (:mod:`core.storage.reclaiming`).
+_REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
+
+MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
@@ -151,7 +158,7 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the file.
-        Damage: it is a database, but not one of ours.
+        Damage: it is a database, but not one of ours; or it has the tables of today and another version.
         sqlite3.Error: a statement failed; the file is as it was.
     """
     version: int = connection.execute("PRAGMA user_version").fetchone()[0]
@@ -160,10 +167,13 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
     if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
         raise Damage("map.sqlite is not one of placerec's databases")
     if version > len(migrations):
+        if _columns(connection) == _expected(migrations):
+            raise Damage(f"map.sqlite says that it is of schema {version}, but its tables are of {len(migrations)}")
         raise DataDirectoryTooNew(
             f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
         )
     if version < len(migrations):
+        seals.teach(connection)
         connection.execute("BEGIN IMMEDIATE")
         try:
             for migration in migrations[version:]:
@@ -179,19 +189,37 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
     return len(migrations) - version
 
 
+def _expected(migrations: Sequence[Migration]) -> dict[str, set[str]]:
+    wanted = sqlite3.connect(":memory:", isolation_level=None)
+    try:
+        migrate(wanted, migrations, create=True)
+        return _columns(wanted)
+    finally:
+        wanted.close()
+
+
 def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS) -> None:
     """Compare a file's tables and columns with those that ``migrations`` make.
 
     Raises:
         Damage: something is missing.
     """
-    wanted = sqlite3.connect(":memory:", isolation_level=None)
-    try:
-        migrate(wanted, migrations, create=True)
-        expected = _columns(wanted)
-    finally:
-        wanted.close()
     found = _columns(connection)
-    for table, columns in expected.items():
+    for table, columns in _expected(migrations).items():
         if missing := columns - found.get(table, set()):
             raise Damage(f"map.sqlite lacks {', '.join(sorted(missing))} of its table {table!r}")
+
+
+def contradictions(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """Where the tables do not follow from the places: the values by which they are found, the ends of sequences."""
+    told = []
+    found, due = "SELECT key, kind, value, row FROM place_values", _values_of("p").format(source="places p, ")
+    for some, others in ((found, due), (due, found)):
+        query = f"SELECT row, key FROM ({some} EXCEPT {others}) LIMIT {limit}"
+        for row, key in connection.execute(query).fetchall():
+            told.append(f"row {row} is not found by its metadata {key!r} as it must be")
+    query = (
+        "SELECT s.name FROM sequences s JOIN places p ON p.sequence = s.code WHERE s.name IS NOT NULL GROUP BY s.code"
+        f" HAVING s.next_ordinal <= max(p.ordinal) LIMIT {limit}"
+    )
+    return told + [f"sequence {name!r} ends before its last place" for (name,) in connection.execute(query).fetchall()]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import faiss
 import numpy as np
@@ -63,6 +64,10 @@ class Held:
         return Held(index, cells)
 
 
+class Reading:
+    """As long as this lives, the file of a segment may be read."""
+
+
 @dataclass(frozen=True, eq=False)
 class Segment:
     """Consecutive rows of a map.
@@ -71,6 +76,8 @@ class Segment:
     first_row: the map's row that is row 0 here.
     alive: bool [n], False for the rows of places that were forgotten or got another frame.
     checksums: uint32 [n], what SQLite names of each row; 0 where it names none.
+    reading: is shared by all states of the segment in which its file may be read.
+    removed: no row is alive, and there are no descriptors any more, in memory or on the shelf.
     """
 
     held: Held | None
@@ -78,6 +85,8 @@ class Segment:
     whereabouts: Whereabouts
     alive: NDArray[np.bool_]
     checksums: NDArray[np.uint32]
+    reading: Reading = field(default_factory=Reading)
+    removed: bool = False
 
     def __len__(self) -> int:
         return len(self.alive)
@@ -134,6 +143,15 @@ class Segment:
         alive, checksums = self.alive.copy(), self.checksums.copy()
         alive[dead], checksums[dead] = False, 0
         return replace(self, alive=alive, checksums=checksums)
+
+    @cached_property
+    def has_life(self) -> bool:
+        """Whether any row is alive."""
+        return bool(self.alive.any())
+
+    def without_rows(self) -> Segment:
+        """Removed: without descriptors, and without a hold on its file."""
+        return replace(self, held=None, reading=Reading(), removed=True)
 
     def search(
         self,

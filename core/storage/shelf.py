@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.storage.descriptors import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
-from core.storage.disk import Damage
+from core.storage.disk import Damage, missing
 from core.storage.resting import FULL, Local, inner_products
 
 Rows = NDArray[np.int64]
@@ -137,7 +137,7 @@ class Shelf:
         try:
             file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError as error:
-            raise Damage(f"{path.name}: the file is missing") from error
+            raise missing(path, error) from error
         try:
             yield file
         finally:

@@ -22,6 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
 from core.storage.descriptors import NO_LOCAL
 from core.storage.parallel import threads, together
@@ -115,9 +116,9 @@ class Snapshot:
 
     @cached_property
     def _held(self) -> NDArray[np.bool_]:
-        """By row, whether its descriptor is in memory: bool [rows]."""
+        """By row, whether its descriptor is not on the shelf, but in memory or removed: bool [rows]."""
         return np.repeat(
-            np.array([segment.held is not None for segment in self.segments], np.bool_),
+            np.array([segment.held is not None or segment.removed for segment in self.segments], np.bool_),
             np.array([len(segment) for segment in self.segments], np.int64),
         )
 
@@ -133,7 +134,7 @@ class Snapshot:
         """The rows to compare with, in parts of equal size within a segment; segments of the dead are left out."""
         parts = []
         for segment in self.segments:
-            if segment.held is not None and segment.alive.any():
+            if segment.held is not None and segment.has_life:
                 count = -(-len(segment) * self.dimension * 4 // _PART_BYTES)
                 ends = [len(segment) * i // count for i in range(count + 1)]
                 parts += [_Part(segment, start, stop) for start, stop in pairwise(ends) if stop > start]
@@ -245,12 +246,16 @@ class Snapshot:
     def _check_rows(self, rows: NDArray[np.int64]) -> None:
         if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
             raise IndexError(f"the map has rows 0 to {self.rows - 1}")
+        for number in np.unique(rows // self.rows_per_segment).tolist():
+            if self.segments[number].removed:
+                raise UnknownPlace("A place was deleted while it was looked at.")
 
     def locals_at(self, rows: NDArray[np.int64]) -> Local:
         """The local descriptors of rows, as :meth:`search` returns them: int8 [k, C, L], a copy.
 
         Raises:
             IndexError: there is no such row.
+            UnknownPlace: it is of a place that was deleted, and its segment was removed.
         """
         self._check_rows(rows)
         found = np.empty((len(rows), *self.local_shape), np.int8)
@@ -270,6 +275,7 @@ class Snapshot:
 
         Raises:
             IndexError: there is no such row.
+            UnknownPlace: it is of a place that was deleted, and its segment was removed.
         """
         self._check_rows(rows)
         found = np.empty((len(rows), self.dimension), np.float32)
@@ -344,8 +350,10 @@ class Snapshot:
         return replace(self, table=self.table.appended(codes))
 
     def holding(self, number: int, held: Held | None) -> Snapshot:
-        """With the descriptors of a segment in memory, or on the shelf only."""
+        """With the descriptors of a segment in memory, or on the shelf only; one that was removed has none."""
         segments = list(self.segments)
+        if segments[number].removed:
+            return self
         segments[number] = replace(segments[number], held=held)
         return replace(self, segments=tuple(segments))
 

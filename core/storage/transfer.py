@@ -13,8 +13,8 @@ from core.errors import StorageFailure
 from core.places import Place
 from core.storage import ledger
 from core.storage.cameras import Access
-from core.storage.records import Enrolment, History, Keep
-from core.storage.writing import Write
+from core.storage.records import Change, Enrolment, History, Keep, SameFrame
+from core.storage.writing import Write, check_enrolment
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,23 @@ class Transfer:
         if hashlib.sha256(kept[0]).digest() != kept[1]:
             raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
         return kept[0]
+
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> list[tuple[Place, Change] | None]:
+        """Like :meth:`core.storage.Map.enrol`, with places among them whose frame is known to be there already.
+
+        All in one COMMIT, in the order given, which is their order in their sequences.
+
+        Returns:
+            None for a place that shows another frame by now, or is gone: nothing is done about it.
+
+        Raises:
+            As :meth:`core.storage.Map.enrol`.
+        """
+        with self._writing() as write:
+            for item in items:
+                if isinstance(item, Enrolment):
+                    check_enrolment(item, write.record.dimension, write.record.local_shape)
+            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
         """Take places of another map, all of them or, if this raises, none.

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage import descriptors
+from core.storage import descriptors, seals
 from core.storage.columns import read_columns
 from core.storage.database import FILE, connect
 from core.storage.descriptors import Layout
@@ -21,15 +21,24 @@ from core.storage.indexing import tier_of
 from core.storage.named import NamedSegment, named_segments
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
-from core.storage.schema import check_schema
+from core.storage.schema import check_schema, contradictions
 from core.storage.segment import Segment, vectors
 from core.storage.snapshot import Snapshot
 
 _NAMED = 10  # of the rows of one kind of damage, so many are told one by one
 
 
+Progress = Callable[[int, int], None]
+"""Told of rows done and of all; what it raises ends the reading."""
+
+
+def untold(done: int, total: int) -> None:
+    """Nobody is told."""
+
+
 class _Findings:
-    def __init__(self) -> None:
+    def __init__(self, progress: Progress = untold) -> None:
+        self.progress = progress
         self.problems: list[str] = []
         self.stale_caches: list[str] = []
         self.places = 0
@@ -43,7 +52,7 @@ class _Findings:
             yield
         except (Damage, OSError) as damage:
             self.problems.append(str(damage))
-        except (sqlite3.Error, ValueError) as error:
+        except (sqlite3.Error, ValueError, TypeError) as error:
             self.problems.append(f"{FILE}: {error}")
 
     def report(self) -> VerifyReport:
@@ -57,20 +66,22 @@ class _Findings:
         )
 
 
-def inspect_folder(folder: Path) -> VerifyReport:
+def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
     """Check a map that is out of service."""
-    findings = _Findings()
+    findings = _Findings(progress)
     with findings.noting():
         connection = connect(folder / FILE)
         try:
             check_schema(connection)
-            return inspect(folder, connection, None)
+            return inspect(folder, connection, None, progress)
         finally:
             connection.close()
     return findings.report()
 
 
-def inspect(folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None) -> VerifyReport:
+def inspect(
+    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = untold
+) -> VerifyReport:
     """Check a map's files against each other, and against ``snapshot`` if it is in service.
 
     Checked are: SQLite's integrity, every descriptor's checksum, the rows that places name, the
@@ -78,10 +89,15 @@ def inspect(folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | N
 
     Args:
         connection: in a transaction that sees the moment of the snapshot.
+        progress: told while descriptors are read.
     """
-    findings = _Findings()
+    findings = _Findings(progress)
     with findings.noting():
         _check_tables(connection, findings)
+    with findings.noting():
+        _check_seals(connection, findings)
+    with findings.noting():
+        findings.problems += [f"{FILE}: {found}" for found in contradictions(connection)]
     with findings.noting():
         _, layout = read_layout(connection)
         segments = named_segments(connection, layout)
@@ -107,6 +123,15 @@ def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
             findings.problems.append(f"{FILE}: {line}")
     for table, row, parent, _ in connection.execute("PRAGMA foreign_key_check").fetchall():
         findings.problems.append(f"{FILE}: row {row} of {table} belongs to nothing in {parent}")
+
+
+def _check_seals(connection: sqlite3.Connection, findings: _Findings) -> None:
+    for table, kind in (("map", "map"), ("places", "place"), ("cameras", "camera")):
+        names = seals.broken(connection, table)
+        for name in names[:_NAMED]:
+            findings.problems.append(f"{FILE}: {kind} {name!r} does not match its checksum")
+        if len(names) > _NAMED:
+            findings.problems.append(f"{FILE}: so with {len(names) - _NAMED} more of {table}")
 
 
 def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None:
@@ -141,6 +166,7 @@ def _check_descriptors(
         if row >= findings.rows:
             findings.problems.append(f"{FILE}: place {place!r} has row {row}, but there are {findings.rows}")
     for named in segments:
+        findings.progress(named.number * layout.rows_per_segment, findings.rows)
         with findings.noting():
             _check_segment(folder, layout, named, places, snapshot, findings)
 
@@ -154,6 +180,10 @@ def _check_segment(
     findings: _Findings,
 ) -> None:
     row = named.number * layout.rows_per_segment
+    if named.removed:
+        for place in [places[one][0] for one in range(row, row + named.rows) if one in places][:_NAMED]:
+            findings.problems.append(f"{FILE}: the segment of place {place!r} is said to be removed")
+        return
     damaged: list[int] = []
     foreign: list[int] = []
     differing: list[int] = []
@@ -170,6 +200,7 @@ def _check_segment(
             differing += [row + offset for offset in _differing(searched, row - searched.first_row, layout, records)]
         findings.checked_bytes += records.nbytes
         row += len(records)
+        findings.progress(row, findings.rows)
     for rows, what in (
         (damaged, "does not match its checksum"),
         (foreign, f"is not the one that {FILE} names"),

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
 from core.storage import descriptors, ledger
+from core.storage.descriptors import Layout
 from core.storage.ledger import StoredPlace
 from core.storage.opening import OpenMap, spot_of
-from core.storage.records import Change, Enrolment, History, Keep, MapRecord
+from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
 from core.storage.resting import LARGEST_HALF
 from core.storage.snapshot import Snapshot, Spot
 
@@ -54,6 +55,27 @@ def _spot(stored: StoredPlace) -> Spot:
     return spot_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
 
 
+def name_appended(
+    connection: sqlite3.Connection, layout: Layout, first_row: int, checksums: list[int]
+) -> dict[int, int]:
+    """Name the rows, from ``first_row`` on, that were appended to the segment files.
+
+    Returns:
+        The segments that became full, and their checksums.
+    """
+    filled, done = {}, 0
+    while done < len(checksums):
+        number, offset = divmod(first_row + done, layout.rows_per_segment)
+        part = checksums[done : done + layout.rows_per_segment - offset]
+        named = connection.execute("SELECT checksum FROM segments WHERE number = ?", (number,)).fetchone()
+        checksum = descriptors.chain(part, named[0] if named else 0)
+        ledger.name_rows(connection, number, offset + len(part), checksum)
+        if offset + len(part) == layout.rows_per_segment:
+            filled[number] = checksum
+        done += len(part)
+    return filled
+
+
 class Write:
     """Collects changes within a transaction of the map's one writer.
 
@@ -71,6 +93,7 @@ class Write:
         """The segments that became full, and their checksums."""
         self._folder = folder
         self._layout = opened.layout
+        self._remains = opened.remains
         self._snapshot = snapshot
         self._born: list[NDArray[np.void]] = []
         self._spots: list[Spot] = []
@@ -100,6 +123,11 @@ class Write:
         self._born.append(record)
         self._spots.append(_spot(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
+
+    def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
+        """Other fields for a place that shows this frame; None, and nothing, if it shows another or is gone."""
+        stored = ledger.find(self.connection, item.id)
+        return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
 
     def adopt(self, item: Enrolment, history: History) -> None:
         """A place of another map, with its history."""
@@ -154,22 +182,12 @@ class Write:
             self.appending = True
             records = np.concatenate(self._born)
             descriptors.append(self._folder, self._layout, before.rows, records)
-            self._name_rows(before.rows, records["checksum"].tolist())
+            self.filled = name_appended(self.connection, self._layout, before.rows, records["checksum"].tolist())
             vectors, local = self._layout.descriptors_of(records), self._layout.locals_of(records)
             after = before.appended(list(vectors), self._spots, list(local), records["checksum"].tolist())
         else:
             after = before
         after = after.moved(self._moved) if self._moved else after
-        return after.without(self._dead) if self._dead else after
-
-    def _name_rows(self, first_row: int, checksums: list[int]) -> None:
-        done = 0
-        while done < len(checksums):
-            number, offset = divmod(first_row + done, self._layout.rows_per_segment)
-            part = checksums[done : done + self._layout.rows_per_segment - offset]
-            named = self.connection.execute("SELECT checksum FROM segments WHERE number = ?", (number,)).fetchone()
-            checksum = descriptors.chain(part, named[0] if named else 0)
-            ledger.name_rows(self.connection, number, offset + len(part), checksum)
-            if offset + len(part) == self._layout.rows_per_segment:
-                self.filled[number] = checksum
-            done += len(part)
+        after = after.without(self._dead) if self._dead else after
+        self._remains.clear(before)
+        return self._remains.remove(self.connection, after)
