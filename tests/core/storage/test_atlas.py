@@ -187,9 +187,10 @@ def test_a_later_arrangement_or_schema_is_refused(directory: Path) -> None:
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
     atlas.close()
     edit(directory, "PRAGMA user_version = 99")
+    edit(directory, "ALTER TABLE places ADD COLUMN floor INTEGER")
     with pytest.raises(DataDirectoryTooNew, match="schema 99"):
         Atlas(directory)
-    edit(directory, "PRAGMA user_version = 1")
+    edit(directory, "ALTER TABLE places DROP COLUMN floor")
     Atlas(directory).close()  # and it let go of the lock each time
 
 

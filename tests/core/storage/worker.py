@@ -12,12 +12,11 @@ import resource
 import signal
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 from core.errors import PlacerecError
 from core.places import PlaceFields
-from core.storage import Atlas, Map, MapSettings, index_files
+from core.storage import Atlas, Map, MapSettings
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 LARGE = 4096
@@ -65,33 +64,6 @@ def everything(directory: Path) -> None:
         atlas.get("lab").patch("late", {"metadata": {"text": f"{i} " * 2000}})
         acknowledge("patched again")
     atlas.close()
-
-
-def enrol_for_ever(directory: Path, settings: MapSettings | None = None) -> None:
-    """Enrols two new places, replaces one and forgets one, over and over; tells of each step before and after it."""
-    atlas = Atlas(directory, rows_per_segment=4)
-    lab = (
-        atlas.get("lab")
-        if atlas.records(None, 1)[0]
-        else atlas.create("lab", ENCODER, DIMENSION, settings, LOCAL_SHAPE)
-    )
-    for i in itertools.count(lab.snapshot().rows):
-        fresh, twin = f"new{i}", f"pair{i}"
-        steps: list[tuple[dict[str, str | None], Callable[[], object]]] = [
-            ({fresh: fresh, twin: twin}, partial(lab.enrol, [frame(fresh), frame(twin, sequence="pairs")])),
-            ({fresh: f"again{i}"}, partial(lab.enrol, [frame(fresh, f"again{i}")])),
-            ({twin: None}, partial(lab.forget, twin)),
-        ]
-        for outcome, step in steps[: 1 + i % 3]:
-            os.write(1, f"begin {json.dumps(outcome)}\n".encode())
-            step()
-            acknowledge(json.dumps(outcome))
-
-
-def enrol_and_code_for_ever(directory: Path) -> None:
-    """The same in a map that is searched by codes, whose files are small, so that many are made."""
-    index_files.GROUP_ROWS = 8
-    enrol_for_ever(directory, MapSettings(index="inverted"))
 
 
 def fill(directory: Path) -> None:
@@ -166,8 +138,6 @@ def die_at_refusal(directory: Path) -> None:
 
 ACTIONS: dict[str, Callable[[Path], None]] = {
     "everything": everything,
-    "enrol-for-ever": enrol_for_ever,
-    "enrol-and-code-for-ever": enrol_and_code_for_ever,
     "fill": fill,
     "hold": hold,
     "keep-trying": keep_trying,

@@ -1,0 +1,164 @@
+"""The lines of an export file: a sequence, a camera, a place each, from the tables and back, every value checked."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from core.errors import InvalidArchive
+from core.masks import Mask
+from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
+from core.storage.archives.manifest import strict_json
+from core.storage.patches import complaint
+
+MOST_LINE_BYTES = 4 << 20
+
+LARGEST = 2**62
+"""What SQLite can hold, with room to count on."""
+
+Number = Annotated[int, Field(ge=0, le=LARGEST, strict=True)]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SequenceLine(_Line):
+    """A sequence.  name: None for the places that belong to none."""
+
+    name: Sequence | None
+    next_ordinal: Number
+
+
+class CameraLine(_Line):
+    """A camera and what is ignored in its frames."""
+
+    name: Camera
+    mask: Mask | None
+    updated_at: Timestamp
+
+
+class Picture(_Line):
+    """What is kept of a place's frame: so many bytes of the pictures of its group."""
+
+    kind: Literal["thumbnail", "image"]
+    bytes: Annotated[int, Field(ge=0, le=1 << 29, strict=True)]
+    sha256: Digest
+
+
+class PlaceLine(_Line):
+    """A place.  digest: SHA-256 of the image that it was enrolled with, and of what was masked in it."""
+
+    id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
+    pose: Pose | None
+    timestamp: Timestamp | None
+    sequence: Sequence | None
+    ordinal: Number
+    camera: Camera | None
+    metadata: dict[str, Any]
+    regions: Number
+    digest: Digest
+    picture: Picture | None
+    created_at: Timestamp
+    updated_at: Timestamp
+
+    def fields(self) -> PlaceFields:
+        """What its owner said of it."""
+        return PlaceFields(
+            pose=self.pose,
+            timestamp=self.timestamp,
+            sequence=self.sequence,
+            camera=self.camera,
+            metadata=self.metadata,
+        )
+
+
+Kind = TypeVar("Kind", bound=_Line)
+
+
+def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
+    """One line of a part.
+
+    Raises:
+        InvalidArchive: it is not what ``kind`` describes.
+    """
+    value = strict_json(text, where)
+    try:
+        made = kind.model_validate(value)
+        if b"\\u" in text:  # half a character, which only an escape can say, is no text of SQLite's
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise InvalidArchive(f"{where} holds half a character (a lone surrogate).") from None
+    except (ValidationError, RecursionError) as error:
+        why = complaint(error) if isinstance(error, ValueError) else "nested too deeply"
+        raise InvalidArchive(f"{where}: {why[:400]}.") from None
+    return made
+
+
+def _line(value: dict[str, Any]) -> bytes:
+    return (json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False) + "\n").encode()
+
+
+def sequence_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
+    """By name, that of no sequence first."""
+    for name, following in connection.execute("SELECT name, next_ordinal FROM sequences ORDER BY name"):
+        yield _line({"name": name, "next_ordinal": following})
+
+
+def camera_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
+    """By name."""
+    for name, mask, updated_at in connection.execute("SELECT name, mask, updated_at FROM cameras ORDER BY name"):
+        yield _line({"name": name, "mask": None if mask is None else json.loads(mask), "updated_at": updated_at})
+
+
+_POSE = ("x", "y", "z", "latitude", "longitude", "heading")
+_PLACES = (
+    "SELECT p.id, p.x, p.y, p.z, p.latitude, p.longitude, p.heading, p.timestamp, s.name, p.ordinal, p.camera,"
+    " p.metadata, p.regions, lower(hex(p.digest)), p.picture, length(k.bytes), lower(hex(k.digest)),"
+    " p.created_at, p.updated_at, p.number, p.row, p.checksum"
+    " FROM places p JOIN sequences s ON s.code = p.sequence LEFT JOIN pictures k ON k.place = p.number"
+    " ORDER BY p.number"
+)
+
+
+class StoredLine:
+    """A place's line, and where the rest of it is: its picture, its descriptor.
+
+    picture_bytes: of what is kept of its frame; 0 where nothing is.
+    """
+
+    __slots__ = ("checksum", "id", "number", "picture_bytes", "row", "text")
+
+    def __init__(self, values: tuple[Any, ...]) -> None:
+        pose = {name: value for name, value in zip(_POSE, values[1:7], strict=True) if value is not None}
+        picture = None if values[15] is None else {"kind": values[14], "bytes": values[15], "sha256": values[16]}
+        self.text = _line(
+            {
+                "id": values[0],
+                "pose": pose or None,
+                "timestamp": values[7],
+                "sequence": values[8],
+                "ordinal": values[9],
+                "camera": values[10],
+                "metadata": json.loads(values[11]),
+                "regions": values[12],
+                "digest": values[13],
+                "picture": picture,
+                "created_at": values[17],
+                "updated_at": values[18],
+            }
+        )
+        self.id: str = values[0]
+        self.picture_bytes: int = values[15] or 0
+        self.number, self.row, self.checksum = (int(value) for value in values[19:22])
+
+
+def place_lines(connection: sqlite3.Connection) -> Iterator[StoredLine]:
+    """All places in the order of their enrolment."""
+    for values in connection.execute(_PLACES):
+        yield StoredLine(values)

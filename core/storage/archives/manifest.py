@@ -1,0 +1,179 @@
+"""What an export file holds: its first part, on which everything else is checked.
+
+The file is a plain tar (ustar).  Its members, in this order, in version 1:
+
+    manifest.json               this: format, version, the map's record, and each part's bytes and SHA-256
+    manifest.sha256             its SHA-256, as sha256sum writes it
+    sequences.jsonl             one line a sequence: its name and the ordinal that its next place gets
+    cameras.jsonl               one line a camera, with its mask
+    places-000001.jsonl         one line a place, in the order of enrolment
+    descriptors-000001.bin      of the same places: descriptor and local descriptors as the map keeps them, one
+                                behind the other, nothing between them
+    pictures-000001.bin         of the same places: what is kept of their frames, one behind the other
+    places-000002.jsonl …       and so on
+
+The bytes of a file follow from its manifest and its parts alone, so the SHA-256 of the manifest names all of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
+from core.places import check_map_id
+from core.storage.patches import complaint
+from core.storage.records import MapRecord
+
+FORMAT = "placerec map"
+VERSION = 1
+MANIFEST, SEAL = "manifest.json", "manifest.sha256"
+SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
+GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"))
+
+MOST_MANIFEST_BYTES = 64 << 20
+MOST_PART_BYTES = 8 << 30
+"""What the header of a tar can say, less one."""
+
+Count = Annotated[int, Field(ge=0, strict=True)]
+
+
+class Part(BaseModel):
+    """One part of the file.  rows: lines, or places whose descriptors or pictures it holds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    rows: Count
+    bytes: Annotated[int, Field(ge=0, lt=MOST_PART_BYTES, strict=True)]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class ArchivedRecord(MapRecord):
+    """A map's record as it travels; what is unknown is refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    encoder: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]+$", max_length=1024)]
+    dimension: Annotated[int, Field(gt=0, le=1 << 24, strict=True)]
+    local_cells: Annotated[int, Field(ge=0, le=1 << 20, strict=True)] = 0
+    local_values: Annotated[int, Field(ge=0, le=1 << 16, strict=True)] = 0
+    revision: Annotated[int, Field(ge=1, le=2**62, strict=True)]
+
+
+class Manifest(BaseModel):
+    """The first part."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: str
+    version: int
+    map: ArchivedRecord
+    places: Count
+    parts: list[Part]
+
+    @property
+    def groups(self) -> int:
+        """How many times places, descriptors and pictures follow each other."""
+        return (len(self.parts) - 2) // len(GROUP_KINDS)
+
+    def group(self, number: int) -> Sequence[Part]:
+        """Places, descriptors and pictures of group ``number``, counted from 0."""
+        first = 2 + number * len(GROUP_KINDS)
+        return self.parts[first : first + len(GROUP_KINDS)]
+
+
+def group_names(number: int) -> list[str]:
+    """The names of the parts of group ``number``, counted from 0."""
+    return [f"{kind}-{number + 1:06d}.{suffix}" for kind, suffix in GROUP_KINDS]
+
+
+def written(manifest: Manifest) -> bytes:
+    """The manifest as it stands in the file; the same manifest is always the same bytes."""
+    return (json.dumps(manifest.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def tag_of(text: bytes) -> str:
+    """What names a file, by the bytes of its manifest: their SHA-256 in hexadecimal."""
+    return hashlib.sha256(text).hexdigest()
+
+
+def seal_of(text: bytes) -> bytes:
+    """What stands behind the manifest, by its bytes."""
+    return f"{tag_of(text)}  {MANIFEST}\n".encode()
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number of JSON")
+
+
+def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) != len(pairs):
+        raise ValueError("a name stands twice in an object")
+    return made
+
+
+def strict_json(text: bytes, what: str) -> Any:
+    """The value of a JSON text without anything that JSON cannot say, or says twice.
+
+    Raises:
+        InvalidArchive.
+    """
+    try:
+        return json.loads(text.decode("utf-8"), parse_constant=_no_constant, object_pairs_hook=_no_repeats)
+    except RecursionError:
+        raise InvalidArchive(f"{what} is nested too deeply.") from None
+    except ValueError as error:
+        raise InvalidArchive(f"{what} is not JSON in UTF-8: {str(error)[:200]}.") from None
+
+
+def read_manifest(text: bytes) -> Manifest:
+    """The manifest of a file, of whatever version that is known.
+
+    Raises:
+        ArchiveTooNew: a later version of placerec wrote the file.
+        InvalidArchive: it is none of ours, or says what cannot be.
+    """
+    value = strict_json(text, MANIFEST)
+    if not isinstance(value, dict) or value.get("format") != FORMAT:
+        raise InvalidArchive(f"{MANIFEST} is not that of a map of placerec.")
+    version = value.get("version")
+    if type(version) is not int or version < 1:
+        raise InvalidArchive(f"{MANIFEST} names no version.")
+    if version not in READERS:
+        raise ArchiveTooNew(
+            f"The file was written by a later version of placerec (format {version}, this one knows {VERSION})."
+        )
+    return READERS[version](value)
+
+
+def _read_first(value: dict[str, Any]) -> Manifest:
+    try:
+        manifest = Manifest.model_validate(value)
+    except (ValidationError, RecursionError) as error:
+        why = complaint(error) if isinstance(error, ValueError) else "it is nested too deeply"
+        raise InvalidArchive(f"{MANIFEST}: {why[:400]}.") from None
+    try:
+        check_map_id(manifest.map.id)
+    except InvalidIdentifier as error:
+        raise InvalidArchive(f"{MANIFEST}: {error}") from None
+    names = [SEQUENCES, CAMERAS]
+    for number in range(max(0, manifest.groups)):
+        names += group_names(number)
+    if [part.name for part in manifest.parts] != names:
+        raise InvalidArchive(f"{MANIFEST}: the parts are not those of a map, in their order.")
+    for number in range(manifest.groups):
+        if len({part.rows for part in manifest.group(number)}) != 1:
+            raise InvalidArchive(f"{MANIFEST}: the parts of group {number + 1} differ in the number of places.")
+    if sum(part.rows for part in manifest.parts if part.name.startswith("places-")) != manifest.places:
+        raise InvalidArchive(f"{MANIFEST}: the parts hold another number of places than it names.")
+    return manifest
+
+
+READERS = {1: _read_first}
+"""How each version is read; a version, once written, stays here."""

@@ -1,0 +1,46 @@
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+import pytest
+
+from core.masks import Mask
+from core.places import PlaceFields, Pose
+from core.storage import Atlas, Enrolment, Map, MapSettings
+from tests.core.storage.archives.files import exported
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+
+
+def filled(lab: Map) -> Map:
+    """With all that a map can hold, and with rows of places that are gone."""
+    moment = datetime(2026, 11, 20, 10, tzinfo=UTC)
+    lab.enrol([frame(f"p{i}", x=i / 3, sequence="monday", metadata={"i": i, "ä": [None, 1.5]}) for i in range(7)])
+    lab.edit({"keep": "image"})
+    lab.enrol([frame("q0", timestamp=moment), frame("q1", camera="front"), frame("gone")])
+    roof = frame("roof")
+    where = PlaceFields(pose=Pose(latitude=48.8, longitude=2.3, heading=10), sequence="Ünter den Linden")
+    lab.enrol([Enrolment("roof", where, roof.descriptor, 3, roof.digest, roof.local)])
+    lab.enrol([frame("p3", "p3 from elsewhere", x=1.0, sequence="monday")])
+    lab.forget("gone")
+    lab.forget("p5")
+    lab.cameras.put("front", Mask(polygons=(((0, 0), (0.25, 0), (0, 0.25)),)))
+    lab.cameras.put("rear", None)
+    lab.edit({"description": "hall", "keep": "none", "index": "exact"})
+    return lab
+
+
+@pytest.fixture
+def full(lab: Map) -> Map:
+    return filled(lab)
+
+
+@pytest.fixture(scope="session")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The file of such a map."""
+    folder = tmp_path_factory.mktemp("content")
+    atlas = Atlas(folder / "data", rows_per_segment=4)
+    lab = filled(atlas.create("lab", ENCODER, DIMENSION, MapSettings(), local_shape=LOCAL_SHAPE))
+    try:
+        return exported(lab, folder / "kept")
+    finally:
+        atlas.close()

@@ -1,0 +1,255 @@
+"""Files whose checksums are right and whose contents are not: what no map may hold comes into none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
+from core.storage import Atlas, descriptors
+from core.storage.archives import building
+from core.storage.archives.building import build
+from core.storage.archives.reading import Archive
+from tests.core.storage.archives.files import Parts, changed, imported, line_changed
+from tests.core.storage.frames import DIMENSION, ENCODER, frame
+
+Made = Callable[[bytes], bytes]
+PLACES, FRAMES, PICTURES = "places-000001.jsonl", "descriptors-000001.bin", "pictures-000001.bin"
+CAMERAS, SEQUENCES = "cameras.jsonl", "sequences.jsonl"
+
+
+def place(**values: Any) -> Made:
+    """Other values in the second place."""
+    return lambda content: line_changed(content, PLACES, 1, **values)
+
+
+def line(part: str, number: int, **values: Any) -> Made:
+    return lambda content: line_changed(content, part, number, **values)
+
+
+def raw(part: str, change: Callable[[bytes], bytes]) -> Made:
+    def edit(_manifest: dict[str, Any], parts: Parts) -> None:
+        parts[part] = change(parts[part])
+
+    return lambda content: changed(content, edit)
+
+
+def counted(part: str, number: int, change: Callable[[bytes], bytes]) -> Made:
+    """Other lines, and as many as the manifest says."""
+
+    def edit(manifest: dict[str, Any], parts: Parts) -> None:
+        parts[part] = change(parts[part])
+        manifest["parts"][number]["rows"] = parts[part].count(b"\n")
+
+    return lambda content: changed(content, edit)
+
+
+def descriptor(*values: float) -> Made:
+    """Another descriptor of the first place."""
+
+    def change(data: bytes) -> bytes:
+        halves = np.zeros(DIMENSION, "<f2")
+        halves[: len(values)] = values
+        return halves.tobytes() + data[2 * DIMENSION :]
+
+    return raw(FRAMES, change)
+
+
+def again(data: bytes) -> bytes:
+    first = data.splitlines(keepends=True)[1]
+    return data + first
+
+
+def many(data: bytes) -> bytes:
+    return b"".join(data.splitlines(keepends=True)[0].replace(b"front", b"c%d" % i) for i in range(257))
+
+
+def deep(levels: int) -> dict[str, Any]:
+    value: dict[str, Any] = {}
+    for _ in range(levels):
+        value = {"a": value}
+    return value
+
+
+KEPT = {"kind": "image", "bytes": 11, "sha256": "0" * 64}
+HOSTILE: dict[str, tuple[Made, str]] = {
+    "a place twice": (place(id="p0"), "UNIQUE"),
+    "an id that is none": (place(id="../p1"), "id"),
+    "an id with an end of line": (place(id="p1\n"), "id"),
+    "a field more": (place(owner="me"), "owner"),
+    "a field of the tables": (place(row=0), "row"),
+    "a sequence not listed": (place(sequence="sunday"), "does not list"),
+    "a sequence with a slash": (place(sequence="a/b"), "sequence"),
+    "an ordinal behind the end": (place(ordinal=7), "behind its end"),
+    "an ordinal below 0": (place(ordinal=-1), "ordinal"),
+    "an ordinal too large": (place(ordinal=1 << 63), "ordinal"),
+    "an ordinal that is true": (place(ordinal=True), "ordinal"),
+    "regions too many": (place(regions=1 << 63), "regions"),
+    "two poses": (place(pose={"x": 1, "y": 2, "latitude": 1, "longitude": 2}), "pose"),
+    "half a pose": (place(pose={"x": 1}), "pose"),
+    "a pose too far": (place(pose={"x": 1e300, "y": 0}), "pose"),
+    "an infinite pose": (raw(PLACES, lambda d: d.replace(b'"x":0.0', b'"x":1e999')), "pose"),
+    "no number": (raw(PLACES, lambda d: d.replace(b'"x":0.0', b'"x":NaN')), "NaN"),
+    "a name twice": (raw(PLACES, lambda d: d.replace(b'"id":"p0"', b'"id":"p0","id":"p9"')), "twice"),
+    "no time": (place(timestamp="noon"), "timestamp"),
+    "no camera's name": (place(camera="../x"), "camera"),
+    "deep metadata": (place(metadata=deep(70)), "nested"),
+    "endless metadata": (raw(PLACES, lambda d: d.replace(b'"i":0', b'"i":1e999')), "JSON"),
+    "metadata that is a list": (place(metadata=[1]), "metadata"),
+    "half a character": (raw(SEQUENCES, lambda d: d.replace(b"monday", b"\\ud800")), "unicode"),
+    "half a character in metadata": (place(metadata={"a": "\ud800"}), "half a character"),
+    "no digest": (place(digest="ff"), "digest"),
+    "a picture of another digest": (line(PLACES, 5, picture=KEPT), "does not match its SHA-256"),
+    "a picture too long": (line(PLACES, 5, picture={**KEPT, "bytes": 1 << 40}), "picture"),
+    "a picture that is not there": (line(PLACES, 5, picture={**KEPT, "bytes": 1 << 20}), "shorter"),
+    "a picture of no kind": (line(PLACES, 5, picture={**KEPT, "kind": "none"}), "picture"),
+    "pictures left over": (raw(PICTURES, lambda d: d + b"more"), "longer"),
+    "pictures too few": (raw(PICTURES, lambda d: d[:-1]), "shorter"),
+    "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), "is to have"),
+    "descriptors too few": (raw(FRAMES, lambda d: d[:-47]), "is to have"),
+    "a descriptor of zeros": (descriptor(), "none that can be compared"),
+    "a descriptor that is no number": (descriptor(1, np.nan), "none that can be compared"),
+    "an infinite descriptor": (descriptor(1, np.inf), "none that can be compared"),
+    "a line too few": (raw(PLACES, lambda d: d[: d.rindex(b"\n", 0, -1) + 1]), "lines, not 9|longer"),
+    "a line too many": (raw(PLACES, lambda d: d + d.splitlines(keepends=True)[0].replace(b"p0", b"p99")), "shorter"),
+    "no end of line": (raw(PLACES, lambda d: d[:-1]), "end of a line"),
+    "an empty line": (raw(PLACES, lambda d: d + b"\n"), "is not JSON"),
+    "no UTF-8": (raw(PLACES, lambda d: d.replace(b"p0", b"\xff\xfe", 1)), "UTF-8"),
+    "no object": (raw(PLACES, lambda d: b"[]\n" + d.split(b"\n", 1)[1]), "line 1"),
+    "an endless line": (raw(PLACES, lambda d: b" " * (5 << 20) + d), "a line of more than"),
+    "a sequence twice": (counted(SEQUENCES, 0, again), "UNIQUE"),
+    "a sequence of nobody": (line(SEQUENCES, 1, name="sunday"), "does not list"),
+    "an empty sequence": (counted(SEQUENCES, 0, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "is empty"),
+    "sequences miscounted": (raw(SEQUENCES, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "lines, not"),
+    "a camera twice": (counted(CAMERAS, 1, again), "UNIQUE"),
+    "too many cameras": (counted(CAMERAS, 1, many), "at most 256"),
+    "a mask of everything": (line(CAMERAS, 0, mask={"polygons": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}), "mask"),
+}
+
+
+def left_behind(directory: Path) -> list[str]:
+    return [path.name for path in (directory / "maps").iterdir()]
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory: pytest.TempPathFactory) -> Atlas:
+    return Atlas(tmp_path_factory.mktemp("shelf") / "data", rows_per_segment=4)
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_contents_are_refused(content: bytes, shelf: Atlas, tmp_path: Path, case: str) -> None:
+    make, complaint = HOSTILE[case]
+    path = tmp_path / "sent.tar"
+    path.write_bytes(make(content))
+    with pytest.raises(InvalidArchive, match=complaint):
+        imported(shelf, path, "lab")
+    assert left_behind(shelf._directory) == [] and shelf.records(None, 10) == ([], None)
+
+
+def test_the_cases_are_refused_for_nothing_else(content: bytes, shelf: Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(place(metadata={"changed": True})(content))
+    made = imported(shelf, path, "another")
+    assert made.place("p1").metadata == {"changed": True} and made.record.id == "another"
+    assert made.verify().ok
+    shelf.delete("another")
+
+
+def test_pictures_can_be_looked_at(content: bytes, shelf: Atlas, tmp_path: Path) -> None:
+    def refuse(data: bytes) -> None:
+        raise InvalidImage("no picture at all")
+
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    with (
+        pytest.raises(InvalidArchive, match="no picture at all"),
+        Archive(path) as archive,
+        shelf.building("lab") as folder,
+    ):
+        build(archive, folder, "lab", check_picture=refuse)
+    assert left_behind(shelf._directory) == []
+
+
+def test_the_id_is_taken_while_it_is_built(content: bytes, shelf: Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    gives_up = RuntimeError("no more of this")
+    with pytest.raises(RuntimeError, match="no more"), shelf.building("lab"):
+        with pytest.raises(MapExists, match="being made"):
+            shelf.create("lab", ENCODER, DIMENSION)
+        with pytest.raises(MapExists, match="being made"):
+            imported(shelf, path, "lab")
+        raise gives_up
+    imported(shelf, path, "lab")
+    with pytest.raises(MapExists, match="already"):
+        imported(shelf, path, "lab")
+    shelf.delete("lab")
+    with pytest.raises(InvalidIdentifier):
+        imported(shelf, path, "../lab")
+
+
+def test_nothing_of_it_is_seen_before_it_is_whole(
+    content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Broken off between two commits, and the process ended there: the next one finds no map, and no rest of one."""
+    monkeypatch.setattr(building, "CHUNK_BYTES", 1)
+    path, directory = tmp_path / "sent.tar", tmp_path / "data"
+    path.write_bytes(content)
+    atlas = Atlas(directory)
+    seen = []
+
+    def advance(done: int, total: int) -> None:
+        assert atlas.records(None, 10) == ([], None) and total == 9
+        seen.append(done)
+        if done == 5:
+            atlas.close()  # as if the process ended: nothing of the building can be undone
+            left = left_behind(directory)
+            assert len(left) == 1 and left[0].startswith(".making-lab-")
+            again = Atlas(directory)
+            assert left_behind(directory) == [] and again.quarantined() == {}
+            again.close()
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), Archive(path) as archive, atlas.building("lab") as folder:
+        build(archive, folder, "lab", advance=advance)
+    assert seen == [1, 2, 3, 4, 5]
+
+
+def test_a_full_disk_leaves_nothing(content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    atlas = Atlas(tmp_path / "data")
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(descriptors, "append", refuse)
+    with pytest.raises(StorageFull):
+        imported(atlas, path, "lab")
+    assert left_behind(tmp_path / "data") == []
+    monkeypatch.undo()
+    made = imported(atlas, path, "lab")
+    made.enrol([frame("next")])
+    assert made.verify().ok
+    atlas.close()
+
+
+def test_lines_are_what_a_person_can_read(content: bytes) -> None:
+    start = content.index(b'{"id":"roof"')
+    shown = json.loads(content[start : content.index(b"\n", start)])
+    assert shown["pose"] == {"latitude": 48.8, "longitude": 2.3, "heading": 10.0}
+    assert shown["sequence"] == "Ünter den Linden"
+
+
+def test_a_flipped_bit_anywhere_makes_no_map(content: bytes, shelf: Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    for at in range(7, len(content), len(content) // 37):
+        path.write_bytes(content[:at] + bytes([content[at] ^ (1 << at % 8)]) + content[at + 1 :])
+        with pytest.raises(InvalidArchive):
+            imported(shelf, path, "lab")
+    assert left_behind(shelf._directory) == [] and shelf.records(None, 10) == ([], None)

@@ -1,0 +1,64 @@
+"""Export files of format version 1, as the code that first wrote it wrote them: read for ever.
+
+``tests/core/storage/fixtures/README.md`` says where they come from.
+"""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.storage import Atlas
+from core.storage.archives.manifest import VERSION
+from tests.core.storage.archives.files import exported, imported
+
+FIXTURE = Path(__file__).parents[1] / "fixtures" / "export-version-1.tar.xz"
+
+
+def read(name: str) -> bytes:
+    with tarfile.open(FIXTURE, "r:xz") as archive:
+        file = archive.extractfile(name)
+        assert file is not None
+        return file.read()
+
+
+@pytest.mark.parametrize("precision", ["half", "compressed", "full"])
+def test_a_file_of_version_1(tmp_path: Path, precision: str) -> None:
+    expected = json.loads(read("expected.json"))[precision]
+    path = tmp_path / "old.tar"
+    path.write_bytes(read(f"{precision}.tar"))
+    atlas = Atlas(tmp_path / "data")
+    found = imported(atlas, path, precision)
+    record = found.record.model_dump(mode="json")
+    assert {name: record[name] for name in expected["record"]} == expected["record"]
+    places = {place.id: place for place in found.places(None, 100)[0]}
+    assert list(places) == list(expected["places"])
+    snapshot = found.snapshot()
+    for place_id, known in expected["places"].items():
+        shown = places[place_id].model_dump(mode="json")
+        rows = np.array(found.rows_of([place_id]))
+        shown["descriptor"] = snapshot.descriptors_at(rows)[0].tolist()
+        shown["local"] = snapshot.locals_at(rows)[0].tolist()
+        digest, picture = found.digest(place_id), found.transfer.picture(place_id)
+        shown["digest"] = digest and digest.hex()
+        shown["picture_text"] = picture and picture.decode()
+        assert {name: shown[name] for name in known} == known
+    assert [camera.model_dump(mode="json") for camera in found.cameras.all()] == expected["cameras"]
+    assert [list(end) for end in found.transfer.sequence_ends().items()] == expected["sequence_ends"]
+    assert found.verify().ok
+    atlas.close()
+
+
+@pytest.mark.parametrize("precision", ["half", "compressed", "full"])
+def test_what_is_written_has_not_changed(tmp_path: Path, precision: str) -> None:
+    """Should this fail, files of another form are being written: they need another version, and a fixture."""
+    assert VERSION == 1
+    path = tmp_path / "old.tar"
+    path.write_bytes(read(f"{precision}.tar"))
+    atlas = Atlas(tmp_path / "data")
+    assert exported(imported(atlas, path, precision), tmp_path / "kept") == path.read_bytes()
+    atlas.close()

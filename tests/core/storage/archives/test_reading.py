@@ -1,0 +1,235 @@
+"""Files that are no exports, are not whole any more, or were made to do harm: refused by name, nothing written."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from core.errors import ArchiveTooNew, InvalidArchive
+from core.storage.archives.reading import Archive, check
+from core.storage.archives.tape import BLOCK, header
+from tests.core.storage.archives.files import Parts, named, parts_of, sealed, taped
+
+Made = Callable[[bytes], bytes]
+PLACES = "places-000001.jsonl"
+
+
+def in_place_of(part: str, **fields: Any) -> Made:
+    """Another header for a member, of the same length or not."""
+
+    def make(content: bytes) -> bytes:
+        at = content.index(part.encode() + b"\0")
+        size = int(content[at + 124 : at + 135], 8)
+        info = tarfile.TarInfo(part)
+        info.size, info.mode = size, 0o644
+        for field, value in fields.items():
+            setattr(info, field, value)
+        block = info.tobuf(tarfile.GNU_FORMAT)
+        assert len(block) == BLOCK
+        return content[:at] + block + content[at + BLOCK :]
+
+    return make
+
+
+def before(name: str, inserted: bytes) -> Made:
+    """More members before one."""
+
+    def make(content: bytes) -> bytes:
+        at = content.index(name.encode() + b"\0")
+        return content[:at] + inserted + content[at:]
+
+    return make
+
+
+def special(name: str, kind: bytes, data: bytes = b"") -> bytes:
+    info = tarfile.TarInfo(name)
+    info.type, info.size = kind, len(data)
+    return info.tobuf(tarfile.USTAR_FORMAT) + data.ljust(-(-len(data) // BLOCK) * BLOCK, b"\0")
+
+
+def manifest_with(**values: Any) -> Made:
+    """Other values at the top of the manifest, sealed."""
+
+    def make(content: bytes) -> bytes:
+        manifest, parts = parts_of(content)
+        return named(json.dumps({**manifest, **values}).encode(), parts)
+
+    return make
+
+
+def map_with(**values: Any) -> Made:
+    def make(content: bytes) -> bytes:
+        manifest, parts = parts_of(content)
+        return sealed({**manifest, "map": {**manifest["map"], **values}}, parts)
+
+    return make
+
+
+def part_with(number: int, **values: Any) -> Made:
+    def make(content: bytes) -> bytes:
+        manifest, parts = parts_of(content)
+        manifest["parts"][number] |= values
+        return named(json.dumps(manifest).encode(), parts)
+
+    return make
+
+
+def text(manifest: bytes) -> Made:
+    return lambda content: named(manifest, parts_of(content)[1])
+
+
+def members(change: Callable[[Parts], Any]) -> Made:
+    """Other members under the same manifest."""
+
+    def make(content: bytes) -> bytes:
+        manifest, parts = parts_of(content)
+        change(parts)
+        return named((json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode(), parts)
+
+    return make
+
+
+def repacked(content: bytes) -> bytes:
+    """As a tar program of today writes it."""
+    with tarfile.open(fileobj=io.BytesIO(content)) as old:
+        out = io.BytesIO()
+        with tarfile.open(fileobj=out, mode="w", format=tarfile.PAX_FORMAT) as new:
+            for member in old:
+                member.mtime = 1.5  # which takes a pax header to say
+                new.addfile(member, old.extractfile(member))
+    return out.getvalue()
+
+
+PAX = special("PaxHeaders/x", tarfile.XHDTYPE, b"17 path=../escape\n")
+HOSTILE: dict[str, tuple[Made, str]] = {
+    "nothing": (lambda _: b"", "ends within"),
+    "a word": (lambda _: b"hello", "ends within"),
+    "no tar": (lambda _: b"x" * 4096, "does not begin as a tar"),
+    "zeros": (lambda _: bytes(8192), "does not begin as a tar"),
+    "compressed": (gzip.compress, "does not begin as a tar"),
+    "another tar": (lambda _: taped({"readme": b"hello"}), "must come first"),
+    "a manifest alone": (lambda c: c[: c.index(b"manifest.sha256\0")], "ends within"),
+    "a huge manifest": (lambda _: header("manifest.json", 1 << 32) + bytes(4096), "must come first"),
+    "an endless manifest": (lambda _: header("manifest.json", 1 << 20) + b"{" * 4096, "ends within"),
+    "repacked": (repacked, "must come first"),
+    "cut": (lambda c: c[:-1000], "is cut"),
+    "cut by a byte": (lambda c: c[:-1], "is cut"),
+    "longer": (lambda c: c + bytes(512), "bytes behind its end"),
+    "a member more": (lambda c: c[:-1024] + header("more", 3) + b"abc".ljust(512, b"\0") + c[-1024:], "more members"),
+    "a member twice": (members(lambda p: p.update({"twice": p[PLACES]})), "more members"),
+    "a member less": (lambda c: members(lambda p: p.popitem())(c), "is cut"),
+    "two exchanged": (members(lambda p: p.update({PLACES: p.pop(PLACES)})), f"in the place of {PLACES}"),
+    "traversal": (in_place_of(PLACES, name="../../etc/passwd"), "in the place of .* is '../../etc/passwd'"),
+    "absolute": (in_place_of(PLACES, name="/etc/passwd"), "in the place of .* is '/etc/passwd'"),
+    "symbolic link": (in_place_of(PLACES, type=tarfile.SYMTYPE, linkname="/etc/passwd"), "not a plain file"),
+    "hard link": (in_place_of(PLACES, type=tarfile.LNKTYPE, linkname="cameras.jsonl"), "not a plain file"),
+    "device": (in_place_of(PLACES, type=tarfile.CHRTYPE), "not a plain file"),
+    "pipe": (in_place_of(PLACES, type=tarfile.FIFOTYPE), "not a plain file"),
+    "folder": (in_place_of(PLACES, type=tarfile.DIRTYPE), "not a plain file"),
+    "sparse": (in_place_of(PLACES, type=tarfile.GNUTYPE_SPARSE), "(not a plain file|is damaged)"),
+    "another length": (in_place_of(PLACES, size=1 << 40), "is not as it must be"),
+    "another owner": (in_place_of(PLACES, uname="root", mode=0o4755), "is not as it must be"),
+    "pax header": (before(PLACES, PAX), "more members"),
+    "pax header for all": (before(PLACES, special("g", tarfile.XGLTYPE, b"12 size=9999\n")), "more members"),
+    "long name": (before(PLACES, special("././@LongLink", tarfile.GNUTYPE_LONGNAME, b"/x")), "more members"),
+    "no JSON": (text(b"{"), "is not JSON"),
+    "no UTF-8": (text(b'{"format": "\xff"}'), "is not JSON in UTF-8"),
+    "not a number": (text(b'{"format": "placerec map", "version": NaN}'), "is no number of JSON"),
+    "a name twice": (text(b'{"format": 1, "format": "placerec map"}'), "stands twice"),
+    "deep": (text(b"[" * 200_000), "nested too deeply"),
+    "another format": (manifest_with(format="tar"), "not that of a map"),
+    "version as text": (manifest_with(version="1"), "names no version"),
+    "version yes": (manifest_with(version=True), "names no version"),
+    "version 0": (manifest_with(version=0), "names no version"),
+    "a field more": (manifest_with(owner="me"), "owner"),
+    "other places": (manifest_with(places=8), "another number of places"),
+    "places as text": (manifest_with(places="9"), "places"),
+    "no parts": (manifest_with(parts=[]), "not those of a map"),
+    "a path as part": (part_with(2, name="../places-000001.jsonl"), "not those of a map"),
+    "a part twice": (part_with(3, name=PLACES), "not those of a map"),
+    "a bomb": (part_with(2, bytes=1 << 32), "is cut"),
+    "a larger bomb": (part_with(2, bytes=1 << 50), "less than"),
+    "negative": (part_with(2, bytes=-1), "greater than"),
+    "rows that differ": (part_with(2, rows=8), "differ in the number"),
+    "no digest": (part_with(2, sha256="0"), "sha256"),
+    "another digest": (part_with(2, sha256="0" * 64), "does not match its SHA-256"),
+    "id as path": (map_with(id="../lab"), "cannot name a map"),
+    "id reserved": (map_with(id="import"), "cannot name a map"),
+    "encoder with lines": (map_with(encoder="a\nb"), "encoder"),
+    "endless descriptors": (map_with(dimension=1 << 60), "dimension"),
+    "dimension as text": (map_with(dimension="16"), "dimension"),
+    "no such precision": (map_with(precision="double"), "precision"),
+    "a later revision": (map_with(revision=1 << 70), "revision"),
+    "no date": (map_with(created_at="yesterday"), "created_at"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_files_are_refused(content: bytes, tmp_path: Path, case: str) -> None:
+    make, complaint = HOSTILE[case]
+    path = tmp_path / "sent.tar"
+    path.write_bytes(make(content))
+    with pytest.raises(InvalidArchive, match=complaint), Archive(path) as archive:
+        check(archive)
+
+
+def test_a_later_version_is_told_from_damage(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(manifest_with(version=2, novel={"field": 1})(content))
+    with pytest.raises(ArchiveTooNew, match="format 2, this one knows 1"), Archive(path):
+        pass
+
+
+def test_what_people_make_by_hand_is_good_if_it_is_right(content: bytes, tmp_path: Path) -> None:
+    """The cases above are refused for what is wrong with them, not for how they were made."""
+    path = tmp_path / "sent.tar"
+    for made in (content, sealed(*parts_of(content)), manifest_with()(content), members(lambda _: None)(content)):
+        path.write_bytes(made)
+        with Archive(path) as archive:
+            check(archive)
+
+
+def test_any_byte_that_is_changed_is_noticed(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    missed = []
+    with path.open("r+b", buffering=0) as file:
+        for at in range(0, len(content), 3):  # each region of the file: headers, zeros, every part, the end
+            file.seek(at)
+            file.write(bytes([content[at] ^ (1 << at % 8)]))
+            try:
+                with Archive(path) as archive:
+                    check(archive)
+                missed.append(at)
+            except InvalidArchive:
+                pass
+            file.seek(at)
+            file.write(content[at : at + 1])
+    assert missed == []
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_what_is_cut_moved_or_overwritten_is_noticed(content: bytes, tmp_path: Path, data: st.DataObject) -> None:
+    start = data.draw(st.integers(0, len(content)))
+    stop = data.draw(st.integers(start, min(len(content), start + 2000)))
+    between = data.draw(st.binary(max_size=600) | st.just(content[:600]))
+    made = content[:start] + between + content[stop:]
+    path = tmp_path / "sent.tar"
+    path.write_bytes(made)
+    try:
+        with Archive(path) as archive:
+            check(archive)
+    except InvalidArchive:
+        assert made != content
+    else:
+        assert made == content
