@@ -32,7 +32,8 @@ MAX_CHUNKS = 16_384
 
 # A marker of a JPEG file. FF00 is a data byte FF, FFFF is padding, D0 to D7 only restart the decoder.
 _MARKER = re.compile(rb"\xff([\x02-\xcf\xd8-\xfe])")
-_SOI, _EOI, _SOS, _APP1, _JPEG_LS = 0xD8, 0xD9, 0xDA, 0xE1, 0xF7
+_SOI, _EOI, _SOS, _DRI, _APP1, _JPEG_LS = 0xD8, 0xD9, 0xDA, 0xDD, 0xE1, 0xF7
+_RESTART, _RESTARTS = re.compile(rb"\xff([\xd0-\xd7])"), bytes(range(0xD0, 0xD8))
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOFn; DHT, JPG and DAC lie between them
 _DECODABLE_FRAMES = frozenset({0xC0, 0xC1, 0xC2, 0xC9, 0xCA})  # baseline, extended, progressive, both codings
 
@@ -67,6 +68,24 @@ class Header:
     format: Format
     width: int
     height: int
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a walk through a whole file found.
+
+    exif: the EXIF block (a TIFF file of its own), or None.
+    coded: of a JPEG file, ``data[start:end]`` of each stretch of coded data, one to a scan.
+    restarts: whether restart markers divide them.
+    plain: one scan of one or three colours, such as cameras write.
+    needed: of a PNG file, where chunks stand that a decoder needs; empty if it needs all of them.
+    """
+
+    exif: bytes | None
+    coded: tuple[tuple[int, int], ...] = ()
+    restarts: bool = False
+    plain: bool = True
+    needed: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,21 +133,30 @@ def read_header(data: bytes) -> Header:
     return header
 
 
-def check_structure(data: bytes, header: Header) -> bytes | None:
-    """Walk through the whole file; return the EXIF block (a TIFF file of its own), or None without one.
+def read_structure(data: bytes, header: Header) -> Structure:
+    """Walk through the whole file.
 
     Raises:
-        TruncatedImage: the file ends before the image does. Bytes after its end are tolerated.
+        TruncatedImage: the file ends before the image does, or a stretch of it is missing. Bytes after its end are
+            tolerated.
         NotAnImage: the parts of the file are damaged, or more than any real file has.
         UnsupportedFormat: an animation.
     """
     match header.format:
         case "jpeg":
-            exif = _check_jpeg(data)
+            return _check_jpeg(data)
         case "png":
-            exif = _check_png(data)
+            return _check_png(data)
         case "webp":
-            exif = _check_webp(data)
+            return Structure(_bare(_check_webp(data)))
+
+
+def check_structure(data: bytes, header: Header) -> bytes | None:
+    """The EXIF block of a whole file, or None without one; errors as for :func:`read_structure`."""
+    return read_structure(data, header).exif
+
+
+def _bare(exif: bytes | None) -> bytes | None:
     return exif.removeprefix(EXIF_PREFIX) if exif is not None else None
 
 
@@ -196,18 +224,34 @@ def _read_jpeg_header(data: bytes) -> Header:
     raise NotAnImage("The JPEG file is damaged: it has no frame header.")
 
 
-def _check_jpeg(data: bytes) -> bytes | None:
-    exif, scans = None, 0
+def _check_jpeg(data: bytes) -> Structure:
+    exif, restarts, colours, opened = None, False, 0, -1
+    coded: list[tuple[int, int]] = []
     for segment in _walk_jpeg(data):
+        if opened >= 0:
+            coded.append((opened, segment.start - (2 if segment.marker == _EOI else 4)))
+            opened = -1
         if segment.marker == _SOS:
-            scans += 1
-            if scans > MAX_JPEG_SCANS:
+            if len(coded) >= MAX_JPEG_SCANS:
                 raise NotAnImage(f"The JPEG file has more than {MAX_JPEG_SCANS} scans.")
+            opened = segment.end
+        elif segment.marker == _DRI:
+            restarts = restarts or any(data[segment.start : segment.end])
+        elif segment.marker in _FRAMES and segment.end - segment.start >= 6:
+            colours = data[segment.start + 5]
         elif segment.marker == _APP1 and exif is None and data.startswith(EXIF_PREFIX, segment.start, segment.end):
             exif = data[segment.start : segment.end]
-    if not scans:
+    if not coded:
         raise NotAnImage("The JPEG file is damaged: it has no image data.")
-    return exif
+    if restarts and not all(_restarts_in_order(data[start:end]) for start, end in coded):
+        raise TruncatedImage("The JPEG file is cut: a stretch of its data is missing.")
+    return Structure(_bare(exif), tuple(coded), restarts, len(coded) == 1 and colours in (1, 3))
+
+
+def _restarts_in_order(coded: bytes) -> bool:
+    """Whether the restart markers of a scan count from 0 to 7 and again: one that is lost leaves a gap."""
+    found = b"".join(_RESTART.findall(coded))
+    return found == (_RESTARTS * (len(found) // len(_RESTARTS) + 1))[: len(found)]
 
 
 # PNG (W3C, section 5)
@@ -247,8 +291,9 @@ def _walk_png(data: bytes) -> Iterator[_Chunk]:
     raise NotAnImage(f"The PNG file has more than {MAX_CHUNKS} chunks.")
 
 
-def _check_png(data: bytes) -> bytes | None:
-    exif, headers, filled = None, 0, False
+def _check_png(data: bytes) -> Structure:
+    exif, headers, filled, all_needed = None, 0, False, True
+    needed: list[tuple[int, int]] = [(0, len(PNG_SIGNATURE))]
     for chunk in _walk_png(data):
         headers += chunk.kind == b"IHDR"
         filled = filled or (chunk.kind == b"IDAT" and chunk.end > chunk.start)
@@ -258,9 +303,13 @@ def _check_png(data: bytes) -> bytes | None:
             raise UnsupportedFormat("The PNG file is an animation; send one frame.")
         if chunk.kind == b"eXIf" and exif is None:
             exif = data[chunk.start : chunk.end]
+        if chunk.kind[:1].islower() and chunk.kind != b"tRNS":  # texts, profiles: they unpack to much, and say things
+            all_needed = False
+        else:
+            needed.append((chunk.start - 8, chunk.end + 4))
     if not filled:
         raise NotAnImage("The PNG file is damaged: it has no image data.")
-    return exif
+    return Structure(_bare(exif), needed=() if all_needed else tuple(needed))
 
 
 # WebP (RFC 9649, section 2)

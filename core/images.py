@@ -8,7 +8,7 @@ import cv2
 import cv2.utils.logging
 import numpy as np
 
-from core.containers import Header, check_structure, read_header
+from core.containers import Header, read_header, read_structure
 from core.errors import (
     EmptyImage,
     ImageTooLarge,
@@ -16,9 +16,11 @@ from core.errors import (
     InvalidImage,
     NotAnImage,
     TooManyPixels,
+    TruncatedImage,
 )
 from core.exif import read_orientation
 from core.preprocessing import Pixels
+from core.wholeness import may_be_filled, same, with_other_endings
 
 __all__ = ["Header", "Limits", "Pixels", "decode", "encode_png", "encode_thumbnail", "read_header"]
 
@@ -51,9 +53,10 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
         ImageTooLarge: more than ``limits.max_bytes``.
         TooManyPixels: the header announces more than ``limits.max_pixels``; nothing was decoded.
         ImageTooSmall: a side is under ``limits.min_side``.
-        TruncatedImage: the bytes end before the image does.
+        TruncatedImage: the bytes end before the image does, or do not hold all of it.
         UnsupportedFormat: an image, but not one of the three formats, or an animation.
         NotAnImage: anything else, or damaged.
+        MemoryError: there is no room for the pixels.
     """
     if not data:
         raise EmptyImage("The image has no bytes.")
@@ -65,16 +68,29 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
         raise TooManyPixels(f"The image has {size}; the limit is {limits.max_pixels}.")
     if min(header.width, header.height) < limits.min_side:
         raise ImageTooSmall(f"The image has {size}; a side needs at least {limits.min_side}.")
-    orientation = read_orientation(check_structure(data, header))
+    structure = read_structure(data, header)
+    if structure.needed:
+        data = b"".join(data[start:end] for start, end in structure.needed)
+    pixels = _pixels(data)
+    if pixels is None:
+        raise NotAnImage(f"The {header.format} data is damaged: it cannot be decoded.")
+    if pixels.shape != (header.height, header.width, 3) or pixels.dtype != np.uint8:
+        raise NotAnImage(f"The {header.format} header announces {size}, its data holds another picture.")
+    filled = header.format == "jpeg" and may_be_filled(structure, pixels)
+    if filled and not same(_pixels(with_other_endings(data, structure)), pixels):
+        raise TruncatedImage(f"The JPEG file is cut: its data ends before the {size} of its header do.")
+    return _upright(pixels, read_orientation(structure.exif))
+
+
+def _pixels(data: bytes) -> Pixels | None:
+    """What OpenCV makes of a file, None if nothing."""
     try:
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)
-    except cv2.error:
-        decoded = None
-    if decoded is None:
-        raise NotAnImage(f"The {header.format} data is damaged: it cannot be decoded.")
-    if decoded.shape != (header.height, header.width, 3) or decoded.dtype != np.uint8:
-        raise NotAnImage(f"The {header.format} header announces {size}, its data holds another picture.")
-    return _upright(np.asarray(decoded, np.uint8), orientation)
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError("the pixels find no room") from error
+        return None
+    return None if decoded is None else np.asarray(decoded)
 
 
 def _upright(pixels: Pixels, orientation: int) -> Pixels:
