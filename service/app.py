@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, nullcontext
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
@@ -13,10 +13,16 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.bodies import BodyLimit
+from service.access import Access, Gate, tell_exposure, ways_of
+from service.audit import kept_in
+from service.bodies import BodyLimit, UploadMemory
 from service.engine import Engine
+from service.gauges import gauges
+from service.keyring import Keyring
+from service.keys import KeyStore
 from service.metrics import Metrics
 from service.problems import install_problems, problem_response
+from service.rates import Rates
 from service.routes import ROUTERS
 from service.settings import Settings, read_settings
 from service.telemetry import Telemetry
@@ -31,6 +37,9 @@ that it is on disk and found by every later query, so a request without an answe
 
 `X-Request-Id` is taken or made. `X-Request-Timeout` (seconds) drops a request that would come too late. \
 An answer with `Retry-After` asks to be tried again.
+
+As soon as a key was ever created, every request needs one: `Authorization: Bearer placerec_…`. \
+Each operation says what role its key needs: `query`, `enrol` (may also query) or `admin` (may do everything).
 """
 TAGS = [
     {"name": "maps", "description": "A map is one environment, bound for life to one encoder."},
@@ -42,6 +51,7 @@ TAGS = [
     {"name": "sessions", "description": "A session is a robot's run: a belief over places, frame by frame."},
     {"name": "frames", "description": "What the encoder makes of a frame, without a map."},
     {"name": "upkeep", "description": "Making a map anew, its health, pruning, merging."},
+    {"name": "transfer", "description": "Maps as files: backup, restore, move."},
     {"name": "jobs", "description": "Long work: it goes on in the background and is told as it does."},
     {"name": "encoders", "description": "Models and vocabularies installed."},
     {"name": "service", "description": "Health, counters, version."},
@@ -74,41 +84,48 @@ class Published:
 
 async def _tell_methods(request: Request, _error: Exception) -> Response:
     """405 with all the methods that the resource has; the framework names those of one route alone."""
-    known: set[str] = set()
     path = request.scope["path"].removeprefix(request.scope["root_path"])
-    for router in ROUTERS:
-        for route in router.routes:
-            if isinstance(route, APIRoute) and route.path_regex.match(path):
-                known |= route.methods or set()
+    routes = [one for router in ROUTERS for one in router.routes if isinstance(one, APIRoute)]
+    found = [route for route in routes if route.path_regex.match(path)]
+    literal = [route for route in found if route.path == path]  # /v1/maps/import is no map
+    known = {method for route in literal or found for method in route.methods or ()}
     known |= {"HEAD"} if "GET" in known else set()
     allowed = ", ".join(sorted(known))
     detail = f"{request.scope['method'][:20]} is not possible here; what is: {allowed}."
     return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> FastAPI:
     """The service; nothing is opened or loaded before it starts.
 
     Args:
         settings: from the environment if left out.
+        as_owner: for a caller in this process, who can read the disk and needs no key; never for a server.
 
     Raises:
         SettingsError: a setting is wrong, or would expose the service without keys.
+        KeysUnreadable: it cannot be told whether there are keys.
     """
     chosen = settings if settings is not None else read_settings()
-    chosen.check_exposure()
+    store = KeyStore(chosen.data_dir)
+    chosen.check_exposure(has_keys=not as_owner and store.exists())
+    keyring = None if as_owner else Keyring(store)
     metrics = Metrics()
+    gate = Gate(keyring, Rates(chosen.rate_per_key, chosen.rate_burst), chosen.is_loopback())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        engine = await to_thread.run_sync(Engine, chosen, metrics)
-        app.state.engine = engine
-        engine.start()
-        try:
-            yield
-        finally:
-            await engine.close()
+        with kept_in(chosen.audit_file), keyring or nullcontext():
+            tell_exposure(gate, chosen)
+            engine = await to_thread.run_sync(Engine, chosen, metrics)
+            app.state.engine = engine
+            engine.start()
+            try:
+                with gauges(engine, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                    yield
+            finally:
+                await engine.close()
 
     app = FastAPI(
         title="placerec",
@@ -127,7 +144,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     app.add_exception_handler(405, _tell_methods)
     for router in ROUTERS:
         app.include_router(router)
-    app.add_middleware(BodyLimit, settings=chosen)
+    app.state.gate = gate
+    app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
+    app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
+    app.add_middleware(Access, gate=gate, ways=ways_of(app.routes), metrics=metrics)
     app.add_middleware(Telemetry, metrics=metrics)
     if chosen.root_path:
         app.add_middleware(Published, root_path=chosen.root_path)  # the outermost is added last

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import aclosing
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from core.masks import Mask
 from service.faults import ClientGone
@@ -15,6 +15,8 @@ from service.jobs import JobContext
 
 if TYPE_CHECKING:
     from service.engine import Engine
+
+Result = TypeVar("Result")
 
 POLL_SECONDS = 0.2
 """A job that is to stop gives its frames up within this time."""
@@ -37,6 +39,29 @@ def stand_back(engine: Engine, context: JobContext) -> None:
         context.pause(0.01)
 
 
+def run_behind(engine: Engine, context: JobContext, work: Callable[[Patience], Coroutine[Any, Any, Result]]) -> Result:
+    """Run a coroutine that waits for the encoder, behind the requests that wait for it; blocks the job's thread.
+
+    Args:
+        work: what to run, with the patience of the job: it ends when the job is to stop.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+
+    async def stopped() -> None:
+        while not (context.cancelled or engine.jobs.stopping):
+            await asyncio.sleep(POLL_SECONDS)
+
+    stand_back(engine, context)
+    patience = Patience(time.monotonic() + LONGEST_SECONDS, stopped)
+    try:
+        return asyncio.run_coroutine_threadsafe(work(patience), engine.loop).result()
+    except ClientGone:
+        context.check_cancelled()
+        raise
+
+
 def encode_behind(
     engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
 ) -> list[Encoded | Exception]:
@@ -47,25 +72,13 @@ def encode_behind(
     Raises:
         JobCancelled, JobInterrupted.
     """
-    stand_back(engine, context)
-    try:
-        return asyncio.run_coroutine_threadsafe(_encode(engine, context, identity, frames, masks), engine.loop).result()
-    except ClientGone:
-        context.check_cancelled()
-        raise
 
+    async def encode(patience: Patience) -> list[Encoded | Exception]:
+        made: dict[int, Encoded | Exception] = {}
+        async with aclosing(engine.inference.encode_many(identity, frames, patience, masks)) as outcomes:
+            async for some in outcomes:
+                for index, outcome in some:
+                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
+        return [made[index] for index in range(len(frames))]
 
-async def _encode(
-    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
-) -> list[Encoded | Exception]:
-    async def stopped() -> None:
-        while not (context.cancelled or engine.jobs.stopping):
-            await asyncio.sleep(POLL_SECONDS)
-
-    patience = Patience(time.monotonic() + LONGEST_SECONDS, stopped)
-    made: dict[int, Encoded | Exception] = {}
-    async with aclosing(engine.inference.encode_many(identity, frames, patience, masks)) as outcomes:
-        async for some in outcomes:
-            for index, outcome in some:
-                made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
-    return [made[index] for index in range(len(frames))]
+    return run_behind(engine, context, encode)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import time
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -45,12 +46,24 @@ class UploadMemory:
 class Intake:
     """The receiving side of one request; stands in for its ``receive``.
 
-    ``limit`` and ``deadline`` (``time.monotonic``) may be changed by the resource before it reads.
+    ``limit`` and ``deadline`` (``time.monotonic``) may be changed by the resource before it reads.  ``idle`` is how
+    many seconds may go by without a byte.
     """
 
-    def __init__(self, scope: Scope, receive: Receive, limit: int, deadline: float, memory: UploadMemory) -> None:
-        self.limit, self.deadline = limit, deadline
+    def __init__(
+        self,
+        scope: Scope,
+        receive: Receive,
+        limit: int,
+        deadline: float,
+        memory: UploadMemory,
+        idle: float = math.inf,
+    ) -> None:
+        self.limit, self.deadline, self.idle = limit, deadline, idle
         self.size, self.complete = 0, False
+        self.held = 0
+        """Bytes of it that count as held in memory."""
+        self._is_held = True
         self._receive, self._memory = receive, memory
         lengths = [value for name, value in scope["headers"] if name == b"content-length"]
         self._announced = int(lengths[0]) if lengths and lengths[0].isdigit() else 0
@@ -67,20 +80,35 @@ class Intake:
         if self.complete:
             return await self._receive()
         self._check(self._announced)
-        self._memory.check(max(0, self._announced - self.size))
+        if self._is_held:
+            self._memory.check(max(0, self._announced - self.size))
+        left = self.deadline - time.monotonic()
         try:
-            async with asyncio.timeout(self.deadline - time.monotonic()):
+            async with asyncio.timeout(min(left, self.idle)):
                 message = await self._receive()
         except TimeoutError:
+            if self.idle < left:
+                raise DeadlineExceeded(f"Nothing of the body came for {self.idle:g} seconds.") from None
             raise DeadlineExceeded("The body did not arrive in time.") from None
         if message["type"] != "http.request":
             raise ClientGone("The connection was closed before the end of the body.")
         arrived = len(message.get("body", b""))
         self._check(self.size + arrived)
-        self._memory.take(arrived)
+        if self._is_held:
+            self._memory.take(arrived)
+            self.held += arrived
         self.size += arrived
         self.complete = not message.get("more_body", False)
         return message
+
+    def pass_on(self, limit: int, seconds: float) -> None:
+        """Take a longer body, which the resource writes to disk as it comes and does not hold.
+
+        Args:
+            limit: bytes.
+            seconds: from now on, within which all of it has to come; ``idle`` holds as well.
+        """
+        self.limit, self.deadline, self._is_held = limit, time.monotonic() + seconds, False
 
     async def hung_up(self) -> None:
         """Return when the caller has closed the connection; for when the body was read."""
@@ -95,9 +123,8 @@ class Intake:
 class BodyLimit:
     """ASGI layer that puts an :class:`Intake` before each request, with the limits of a JSON body."""
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self.app, self.settings = app, settings
-        self.memory = UploadMemory(settings.max_upload_memory)
+    def __init__(self, app: ASGIApp, settings: Settings, memory: UploadMemory) -> None:
+        self.app, self.settings, self.memory = app, settings, memory
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -105,13 +132,14 @@ class BodyLimit:
             return
         state = scope["state"]
         deadline = state["started"] + self.settings.request_timeout
-        intake = Intake(scope, receive, self.settings.max_json_bytes, deadline, self.memory)
+        idle = self.settings.read_timeout
+        intake = Intake(scope, receive, self.settings.max_json_bytes, deadline, self.memory, idle)
         state["intake"] = intake
         try:
             await self.app(scope, intake, send)
         finally:
             state["bytes_in"] = intake.size
-            self.memory.release(intake.size)
+            self.memory.release(intake.held)
 
 
 def intake_of(request: Request) -> Intake:

@@ -17,6 +17,7 @@ from service.engine import Engine
 from service.faults import InvalidRequest, UnsupportedMediaType
 from service.inference import Patience
 from service.parameters import Parameters
+from service.principals import Principal
 from service.uploads import media_type
 
 JSON_TYPES = ("application/json", "application/merge-patch+json")
@@ -25,6 +26,11 @@ JSON_TYPES = ("application/json", "application/merge-patch+json")
 async def _engine(request: Request) -> Engine:
     engine: Engine = request.app.state.engine
     return engine
+
+
+async def _principal(request: Request) -> Principal:
+    principal: Principal = request.state.principal
+    return principal
 
 
 async def _patience(
@@ -52,10 +58,11 @@ async def single_values(request: Request) -> None:
     Raises:
         InvalidRequest: there is one.
     """
-    names = [name for name, _ in request.query_params.multi_items()]
-    for name in set(names):
-        if names.count(name) > 1:
+    seen: set[str] = set()
+    for name, _ in request.query_params.multi_items():
+        if name in seen:
             raise InvalidRequest(f"{name[:80]} stands in the query string twice.")
+        seen.add(name)
 
 
 async def json_body(request: Request) -> None:
@@ -122,6 +129,7 @@ def rounded(milliseconds: Mapping[str, float]) -> dict[str, float]:
 
 
 EngineDep = Annotated[Engine, Depends(_engine)]
+PrincipalDep = Annotated[Principal, Depends(_principal)]
 PatienceDep = Annotated[Patience, Depends(_patience)]
 MapId = Annotated[str, Path(alias="map", description="Id of the map.", examples=["lab"]), AfterValidator(check_map_id)]
 PlaceId = Annotated[

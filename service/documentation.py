@@ -169,7 +169,9 @@ def _curl(method: str, path: str, operation: Json) -> str:
         words += ["-H 'Content-Type: image/jpeg'", "--data-binary @frame.jpg"]
     elif "application/json" in body:
         words += ["-H 'Content-Type: application/json'", "-d @body.json"]
-    elif body:
+    elif "multipart/form-data" not in body:
+        words += [f"-H 'Content-Type: {kind}' --data-binary @file" for kind in list(body)[:1]]
+    else:
         properties = body["multipart/form-data"]["schema"]["properties"]
         files = [name for name, field in properties.items() if field.get("format") == "binary"]
         words += ["-F places=@places.json"] if "places" in properties else []

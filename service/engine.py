@@ -5,11 +5,9 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-import threading
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
-from typing import ParamSpec, TypeVar
 
 from anyio import to_thread
 
@@ -19,28 +17,25 @@ from core.images import Limits
 from core.masks import Mask
 from core.storage import Atlas, Map, MapRecord
 from core.verdict import Calibration
+from service.blocking import in_thread as in_thread
+from service.exports import Exports
 from service.faults import EncoderNotInstalled, NotReady
+from service.imports import Imports
 from service.inference import Encoded, Inference, Outcomes, Patience
 from service.jobs import Jobs
 from service.metrics import MapCollector, Metrics
 from service.pictures import Pictures
+from service.possession import Possession
 from service.searches import Searches
 from service.sessions import Sessions
 from service.settings import Settings, unknown_variables
+from service.staging import Staging
 from service.upkeep import Upkeep
-
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
 
 DISK_CHECK_SECONDS = 1.0
 """A readiness probe that comes sooner is told the last result."""
 
 log = logging.getLogger("placerec.engine")
-
-
-async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-    """Run blocking work, that of maps above all, in a thread of the pool; it is not broken off."""
-    return await to_thread.run_sync(lambda: work(*args, **kwargs))
 
 
 async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
@@ -85,9 +80,13 @@ class Engine:
             self.atlas.close()
             raise
         self.searches = Searches()
+        self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.upkeep = Upkeep(self)
-        self._writing: dict[str, threading.Lock] = {}
+        self.exports, self.imports = Exports(settings), Imports(self)
+        self._possession = Possession()
         self.pictures = Pictures()
+        self.stopping = False
+        """Whether the service is about to stop, so that nobody should be sent here any more."""
         self._encoder_state = "loading"
         self._disk_state, self._disk_checked = "ok", 0.0
         self._loading: asyncio.Task[None] | None = None
@@ -101,6 +100,8 @@ class Engine:
         self._loading = asyncio.create_task(self._load_default())
         self.loop = asyncio.get_running_loop()
         self.upkeep.start()
+        self.exports.clean()
+        self.imports.clean()
         self.jobs.start()
 
     async def close(self) -> None:
@@ -108,6 +109,7 @@ class Engine:
         if self._loading is not None:
             self._loading.cancel()
         self.metrics.registry.unregister(self._map_collector)
+        await self.exports.close()
         # Jobs first: what they are at needs the encoder and the maps.
         await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
         await to_thread.run_sync(self.upkeep.close)
@@ -144,6 +146,8 @@ class Engine:
             self._disk_checked = now
             self._disk_state = await in_thread(self._check_disk)
         checks = {"encoder": self._encoder_state, "maps": "ok", "disk": self._disk_state}
+        if self.stopping:
+            checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
         if bad:
             raise NotReady(f"Not ready: {'; '.join(bad)}", checks)
@@ -175,7 +179,7 @@ class Engine:
     @contextmanager
     def writing(self, map_id: str) -> Iterator[None]:
         """Possession of a map for a write that depends on a look at it; blocks, so call it in a thread."""
-        with self._writing.setdefault(map_id, threading.Lock()):
+        with self._possession.of(map_id):
             yield
 
     # Encoders

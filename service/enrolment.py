@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import aclosing
+from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from core.errors import NoRegions, UnknownPlace
+from core.errors import NoRegions
 from core.images import encode_thumbnail
 from core.masks import Mask
 from core.places import Place, PlaceFields
-from core.storage import Change, Enrolment, Map
-from service.engine import Engine, in_thread
-from service.faults import FrameNeeded
+from core.storage import Change, Enrolment, Map, SameFrame
+from service.blocking import in_thread
+from service.faults import FrameNeeded, TooManyPlaces
 from service.inference import Encoded, Patience
+
+if TYPE_CHECKING:
+    from service.engine import Engine
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ async def enrol(
     candidates: Sequence[Candidate],
     patience: Patience,
     reject: Callable[[int, Exception], None] = _raise,
+    queued: bool = True,
 ) -> dict[int, Enrolled]:
     """Enrol frames; one that the place holds already is not encoded again.
 
@@ -68,6 +74,7 @@ async def enrol(
     Args:
         candidates: of different ids.
         reject: is told the index of a frame that cannot be encoded and why; it may raise to end all.
+        queued: it takes a place in the queue, as a request does; a job stands back instead.
 
     Returns:
         What was stored, by index; durable, and seen by every later query.
@@ -89,7 +96,7 @@ async def enrol(
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [candidates[i].mask for i in new]
-            with engine.inference.place_in_queue():
+            with engine.inference.place_in_queue(len(sent)) if queued else nullcontext():
                 async with aclosing(engine.encode_many_for(map_, bodies, patience, masks)) as outcomes:
                     async for some in outcomes:
                         frames = {new[index]: outcome for index, outcome in some}
@@ -100,8 +107,6 @@ async def enrol(
                                 reject(i, made)
                             else:
                                 enrolments[i], times[i] = made
-        # In the order in which they were given: it is the order of the places in their sequence.
-        enrolments = dict(sorted(enrolments.items()))
         done = await in_thread(
             _commit, engine, map_, enrolments, {i: (candidates[i], digests[i]) for i in sorted(known)}
         )
@@ -154,16 +159,31 @@ def _commit(
     enrolments: Mapping[int, Enrolment],
     known: Mapping[int, tuple[Candidate, bytes]],
 ) -> dict[int, tuple[Place, Change]]:
-    """Store new pictures in one commit, and new fields of pictures that are still the ones known."""
-    done: dict[int, tuple[Place, Change]] = {}
-    # No other picture may take the place between the look at its digest and the writing of its fields.
+    """Store new pictures, and new fields of pictures that are still the ones known, in one commit.
+
+    In the order in which they were given: it is the order of the places in their sequence.
+    """
+    items: dict[int, Enrolment | SameFrame] = dict(enrolments)
+    items |= {i: SameFrame(candidate.id, candidate.fields, digest) for i, (candidate, digest) in known.items()}
+    items = dict(sorted(items.items()))
+    began = time.perf_counter()
     with engine.writing(map_.record.id):
         if enrolments:
-            done.update(zip(enrolments, map_.enrol(list(enrolments.values())), strict=True))
-        for i, (candidate, digest) in known.items():
-            try:
-                if map_.digest(candidate.id) == digest:
-                    done[i] = map_.set_fields(candidate.id, candidate.fields)
-            except UnknownPlace:
-                continue
+            check_places(engine, map_, [enrolment.id for enrolment in enrolments.values()])
+        found = zip(items, map_.transfer.enrol(list(items.values())), strict=True)
+        done = {i: stored for i, stored in found if stored is not None}
+    engine.metrics.commits.observe(time.perf_counter() - began)
     return done
+
+
+def check_places(engine: Engine, map_: Map, ids: Sequence[str]) -> None:
+    """See that a map has room for places of these ids, those that it has included; call it in possession of the map.
+
+    Raises:
+        TooManyPlaces: it has not.
+    """
+    most, there = engine.settings.max_places, map_.count_places()
+    if there + len(ids) <= most:  # nearly always
+        return
+    if there + sum(row is None for row in map_.rows_of(ids)) > most:
+        raise TooManyPlaces(f"The map {map_.record.id} has {there} places of at most {most}.")

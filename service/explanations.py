@@ -18,7 +18,7 @@ from core.storage import Map
 from core.vlad import assign
 from service.engine import Engine, camera_mask, in_thread
 from service.inference import Encoded, Patience
-from service.pictures import Line, Outline, side_by_side
+from service.pictures import Line, Outline, scaled, side_by_side
 from service.regions import boxes, layer_grids
 from service.schemas.explanations import (
     CellPair,
@@ -28,12 +28,18 @@ from service.schemas.explanations import (
     RegionPair,
     RelativeBox,
 )
+from service.upkeep import key_of
 
 LISTED = 30
 """Regions of a frame that are told of."""
 
 DRAWN = 60
 """Lines of a picture at most."""
+
+
+def as_drawn(encoded: Encoded) -> Encoded:
+    """The same with pixels only as many as are drawn: a frame that waits for another may have forty million."""
+    return replace(encoded, pixels=scaled(encoded.pixels))
 
 
 async def explained_match(
@@ -61,7 +67,7 @@ async def explained_match(
     path = None
     if again is not None:
         drawn = await in_thread(drawing, told, query.pixels, again.pixels)
-        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(map_.record.id, drawn)}"
+        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(key_of(map_), drawn)}"
     return MatchExplanation(**told.__dict__, place=place_id, match_picture=place.picture, picture=path)
 
 

@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import ClassVar
+
 
 class Fault(Exception):
     """Base of all classes below; the text is one plain sentence for the caller."""
@@ -91,6 +94,10 @@ class JobQueueFull(Fault):
     """So many jobs wait that one more is not taken."""
 
 
+class StagingFull(Fault):
+    """What waits on disk to be worked through takes so much room that this has to wait."""
+
+
 class JobLost(Fault):
     """The service ended before the job did, and a job of this kind cannot be taken up again."""
 
@@ -129,3 +136,103 @@ class FrameOutOfOrder(Fault):
 
 class StreamTaken(Fault):
     """Another connection streams into the session."""
+
+
+class KeyNeeded(Fault):
+    """The request carries no key, or none that can be read, and keys are demanded."""
+
+    headers: ClassVar = {"WWW-Authenticate": 'Bearer realm="placerec"'}
+
+
+class KeyRefused(Fault):
+    """The key is unknown, expired or revoked."""
+
+    headers: ClassVar = {"WWW-Authenticate": 'Bearer realm="placerec", error="invalid_token"'}
+
+
+class RoleTooLow(Fault):
+    """The key's role does not allow the operation."""
+
+
+class MapForbidden(Fault):
+    """The key is limited to other maps."""
+
+
+class ForeignPage(Fault):
+    """Without keys: the request comes from a page of another site, or was addressed to another host's name."""
+
+
+class KeysUnreadable(Fault):
+    """The file of the keys is damaged, gone or cannot be read, so nobody can be let in."""
+
+
+class RateExceeded(Fault):
+    """The caller sends more requests a second than it may.
+
+    Args:
+        seconds: after which the next one would be taken.
+    """
+
+    def __init__(self, detail: str, seconds: float) -> None:
+        super().__init__(detail)
+        self.headers = {"Retry-After": str(max(1, math.ceil(seconds)))}
+
+
+class MalformedHead(Fault):
+    """The head of the request is not HTTP."""
+
+
+class HeadTooSlow(Fault):
+    """The head of the request did not come in time."""
+
+
+class HeadTooLarge(Fault):
+    """The request has too many headers, or too many bytes of them."""
+
+
+class UrlTooLong(Fault):
+    """Path and query string are longer than is read."""
+
+
+class TooManyConnections(Fault):
+    """So many connections are open, of all callers or of this one's address, that one more is not served."""
+
+
+class TooManyMaps(Fault):
+    """There are as many maps as there may be."""
+
+
+class TooManyPlaces(Fault):
+    """The map holds as many places as it may."""
+
+
+class TooManyExports(Fault):
+    """As many maps are being downloaded as moments of maps may be kept."""
+
+
+class TooManyImports(Fault):
+    """As many maps are being brought, or wait for a job, as may be."""
+
+
+class ExportGone(Fault):
+    """The moment of the map of which the caller has a part is not kept any more."""
+
+
+class DigestMismatch(Fault):
+    """The body is not the one of which the caller gives the digest."""
+
+
+class RangeNotSatisfiable(Fault):
+    """The range begins behind the end.
+
+    Args:
+        size: bytes that there are.
+    """
+
+    def __init__(self, detail: str, size: int) -> None:
+        super().__init__(detail)
+        self.headers = {"Content-Range": f"bytes */{size}"}
+
+
+class Stopping(Fault):
+    """The service was stopped before the request was done, and could not wait any longer."""

@@ -59,7 +59,7 @@ class Inference:
         self, catalogue: EncoderCatalogue, limits: Limits, queue_length: int, threads: int, metrics: Metrics
     ) -> None:
         self._catalogue, self._metrics = catalogue, metrics
-        self._queue_length, self._waiting = queue_length, 0
+        self._queue_length, self._waiting, self._bulk = queue_length, 0, 0
         self._loaded: dict[str, Encoder] = {}
         share_cores(threads or torch.get_num_threads())
         self._batches = MicroBatches(self._load, limits, metrics.encoded_together.observe)
@@ -79,19 +79,26 @@ class Inference:
         return self._waiting
 
     @contextmanager
-    def place_in_queue(self) -> Iterator[None]:
+    def place_in_queue(self, frames: int = 1) -> Iterator[None]:
         """A place in the queue for one request, whose frames are encoded within.
+
+        Args:
+            frames: of the request. Those of many frames, which keep their places for long, may have half of the queue,
+                so that there is always room for those of one.
 
         Raises:
             QueueFull: none is free.
         """
         self.check_room()
-        self._waiting += 1
+        bulk = int(frames > 1)
+        if bulk and self._bulk >= max(1, self._queue_length // 2):
+            raise QueueFull("Too many requests of many frames wait for the encoder; send this one again in a moment.")
+        self._waiting, self._bulk = self._waiting + 1, self._bulk + bulk
         self._metrics.queue.set(self._waiting)
         try:
             yield
         finally:
-            self._waiting -= 1
+            self._waiting, self._bulk = self._waiting - 1, self._bulk - bulk
             self._metrics.queue.set(self._waiting)
 
     async def load(self, identity: str) -> Encoder:

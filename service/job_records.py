@@ -8,7 +8,7 @@ import sqlite3
 import threading
 from collections.abc import Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -17,10 +17,12 @@ from core.errors import DataDirectoryTooNew
 from core.storage.disk import Damage, refusals
 
 FILE = "jobs.sqlite"
-VERSION = 1
+VERSION = 3
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
+
+DAMAGED = "its record was damaged"
 
 log = logging.getLogger("placerec.jobs")
 
@@ -43,8 +45,16 @@ _TABLE = """CREATE TABLE jobs (
     problem TEXT,
     created_at TEXT NOT NULL,
     started_at TEXT,
-    ended_at TEXT
+    ended_at TEXT,
+    maps TEXT NOT NULL DEFAULT '{}',
+    asker TEXT NOT NULL DEFAULT '{}'
 ) STRICT"""
+
+_MIGRATIONS = {
+    1: "ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'",
+    2: "ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'",
+}
+"""From a version to the next one."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +71,9 @@ class Job:
     notes: what it wrote down for its next attempt.
     result: what it found, once it has succeeded.
     problem: why it failed, as a problem object.
+    maps: the maps that it was asked for, by id, and when each was created: one of the same id that was created at
+        another time is another map.
+    asker: who asked for it, as ``service.principals.Asker`` has it; for the audit trail.
     """
 
     number: int
@@ -82,6 +95,8 @@ class Job:
     problem: Mapping[str, Any] | None = None
     started_at: datetime | None = None
     ended_at: datetime | None = None
+    maps: Mapping[str, str] = field(default_factory=dict)
+    asker: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def ended(self) -> bool:
@@ -103,13 +118,16 @@ class JobRecords:
     def __init__(self, directory: Path) -> None:
         """Open the file of a data directory that this process holds.
 
-        One that is damaged is put aside: jobs are work to be done again, not what the maps hold.
+        One that is damaged is put aside: jobs are work to be done again, not what the maps hold.  What can still be
+        read of it is kept, as jobs that cannot go on.
 
         Raises:
             DataDirectoryTooNew: a later version of placerec wrote it.
             StorageFull, StorageFailure.
         """
         self._lock = threading.Lock()
+        self.put_aside: str | None = None
+        """Under which name the file was put aside because it was damaged, if it was."""
         path = directory / FILE
         with refusals(f"open {path}"):
             try:
@@ -117,11 +135,15 @@ class JobRecords:
             except Damage as damage:
                 aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
                 log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, damage)
+                salvaged = _salvaged(path)
                 path.rename(aside)
                 for suffix in ("-wal", "-shm"):
                     with suppress(FileNotFoundError):
                         path.with_name(FILE + suffix).unlink()
-                self._connection = _open(path)
+                self._connection, self.put_aside = _open(path), aside.name
+                for job in salvaged:
+                    with suppress(sqlite3.IntegrityError, sqlite3.ProgrammingError, ValueError, TypeError):
+                        self.put(job)  # unless nothing that a job can be is left of it
 
     def close(self) -> None:
         """Nothing can be written from here on."""
@@ -133,7 +155,7 @@ class JobRecords:
         with self._lock, refusals("read the jobs"), closing(self._connection.cursor()) as cursor:
             cursor.execute("SELECT * FROM jobs ORDER BY number")
             names = [column[0] for column in cursor.description]
-            return [_job(dict(zip(names, values, strict=True))) for values in cursor.fetchall()]
+            return [_readable(dict(zip(names, values, strict=True))) for values in cursor.fetchall()]
 
     def put(self, job: Job) -> None:
         """Write a job, new or changed."""
@@ -184,15 +206,26 @@ def _open(path: Path) -> sqlite3.Connection:
             connection.execute(_TABLE)
             connection.execute(f"PRAGMA user_version = {VERSION}")
             connection.execute("COMMIT")
+        for old in range(version or VERSION, VERSION):
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute(_MIGRATIONS[old])
+            connection.execute(f"PRAGMA user_version = {old + 1}")
+            connection.execute("COMMIT")
         for (line,) in connection.execute("PRAGMA quick_check").fetchall():
             if line != "ok":
                 raise Damage(line)
-        connection.execute(f"SELECT {', '.join(_NAMES)} FROM jobs LIMIT 0")
+        connection.execute(f"SELECT {', '.join(_NAMES)} FROM jobs").fetchall()  # can all of it be read?
+        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
+        connection.execute("UPDATE jobs SET id = id WHERE false")
     except sqlite3.DatabaseError as error:
         connection.close()
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
+        told = str(error)
+        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
             raise  # the disk refuses
         raise Damage(str(error)) from error
+    except UnicodeDecodeError as error:
+        connection.close()
+        raise Damage("its text is damaged") from error
     except BaseException:
         connection.close()
         raise
@@ -220,6 +253,8 @@ def _columns(job: Job) -> dict[str, Any]:
         "created_at": _text(job.created_at),
         "started_at": _text(job.started_at),
         "ended_at": _text(job.ended_at),
+        "maps": json.dumps(dict(job.maps)),
+        "asker": json.dumps(dict(job.asker)),
     }
 
 
@@ -229,7 +264,7 @@ def _text(moment: datetime | None) -> str | None:
 
 def _job(columns: dict[str, Any]) -> Job:
     columns["map_id"] = columns.pop("map")
-    for name in ("arguments", "notes", "result", "problem"):
+    for name in ("arguments", "notes", "result", "problem", "maps", "asker"):
         columns[name] = None if columns[name] is None else json.loads(columns[name])
     for name in ("created_at", "started_at", "ended_at"):
         columns[name] = None if columns[name] is None else datetime.fromisoformat(columns[name])
@@ -238,4 +273,34 @@ def _job(columns: dict[str, Any]) -> Job:
     return Job(**columns)
 
 
+def _readable(columns: dict[str, Any]) -> Job:
+    """A job; of one whose record makes no sense, what can be told of it: it cannot go on."""
+    try:
+        return _job(dict(columns))
+    except (ValueError, TypeError, KeyError) as error:
+        log.error("the record of the job %s cannot be read: %s", columns["id"], error)
+        known = {name: columns[name] for name in ("number", "id", "kind")}
+        state: JobState = columns["state"] if columns["state"] in ENDED else "running"
+        job = Job(**known, map_id=columns["map"], arguments={}, resumable=False, created_at=_EPOCH, state=state)
+        return replace(job, message=DAMAGED)
+
+
+def _salvaged(path: Path) -> list[Job]:
+    """The jobs of a damaged file, as far as it can be read; none of them can go on."""
+    found: dict[int, Job] = {}
+    with (
+        suppress(sqlite3.Error, UnicodeDecodeError, TypeError),
+        closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection,
+    ):
+        rows = connection.execute("SELECT * FROM jobs")
+        names = [column[0] for column in rows.description]
+        for values in rows:
+            columns = dict(zip(names, values, strict=True))
+            with suppress(KeyError, TypeError, ValueError):
+                job = _readable({"maps": "{}", "asker": "{}"} | columns)
+                found[int(job.number)] = replace(job, resumable=False, message=DAMAGED)
+    return [found[number] for number in sorted(found)]
+
+
+_EPOCH = datetime.fromtimestamp(0, UTC)
 _NAMES = tuple(_columns(Job(0, "", "", None, {}, False, datetime.min)))

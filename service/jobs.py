@@ -8,12 +8,13 @@ when it is asked to lies with it: it calls :meth:`JobContext.check_cancelled` wh
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
 import secrets
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -21,15 +22,19 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import PlacerecError
+from service.audit import note_job, now_asking
 from service.faults import JobEnded, JobLost, JobQueueFull, TooManyWatchers, UnknownJob
-from service.job_context import NOTICE_SECONDS, JobCancelled, JobContext, JobInterrupted, Work
-from service.job_records import Job, JobRecords
+from service.job_context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
+from service.job_records import DAMAGED, Job, JobRecords
 from service.problems import problem_of
 
 __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jobs", "Work"]
 
 MOST_RESULT_BYTES = 4 << 20
 """Of a result as JSON."""
+
+Discard = Callable[[Job], None]
+"""Clears away what a job had for itself, once it has ended in whatever way."""
 
 log = logging.getLogger("placerec.jobs")
 
@@ -62,6 +67,9 @@ class Jobs:
         self._changed = threading.Condition()  # held by whoever changes a job
         self._records = JobRecords(directory)
         self._kinds: dict[str, Work] = {}
+        self._discards: dict[str, Discard] = {}
+        self._numbers = itertools.count()
+        self._gaveway: dict[str, tuple[int, int]] = {}  # behind whom a job waits that has given way
         self._works: dict[str, Work] = {}
         self._jobs = {job.id: job for job in self._records.read()}
         self._last_number = self._records.last_number()
@@ -70,10 +78,12 @@ class Jobs:
 
     # Kinds, start and end
 
-    def register(self, kind: str, work: Work) -> None:
+    def register(self, kind: str, work: Work, discard: Discard | None = None) -> None:
         """Name a kind of job that can be begun anew: ``work`` does what ``context.arguments`` say, from any state
-        that an earlier attempt left."""
+        that an earlier attempt left; ``discard`` clears away what the job had for itself."""
         self._kinds[kind] = work
+        if discard is not None:
+            self._discards[kind] = discard
 
     def start(self) -> None:
         """Take up what an earlier process left, and work; call it when all kinds are registered."""
@@ -84,8 +94,13 @@ class Jobs:
                     self._change(job.id, state="queued", message="waits to go on after a restart of the service")
                 continue
             was = "ran" if job.state == "running" else "waited"
-            why = f"The service ended while the job {was}, and this kind of job cannot be taken up again."
-            self._end(job.id, "failed", problem=_problem(JobLost(why)))
+            why = "this kind of job cannot be taken up again"
+            if job.message == DAMAGED:
+                why = DAMAGED
+            elif job.resumable:
+                why = f"this version of placerec knows no jobs of the kind {job.kind}"
+            self._end(job.id, "failed", problem=_problem(JobLost(f"The service ended while the job {was}, and {why}.")))
+            self._discard(job)
         for number in range(self._workers):
             thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
             thread.start()
@@ -111,13 +126,20 @@ class Jobs:
     # For those who ask
 
     def submit(
-        self, kind: str, map_id: str | None, work: Work | None = None, arguments: Mapping[str, Any] | None = None
+        self,
+        kind: str,
+        map_id: str | None,
+        work: Work | None = None,
+        arguments: Mapping[str, Any] | None = None,
+        maps: Mapping[str, str] | None = None,
     ) -> Job:
         """Let a job wait for its turn; it is on disk when this returns.
 
         Args:
             work: what it does; without it the kind is a registered one, which survives a restart.
             arguments: for the work, as JSON.
+            maps: those that it is asked for, by id, and when each was created (``job_context.born``): the job fails
+                rather than to work on a later one of the same id.
 
         Raises:
             JobQueueFull: too many wait.
@@ -126,8 +148,7 @@ class Jobs:
         resumable = work is None
         chosen = self._kinds[kind] if work is None else work
         with self._changed:
-            if sum(job.state == "queued" for job in self._jobs.values()) >= self._longest_queue:
-                raise JobQueueFull(f"{self._longest_queue} jobs wait already; send this one again later.")
+            self.check_room()
             job = Job(
                 number=self._last_number + 1,
                 id=secrets.token_hex(8),
@@ -136,6 +157,8 @@ class Jobs:
                 arguments=dict(arguments or {}),
                 resumable=resumable,
                 created_at=datetime.now(UTC),
+                maps=dict(maps or {}),
+                asker=now_asking(),
             )
             self._records.put(job)
             self._last_number = job.number
@@ -143,6 +166,16 @@ class Jobs:
             self._changed.notify_all()
         log.info("job queued", extra={"job": job.id, "kind": kind, "map": map_id})
         return job
+
+    def check_room(self) -> None:
+        """Raise JobQueueFull if no further job may wait; for before a long body is read."""
+        if sum(job.state == "queued" for job in self._jobs.copy().values()) >= self._longest_queue:
+            raise JobQueueFull(f"{self._longest_queue} jobs wait already; send this one again later.")
+
+    @property
+    def watchers(self) -> int:
+        """Clients that follow jobs now."""
+        return len(self._watchers)
 
     def get(self, job_id: str) -> Job:
         """A job as it is now.
@@ -152,7 +185,9 @@ class Jobs:
         """
         found = self._jobs.get(job_id)
         if found is None:
-            raise UnknownJob(f"There is no job {job_id[:80]!r}.")
+            aside = self._records.put_aside
+            more = "" if aside is None else f" The records of earlier jobs were damaged; they are put aside as {aside}."
+            raise UnknownJob(f"There is no job {job_id[:80]!r}.{more}")
         return found
 
     def all(self) -> list[Job]:
@@ -171,12 +206,15 @@ class Jobs:
             job = self.get(job_id)
             if job.state in ("succeeded", "failed"):
                 raise JobEnded(f"The job {job_id} has {job.state} already.")
-            if job.state == "queued" and not job.attempt:
-                return self._end(job_id, "cancelled")
-            if job.state != "cancelled" and not job.cancelling:
+            if ended := job.state == "queued" and not job.attempt:
+                job = self._end(job_id, "cancelled")
+            elif job.state != "cancelled" and not job.cancelling:
                 changed = replace(job, cancelling=True, change=job.change + 1)
                 self._records.update(changed)
                 self._jobs[job_id] = changed
+        if ended:
+            self._discard(job)
+            return job
         self._notify(job_id)
         return self.get(job_id)
 
@@ -200,44 +238,83 @@ class Jobs:
 
     def _work(self) -> None:
         while (job := self._take()) is not None:
-            began = time.perf_counter()
-            context = JobContext(self, job)
+            note_job(job, "running")
             try:
-                result = dict(self._works[job.id](context))
-                if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:
-                    raise ValueError("the result is too long to be kept")
-            except JobCancelled:
-                ended = self._end(job.id, "cancelled")
-            except JobInterrupted:
-                ended = self._put_off(job)
-            except Exception as error:
-                problem = _problem(error)
-                if problem["status"] == 500:
-                    log.exception("job %s failed", job.id)
-                ended = self._end(job.id, "failed", problem=problem)
-            else:
-                ended = self._end(job.id, "succeeded", result=result)
-            seconds = round(time.perf_counter() - began, 2)
-            noted = {"job": job.id, "kind": job.kind, "map": job.map_id, "seconds": seconds}
-            log.info("job %s", ended.state, extra=noted)
+                self._do(job)
+            except Exception:  # a defect of ours: the job is told as failed, and the worker goes on
+                log.exception("job %s failed", job.id)
+                self._end(job.id, "failed", problem=_problem(RuntimeError()))
+
+    def _do(self, job: Job) -> None:
+        began = time.perf_counter()
+        context = JobContext(self, job)
+        try:
+            result = dict(self._works[job.id](context))
+            if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:
+                raise ValueError("the result is too long to be kept")
+        except JobCancelled:
+            ended = self._end(job.id, "cancelled")
+        except JobInterrupted:
+            ended = self._put_off(job)
+        except JobGivesWay:
+            self._gaveway[job.id] = (self._last_number, next(self._numbers))
+            ended = self._change(job.id, state="queued", message="waits for others to have their turn")
+            with self._changed:
+                self._changed.notify_all()
+        except Exception as error:
+            problem = _problem(error)
+            if problem["status"] == 500:
+                log.exception("job %s failed", job.id)
+            ended = self._end(job.id, "failed", problem=problem)
+        else:
+            ended = self._end(job.id, "succeeded", result=result)
+        if ended.ended:
+            self._discard(ended)
+        seconds = round(time.perf_counter() - began, 2)
+        log.info("job %s", ended.state, extra={"job": job.id, "kind": job.kind, "map": job.map_id, "seconds": seconds})
 
     def _take(self) -> Job | None:
         """The next job, which runs from now on; waits for one; None when the service stops."""
         with self._changed:
             while not self.stopping:
-                busy = {job.map_id for job in self._jobs.values() if job.state == "running"} - {None}
-                for job in self.all():
-                    if job.state == "queued" and job.map_id not in busy and job.id in self._works:
-                        now = datetime.now(UTC)
-                        return self._change(job.id, state="running", attempt=job.attempt + 1, started_at=now)
+                for job in self._ready():
+                    now = datetime.now(UTC)
+                    return self._change(job.id, state="running", attempt=job.attempt + 1, started_at=now)
                 self._changed.wait()
         return None
+
+    def _ready(self, but_for: str | None = None) -> list[Job]:
+        """Jobs that may run now, in their order; those of one map run one after another, as they were asked for."""
+        first: dict[str | None, int] = {}
+        for job in (open_ := [job for job in self.all() if not job.ended and job.id != but_for]):
+            first.setdefault(job.map_id, job.number)
+        ready = [
+            job
+            for job in open_
+            if job.state == "queued"
+            and job.id in self._works
+            and (job.map_id is None or first[job.map_id] == job.number)
+        ]
+        return sorted(ready, key=lambda job: self._gaveway.get(job.id, (job.number, 0)))
+
+    def others_wait(self, job_id: str) -> bool:
+        """Whether jobs of other maps wait that could run if this one gave way."""
+        with self._changed:
+            own = self._jobs[job_id].map_id
+            return any(job.map_id is None or job.map_id != own for job in self._ready(job_id))
 
     def _put_off(self, job: Job) -> Job:
         if job.resumable:
             return self._change(job.id, state="queued", message="goes on when the service starts again")
         why = "The service was stopped while the job ran, and this kind of job cannot be taken up again."
         return self._end(job.id, "failed", problem=_problem(JobLost(why)))
+
+    def _discard(self, job: Job) -> None:
+        if (discard := self._discards.get(job.kind)) is not None:
+            try:
+                discard(job)
+            except Exception as error:  # what is left is cleared away at the next start
+                log.warning("what the job %s had cannot be cleared away: %s", job.id, error)
 
     # Changes
 
@@ -266,7 +343,9 @@ class Jobs:
             for job in past:
                 del self._jobs[job.id]
             ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
+            note_job(ended, state)
             self._works.pop(job_id, None)
+            self._gaveway.pop(job_id, None)
             self._changed.notify_all()  # another one of the same map may run
             if past:
                 with suppress(PlacerecError):  # they are forgotten at another time

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -23,12 +24,15 @@ from typing import Any
 from urllib.parse import urlsplit
 
 RETRY_SECONDS = 0.05
+KEY = "PLACEREC_KEY"
 
 
-def request(host: str, path: str, data: bytes) -> bytes:
+def request(host: str, path: str, data: bytes, key: str | None = None) -> bytes:
     """One frame as it goes over the wire."""
-    head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
-    return head.encode() + data
+    head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
+    if key:
+        head += f"Authorization: Bearer {key}\r\n"
+    return head.encode() + b"\r\n" + data
 
 
 async def answer(reader: asyncio.StreamReader) -> int:
@@ -62,15 +66,19 @@ async def robot(
     writer.close()
 
 
-def measure(url: str, path: str, frames: Path, robots: int, seconds: float) -> dict[str, Any]:
+def measure(url: str, path: str, frames: Path, robots: int, seconds: float, key: str | None = None) -> dict[str, Any]:
     """What so many robots see, driven by a process of their own; as :func:`drive` gives it.
+
+    Args:
+        key: of the service; without one, that of the environment.
 
     Raises:
         subprocess.CalledProcessError: the service cannot be reached, or hung up.
     """
     words = ["--url", url, "--path", path, "--frames", str(frames), "--robots", str(robots), "--seconds", str(seconds)]
     command = [sys.executable, "-m", "service.load", *words]
-    done = subprocess.run(command, capture_output=True, check=True)
+    environment = {**os.environ, **({} if key is None else {KEY: key})}  # not among the words, which others can see
+    done = subprocess.run(command, capture_output=True, check=True, env=environment)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
@@ -79,7 +87,8 @@ async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: 
     """Let so many robots drive; what they saw, with times in milliseconds."""
     parts = urlsplit(url)
     host, port = str(parts.hostname), parts.port or 80
-    requests = [request(parts.netloc, parts.path.rstrip("/") + path, data) for data in frames]
+    key = os.environ.get(KEY)
+    requests = [request(parts.netloc, parts.path.rstrip("/") + path, data, key) for data in frames]
     times: list[float] = []
     statuses: Counter[int] = Counter()
     began = time.perf_counter()

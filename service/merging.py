@@ -167,13 +167,14 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         UnknownMap, WrongEncoder, MergeConflict, EncoderNotInstalled, StorageFull, StorageFailure: the map is as
             it was.
     """
-    map_ = engine.atlas.get(str(context.map_id))
+    map_ = context.map(engine.atlas)
     try:
-        other = engine.atlas.get(context.arguments["from"])
+        other = context.map(engine.atlas, context.arguments["from"])
         check_encoders(map_, other)
     except PlacerecError as error:
         if "after" in context.notes:
-            _undo(context, map_, None, error)
+            with engine.writing(map_.record.id):
+                _undo(context, map_, None, error)
         raise
     if "after" not in context.notes:
         outline = map_.transfer.outline()
@@ -195,7 +196,8 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     except JobInterrupted:
         raise
     except BaseException as error:
-        _undo(context, map_, other, error)
+        with engine.writing(map_.record.id):
+            _undo(context, map_, other, error)
         raise
     return dict(context.notes["report"]) | {"places": map_.count_places()}
 
@@ -229,8 +231,26 @@ def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
         snapshot = other.snapshot()
         for first in range(0, len(due), CHUNK):
             stand_back(engine, context)
-            _adopt(context, map_, other, snapshot, due[first : first + CHUNK])
+            # No place may be enrolled under one of the ids between the look at them and the commit.
+            with engine.writing(map_.record.id):
+                _adopt(context, map_, other, snapshot, _still_free(context, map_, due[first : first + CHUNK]))
             context.progress(len(coming) - len(due) + min(first + CHUNK, len(due)), len(coming))
+
+
+def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str]]) -> list[tuple[Outline, str]]:
+    """What may come under its name: nobody has enrolled another frame there since the merge began.
+
+    Raises:
+        MergeConflict: somebody has, and such places are not to be skipped.
+    """
+    free: list[tuple[Outline, str]] = []
+    for place, name in due:
+        there = map_.digest(name)
+        if there is None or there.hex() == context.notes["coming"][name]:
+            free.append((place, name))
+        elif context.arguments["on_conflict"] != "skip":
+            raise MergeConflict(f"The place {name!r} was enrolled with another frame while the merge was under way.")
+    return free
 
 
 def _adopt(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:

@@ -58,6 +58,15 @@ class Metrics:
         self.queue = Gauge(
             "placerec_queue_length", "Requests that wait for the encoder or are in it.", registry=self.registry
         )
+        self.under_way = Gauge(
+            "placerec_requests_under_way", "Requests and WebSockets that are being answered.", registry=self.registry
+        )
+        self.commits = Histogram(
+            "placerec_commit_seconds",
+            "Time of one commit of enrolled frames, until all of it is synced to the disk.",
+            buckets=SECONDS,
+            registry=self.registry,
+        )
         self.problems = Counter(
             "placerec_problems", "Requests that ended in a problem, by its type.", ["type"], registry=self.registry
         )

@@ -109,6 +109,7 @@ class MicroBatches:
         self._errands: deque[_Errand[Any]] = deque()
         self._robots: deque[Turn] = deque()
         self._bulk: deque[Turn] = deque()
+        self._passed_over = 0  # batches since a bulk request's encoder had its turn
         self._closed = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="encoder", daemon=True)
@@ -167,8 +168,7 @@ class MicroBatches:
 
     def _take(self) -> list[Turn]:
         """The next batch: frames of one encoder, that of whoever is first; robots before bulk, which keeps a share."""
-        first = (self._robots or self._bulk)[0]
-        most = MOST_FRAMES if self._robots else MOST_BULK
+        first, most = self._first()
         kept = most // BULK_SHARE if self._robots and self._bulk else 0
         taken: list[Turn] = []
         pixels = 0
@@ -186,6 +186,19 @@ class MicroBatches:
                     pixels += turn.pixels()
             queue.extendleft(reversed(passed))
         return taken
+
+    def _first(self) -> tuple[Turn, int]:
+        """Whose encoder is next, and how many frames it is to have at most."""
+        first = (self._robots or self._bulk)[0]
+        if not self._bulk or self._bulk[0].identity == first.identity:
+            self._passed_over = 0
+            return first, MOST_FRAMES if self._robots else MOST_BULK
+        # A share of a batch is of no use to who needs another encoder: one batch in so many is theirs.
+        self._passed_over += 1
+        if self._passed_over < BULK_SHARE:
+            return first, MOST_FRAMES
+        self._passed_over = 0
+        return self._bulk[0], MOST_BULK
 
     def _encode(self, batch: Sequence[Turn]) -> None:
         """Settle each turn of a batch, one way or the other."""

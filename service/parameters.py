@@ -132,6 +132,7 @@ class BatchParameters(Parameters):
     """Beside many frames to enrol."""
 
     encoder: EncoderAssertion = None
+    background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
 
 
 class BatchItem(PlaceDescription):

@@ -15,6 +15,7 @@ import numpy as np
 from core.images import encode_png
 from core.preprocessing import Pixels
 from service.faults import UnknownExplanation
+from service.statistics import MapKey
 
 HEIGHT = 360
 """Of each frame in the drawing, pixels."""
@@ -57,7 +58,7 @@ def side_by_side(
         left, right: H x W x 3 uint8, BGR.
         outlines: boxes in the left frame and in the right one.
     """
-    frames = [_scaled(left), _scaled(right)]
+    frames = [scaled(left), scaled(right)]
     height = max(len(frame) for frame in frames)
     starts = [0, frames[0].shape[1] + GAP]
     canvas = np.full((height, starts[1] + frames[1].shape[1], 3), 32, np.uint8)
@@ -77,7 +78,8 @@ def side_by_side(
     return encode_png(canvas)
 
 
-def _scaled(frame: Pixels) -> Pixels:
+def scaled(frame: Pixels) -> Pixels:
+    """A frame in the size in which it is drawn; one of that size as it is."""
     height, width = frame.shape[:2]
     factor = min(HEIGHT / height, WIDEST / width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
@@ -99,26 +101,26 @@ class Pictures:
     """The pictures of the last explanations, in memory; from any thread."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[tuple[str, str], tuple[float, bytes]] = OrderedDict()
+        self._kept: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()
         self._lock = threading.Lock()
 
-    def keep(self, map_id: str, picture: bytes) -> str:
-        """Keep a PNG for a while; the name to fetch it by."""
+    def keep(self, key: MapKey, picture: bytes) -> str:
+        """Keep a PNG for a while, for as long as its map is there; the name to fetch it by."""
         name = secrets.token_urlsafe(12)
         with self._lock:
-            self._kept[map_id, name] = (time.monotonic() + SECONDS, picture)
+            self._kept[key, name] = (time.monotonic() + SECONDS, picture)
             while len(self._kept) > KEPT:
                 self._kept.popitem(last=False)
         return name
 
-    def fetch(self, map_id: str, name: str) -> bytes:
+    def fetch(self, key: MapKey, name: str) -> bytes:
         """The PNG.
 
         Raises:
             UnknownExplanation: there is none of this name, or not any more.
         """
         with self._lock:
-            until, picture = self._kept.get((map_id, name), (0.0, b""))
+            until, picture = self._kept.get((key, name), (0.0, b""))
         if time.monotonic() > until:
             raise UnknownExplanation(
                 f"There is no picture {name[:40]!r}; the last {KEPT} are kept for {SECONDS / 60:.0f} minutes."

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import http
 import logging
+import random
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,12 +18,21 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from core import errors
+from core.storage.disk import refusals
 from service import faults
 
 MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:placerec:problem:"
-RETRY_AFTER_SECONDS = 1
+RETRY_AFTER_SECONDS = (1, 3)
+"""Least and most: one at random, so that those who were refused together do not come again together."""
+
+RETRY_LATE_SECONDS = (5, 15)
+"""The same where what is waited for takes its time: a job, a session's end, a restart."""
+
 PATH_CHARACTERS = "/:@!$&'()*+,;="
+
+SHORTAGES = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
+"""What a file can be refused for that is nobody's mistake and may pass."""
 
 log = logging.getLogger("placerec.problems")
 
@@ -108,6 +119,14 @@ KINDS: dict[type[Exception], Kind] = {
     errors.MapQuarantined: Kind(503, "map-quarantined", "The map is damaged and out of service"),
     errors.DataDirectoryLocked: Kind(503, "data-directory-locked", "Another process holds the data"),
     errors.DataDirectoryTooNew: Kind(503, "data-directory-too-new", "The data is of a later version"),
+    # Maps as files
+    errors.InvalidArchive: Kind(422, "invalid-archive", "The file is not the export of a map, or is damaged"),
+    errors.ArchiveTooNew: Kind(422, "archive-too-new", "The file is of a later version"),
+    faults.DigestMismatch: Kind(422, "digest-mismatch", "The body is not the one that was to come"),
+    faults.ExportGone: Kind(412, "export-gone", "The rest of the download is not there any more"),
+    faults.RangeNotSatisfiable: Kind(416, "range-not-satisfiable", "The range begins behind the end"),
+    faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
+    faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
     # Traverses on disk: the command line's own, which no request reaches
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is no traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
@@ -123,10 +142,29 @@ KINDS: dict[type[Exception], Kind] = {
     faults.QueueFull: Kind(503, "queue-full", "Too many requests wait"),
     faults.MemoryFull: Kind(503, "memory-full", "Too many uploads at one time"),
     faults.DeadlineExceeded: Kind(503, "deadline-exceeded", "The time was up"),
+    faults.StagingFull: Kind(503, "staging-full", "Too much waits to be enrolled"),
     faults.JobQueueFull: Kind(503, "job-queue-full", "Too many jobs wait"),
     faults.TooManyWatchers: Kind(503, "too-many-watchers", "Too many follow jobs"),
     faults.NotReady: Kind(503, "not-ready", "The service is not ready"),
+    faults.Stopping: Kind(503, "stopping", "The service is stopping"),
+    faults.TooManyConnections: Kind(503, "too-many-connections", "Too many connections"),
+    # The connection
+    faults.MalformedHead: Kind(400, "malformed-head", "Not a request of HTTP"),
+    faults.HeadTooSlow: Kind(408, "head-too-slow", "The request did not come in time"),
+    faults.UrlTooLong: Kind(414, "url-too-long", "The path and query string are too long"),
+    faults.HeadTooLarge: Kind(431, "head-too-large", "Too many headers, or too long ones"),
+    # What the installation holds
+    faults.TooManyMaps: Kind(409, "too-many-maps", "There are as many maps as there may be"),
+    faults.TooManyPlaces: Kind(409, "too-many-places", "The map holds as many places as it may"),
     faults.ClientGone: Kind(499, "client-gone", "The caller hung up"),
+    # Who asks
+    faults.KeyNeeded: Kind(401, "key-needed", "A key is needed"),
+    faults.KeyRefused: Kind(401, "key-refused", "The key is not valid"),
+    faults.RoleTooLow: Kind(403, "role-too-low", "The key's role does not allow this"),
+    faults.MapForbidden: Kind(403, "map-forbidden", "The key is limited to other maps"),
+    faults.ForeignPage: Kind(403, "foreign-page", "Not from a page or a name of elsewhere"),
+    faults.RateExceeded: Kind(429, "rate-exceeded", "Too many requests a second"),
+    faults.KeysUnreadable: Kind(503, "keys-unreadable", "The keys cannot be read"),
 }
 
 BY_STATUS: dict[int, Kind] = {
@@ -143,9 +181,28 @@ RETRY_LATER = (
     faults.DeadlineExceeded,
     faults.NotReady,
     faults.JobQueueFull,
+    faults.StagingFull,
+    faults.TooManyExports,
+    faults.TooManyImports,
     faults.TooManyWatchers,
     faults.TooManySessions,
+    faults.TooManyConnections,
+    faults.Stopping,
 )
+
+RETRY_LATE = (
+    faults.TooManyExports,
+    faults.TooManyImports,
+    faults.JobQueueFull,
+    faults.TooManyWatchers,
+    faults.TooManySessions,
+    faults.Stopping,
+)
+
+
+def retry_after(error: Exception) -> str:
+    """Seconds after which a request that was refused for the moment is worth sending again."""
+    return str(random.randint(*RETRY_LATE_SECONDS if isinstance(error, RETRY_LATE) else RETRY_AFTER_SECONDS))
 
 
 def kind_of(error: Exception) -> Kind:
@@ -162,8 +219,22 @@ def kind_of(error: Exception) -> Kind:
     return INTERNAL
 
 
+def declared(error: Exception) -> Exception:
+    """What the system refused where nobody had reckoned with it, as what it is elsewhere; else the error itself."""
+    if isinstance(error, MemoryError):
+        return faults.MemoryFull("The memory does not suffice for this request at the moment.")
+    if isinstance(error, OSError) and error.errno in SHORTAGES:
+        try:
+            with refusals("do what was asked for"):
+                raise error
+        except errors.PlacerecError as refusal:
+            return refusal
+    return error
+
+
 def problem_of(error: Exception, instance: str | None = None, request_id: str | None = None) -> Problem:
     """The problem that an exception is; nothing of an unexpected one is told but that it happened."""
+    error = declared(error)
     kind = kind_of(error)
     detail = str(error) or kind.title
     if kind is INTERNAL:
@@ -208,13 +279,13 @@ def request_problem(request: Request, error: Exception) -> Problem:
 
 def problem_response(request: Request, error: Exception) -> Response:
     """The answer to a request that ended in ``error``; its kind is noted for the log and the counters."""
+    error = declared(error)
     problem = request_problem(request, error)
     request.state.problem = problem.type.removeprefix(TYPE_PREFIX)
     headers: dict[str, str] = {}
-    if isinstance(error, HTTPException) and error.headers:
-        headers.update(error.headers)
+    headers.update(getattr(error, "headers", None) or {})
     if isinstance(error, RETRY_LATER):
-        headers["Retry-After"] = str(RETRY_AFTER_SECONDS)
+        headers["Retry-After"] = retry_after(error)
     elif problem.status >= 500:
         trace = error if problem.status == 500 else None
         log.error("%s: %s", problem.type, error, exc_info=trace, extra={"request_id": problem.request_id})
@@ -237,15 +308,26 @@ def install_problems(app: FastAPI) -> None:
 
 
 def problem_documentation(*kinds: type[Exception]) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI ``responses`` that name, under each status, the problems that a route can answer with."""
+    """OpenAPI ``responses`` that name, under each status, the problems that a route can answer with.
+
+    Those that all operations share are added by ``service.openapi``: a route names what is its own.
+    """
     documented: dict[int | str, dict[str, Any]] = {}
+    document_problems(documented, kinds)
+    return documented
+
+
+def document_problems(documented: dict[Any, dict[str, Any]], kinds: Iterable[type[Exception]], key: type = int) -> None:
+    """Add problems to OpenAPI ``responses``, beside those that stand there; ``key`` is the type of their statuses."""
     for cls in kinds:
         kind = KINDS[cls]
-        entry = documented.setdefault(kind.status, {"description": "", "content": {MEDIA_TYPE: {"examples": {}}}})
-        entry["description"] = "; ".join(filter(None, [entry["description"], kind.title]))
-        entry["content"][MEDIA_TYPE]["schema"] = {"$ref": "#/components/schemas/Problem"}
-        entry["content"][MEDIA_TYPE]["examples"][kind.slug] = {"$ref": f"#/components/examples/{kind.slug}"}
-    return documented
+        entry = documented.setdefault(key(kind.status), {"description": ""})
+        content = entry.setdefault("content", {}).setdefault(MEDIA_TYPE, {})
+        examples = content.setdefault("examples", {})
+        if kind.slug not in examples:
+            entry["description"] = "; ".join(filter(None, [entry["description"], kind.title]))
+            examples[kind.slug] = {"$ref": f"#/components/examples/{kind.slug}"}
+        content["schema"] = {"$ref": "#/components/schemas/Problem"}
 
 
 def problem_examples() -> dict[str, Any]:

@@ -43,7 +43,7 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     Raises:
         UnknownMap, UnknownSequence, NothingToMeasure, EncoderNotInstalled, StorageFull, StorageFailure.
     """
-    map_ = engine.atlas.get(str(context.map_id))
+    map_ = context.map(engine.atlas)
     if (planned := context.notes.get("report")) is None:
         planned, going = _plan(engine, context)
         if context.arguments["dry_run"]:
@@ -53,7 +53,8 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     if any(digests.get(place.id) == place.digest for place in map_.transfer.outline()):  # not done by an attempt before
         context.check_cancelled()
     context.progress(0, len(digests), "forgets the places")
-    map_.transfer.forget(digests)
+    with engine.writing(map_.record.id):
+        map_.transfer.forget(digests)
     context.progress(len(digests), len(digests))
     return dict(planned) | {"places_after": map_.count_places()}
 
@@ -61,7 +62,7 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str, str]]:
     """The report, and the digests of the places that go, by their ids."""
     wanted = context.arguments
-    map_ = engine.atlas.get(str(context.map_id))
+    map_ = context.map(engine.atlas)
     own = OwnFrames(map_, load_encoder(engine, map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
     asking = _named(names, wanted["queries"])

@@ -19,6 +19,7 @@ from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
 from service.background import encode_behind
 from service.faults import ImagesMissing
+from service.job_context import born
 from service.jobs import JobContext, JobInterrupted
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
             left.
     """
     target, identity = context.arguments["to"], context.arguments["encoder"]
-    if (published := context.notes.get("result")) is not None and _is_published(engine, target, identity):
+    if (published := context.notes.get("result")) is not None and _is_published(engine, target, context.notes["made"]):
         return dict(published)  # killed between the rename and the end of the job
     if not context.notes:
         if target in engine.atlas.unlisted():
@@ -72,9 +73,9 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         raise
 
 
-def _is_published(engine: Engine, target: str, identity: str) -> bool:
+def _is_published(engine: Engine, target: str, made: str) -> bool:
     try:
-        return engine.atlas.find(target).record.encoder == identity
+        return born(engine.atlas.find(target)) == made
     except UnknownMap:
         return False
 
@@ -84,7 +85,7 @@ class _Reencoding:
 
     def __init__(self, engine: Engine, context: JobContext, target: str, identity: str) -> None:
         self.engine, self.context, self.target, self.identity = engine, context, target, identity
-        self.source = engine.atlas.get(str(context.map_id))
+        self.source = context.map(engine.atlas)
         self.made = engine.atlas.unlisted().get(target) or self._create()
         self.left_out: dict[str, tuple[Outline, str]] = {}
         """Places whose frame gives the new encoder nothing, by id, and why."""
@@ -207,7 +208,7 @@ class _Reencoding:
             "places": self.made.count_places(),
             "left_out": {"count": len(self.left_out), "places": named},
         }
-        self.context.remember(result=result)
+        self.context.remember(result=result, made=born(self.made))
         self.engine.atlas.publish(self.target)
         return result
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections import defaultdict, deque
 from collections.abc import Sequence
+from contextvars import Context
 from dataclasses import dataclass
 
 from anyio import to_thread
@@ -69,7 +70,8 @@ class Searches:
         if self._running[purpose] < self._at_once:
             self._running[purpose] += 1
             # Not before the others whose frames left the encoder in the same moment have come as well.
-            loop.call_soon(self._start, purpose)
+            # It is nobody's search alone, so it says in the log of none that it was for it.
+            loop.call_soon(self._start, purpose, context=Context())
         answers = await asyncio.gather(*(part.answer for part in parts))
         return [located for answer in answers for located in answer]
 

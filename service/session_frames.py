@@ -148,7 +148,8 @@ def _advanced(
     answer.milliseconds = rounded({"belief": believed, "total": 1e3 * (time.monotonic() - began)})
     # Not before all that may fail is done: a frame that raises was not taken in.
     session.answer, session.lost = answer.model_dump_json(), lost
-    session.request, session.used = request_id, time.time()
+    session.request = request_id
+    session.touch()
     if options.frame is not None:
         session.number = options.frame
     if options.timestamp is not None:

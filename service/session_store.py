@@ -1,8 +1,8 @@
 """Sessions on disk: one small SQLite file in the data directory, written after every frame.
 
-In WAL mode with ``synchronous=NORMAL`` a commit is one write and no sync: it outlives the process however that
-ends, and a power cut may take back the last of them but damages nothing.  A file that cannot be read is put aside:
-sessions are worth less than a service that starts.
+A frame that is answered was written down and synced, as every write that is acknowledged (``synchronous=FULL`` in WAL
+mode): a power cut takes none of it back.  A file that cannot be read is put aside: sessions are worth less than a
+service that starts.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from core.storage.disk import refusals
+
 FILE = "sessions.sqlite"
 APPLICATION_ID = 0x504C5253  # "PLRS"
 FORMAT = 1
 
 LOG_PAGES = 256
-"""After so many pages the log is written back; that one commit syncs."""
+"""After so many pages the log is written back."""
 
 _SCHEMA = """
 CREATE TABLE sessions (
@@ -79,17 +81,28 @@ class SessionStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open the file, or make it; one that is damaged is put aside under ``sessions.sqlite.damaged``."""
+        """Open the file, or make it; one that is damaged is put aside under ``sessions.sqlite.damaged``.
+
+        Raises:
+            StorageFull, StorageFailure: the disk refuses.
+        """
         path = folder / FILE
         self._lock = threading.Lock()
+        with refusals(f"open {path}"):
+            self._connection = self._opened_or_new(path)
+
+    def _opened_or_new(self, path: Path) -> sqlite3.Connection:
         try:
-            self._connection = _opened(path)
-        except sqlite3.DatabaseError as error:
+            return _opened(path)
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            told = str(error)
+            if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
+                raise  # the disk refuses, which says nothing of the file
             log.error("%s cannot be read and is put aside; its sessions are lost: %s", FILE, error)
             for suffix in ("-wal", "-shm"):
                 path.with_name(FILE + suffix).unlink(missing_ok=True)
             path.replace(path.with_name(FILE + ".damaged"))
-            self._connection = _opened(path)
+            return _opened(path)
 
     def close(self) -> None:
         """Write the log back and let the file go."""
@@ -117,6 +130,14 @@ class SessionStore:
         with self._lock:
             self._connection.execute(f"INSERT OR REPLACE INTO sessions VALUES ({marks})", values)
 
+    def renew(self, session: StoredSession) -> bool:
+        """The same, unless it was forgotten or has ended meanwhile; whether it was there."""
+        assignments = ", ".join(f"{name} = ?" for name in COLUMNS)
+        values = [getattr(session, name) for name in COLUMNS]
+        with self._lock, closing(self._connection.cursor()) as cursor:
+            cursor.execute(f"UPDATE sessions SET {assignments} WHERE id = ? AND ended IS NULL", [*values, session.id])
+            return cursor.rowcount > 0
+
     def end(self, session_id: str, reason: str, moment: float) -> None:
         """Remember that, when and why a session ended, and nothing else of it."""
         with self._lock:
@@ -135,7 +156,7 @@ def _opened(path: Path) -> sqlite3.Connection:
     connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
     try:
         connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")  # for the tables; see above for what follows
+        connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
         with closing(connection.execute("PRAGMA user_version")) as cursor:
@@ -148,8 +169,13 @@ def _opened(path: Path) -> sqlite3.Connection:
             connection.execute("COMMIT")
         elif version != FORMAT:
             raise sqlite3.DatabaseError(f"it is of format {version}, not {FORMAT}")
+        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
+            if line != "ok":
+                raise sqlite3.DatabaseError(line)
+        connection.execute(f"SELECT {', '.join(HEAD)} FROM sessions").fetchall()
         connection.execute(f"SELECT {', '.join(COLUMNS)} FROM sessions LIMIT 1").fetchall()
-        connection.execute("PRAGMA synchronous = NORMAL")
+        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
+        connection.execute("UPDATE sessions SET id = id WHERE false")
     except BaseException:
         connection.close()
         raise

@@ -56,6 +56,7 @@ class Session:
     lost: frames that a restart is known to have lost.
     answer: JSON of the last answer.
     run: None after a restart, until the next frame.
+    idle_since: when the last frame came by the monotonic clock, by which it ends: the other one may be set.
     """
 
     id: str
@@ -74,12 +75,17 @@ class Session:
     restored: bool = False
     streaming: bool = False
     waiting: int = 0
+    idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @property
     def expires(self) -> float:
         """When it ends unless a frame comes, seconds since 1970."""
-        return self.used + self.expires_after
+        return time.time() + self.expires_after - (time.monotonic() - self.idle_since)
+
+    def touch(self) -> None:
+        """A frame came, now."""
+        self.used, self.idle_since = time.time(), time.monotonic()
 
     @property
     def selection(self) -> Selection | None:
@@ -158,6 +164,7 @@ class Sessions:
             self._living[stored.id] = Session(
                 stored.id, stored.map, stored.map_created_at, options, expires_after, stored.created, stored.used,
                 stored.number, stored.moment, stored.request, stored.lost, restored=True,
+                idle_since=time.monotonic() - max(0.0, now - stored.used),
             )  # fmt: skip
         if kept:
             log.info("sessions are taken up", extra={"sessions": len(kept)})
@@ -231,6 +238,10 @@ class Sessions:
             found = [one for one in self._living.values() if one.map_id == map_.record.id]
         return sorted((one for one in found if one.map_created_at == _created(map_)), key=lambda one: one.id)
 
+    def count(self) -> int:
+        """Sessions that are under way, of all maps."""
+        return len(self._living)
+
     def delete(self, session: Session) -> None:
         """End a run; it is as if there had been none.
 
@@ -244,8 +255,9 @@ class Sessions:
             self._drop_charts()
 
     def _sweep(self) -> None:
-        now = time.time()
-        for session in [one for one in self._living.values() if one.expires <= now and not one.waiting]:
+        now = time.monotonic()
+        over = [one for one in self._living.values() if now - one.idle_since >= one.expires_after and not one.waiting]
+        for session in over:
             self._end(session, EXPIRED)
 
     def _end(self, session: Session, reason: str) -> None:
@@ -284,13 +296,17 @@ class Sessions:
             graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
             done = time.monotonic()
             self._charts[key] = _Charted(snapshot, graph, done, done - now)
+            if len(self._charts) > self._settings.max_sessions:  # of sessions that were refused, or are over
+                with self._lock:
+                    self._drop_charts()
             return graph
 
     def _drop_charts(self) -> None:
-        """Those of maps that no session is about."""
-        used = {(one.map_id, one.map_created_at) for one in self._living.values()}
-        for key in [key for key in self._charts if key[:2] not in used]:
-            del self._charts[key]
+        """Those of maps and sequences that no session is about."""
+        used = {(one.map_id, one.map_created_at, tuple(one.options.sequences or ())) for one in self._living.values()}
+        for key in list(self._charts):
+            if key not in used:
+                self._charts.pop(key, None)
 
     def run(self, map_: Map, session: Session) -> Run:
         """The session's run over the places as they are now; call it in the session's turn.
@@ -327,16 +343,12 @@ class Sessions:
     def save(self, session: Session) -> bool:
         """Write a session down as it is; False if the disk refuses, which is no reason not to answer, and for a session
         that was ended meanwhile."""
-        stored = _stored(session)
         try:
-            with self._lock:
-                if session.id not in self._living:
-                    return False
-                self._store.write(stored)
+            # Without our lock: a sync takes a while, and others look for theirs.
+            return self._store.renew(_stored(session))
         except sqlite3.Error as error:
             log.warning("session %s is not written down: %s", session.id, error)
             return False
-        return True
 
 
 def alive_rows(map_: Map) -> NDArray[np.bool_]:

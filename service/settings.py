@@ -31,7 +31,21 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 takes a free one.")
     allow_anonymous: bool = Field(
         default=False,
-        description="Serve other machines although no keys are set: whoever reaches the port may do everything.",
+        description="Serve other machines although no key was ever created: whoever reaches the port may do "
+        "everything. Once there are keys it opens nothing.",
+    )
+    rate_per_key: float = Field(
+        default=0.0,
+        ge=0,
+        le=1_000_000,
+        allow_inf_nan=False,
+        description="Requests a second of one key (without keys: of one address); then 429. 0 sets no limit.",
+    )
+    rate_burst: int = Field(
+        default=20, ge=1, le=1_000_000, description="Requests that may come at once before that rate holds."
+    )
+    audit_file: Path | None = Field(
+        default=None, description="File to which the audit trail is appended, besides the log; none by default."
     )
     root_path: str = Field(
         default="",
@@ -71,6 +85,56 @@ class Settings(BaseSettings):
     shutdown_timeout: Seconds = Field(
         default=10.0, description="Seconds that requests under way get to finish when the service stops."
     )
+    drain_seconds: float = Field(
+        default=0.0,
+        ge=0,
+        le=600,
+        allow_inf_nan=False,
+        description="Seconds after SIGTERM in which readiness is denied but requests are still taken, so that a "
+        "balancer sends no more.",
+    )
+    head_timeout: Seconds = Field(
+        default=10.0, description="Seconds within which the head of a request has to come whole; then 408."
+    )
+    read_timeout: Seconds = Field(
+        default=10.0, description="Seconds without a byte of a body after which its request is dropped."
+    )
+    write_timeout: Seconds = Field(
+        default=30.0,
+        description="Seconds within which a caller has to take 64 KiB of its answer, or all of it; then the connection "
+        "is cut.",
+    )
+    keep_alive_timeout: Seconds = Field(
+        default=75.0, description="Seconds without a request after which a connection is closed."
+    )
+    max_connections: int = Field(
+        default=1000,
+        ge=1,
+        le=1_000_000,
+        description="Open connections; one more closes that which has waited longest for a request, or else gets 503.",
+    )
+    max_connections_per_address: int = Field(
+        default=500,
+        ge=0,
+        le=1_000_000,
+        description="The same of one address, which behind a proxy is the proxy's; 0 sets no such limit.",
+    )
+    max_pipelined: int = Field(
+        default=16, ge=1, le=1000, description="Requests sent ahead on one connection; those behind are not read."
+    )
+    max_url_bytes: int = Field(
+        default=64 * 1024, ge=256, le=MIB, description="Longest path and query string together; then 414."
+    )
+    max_header_bytes: int = Field(default=16 * 1024, ge=256, le=MIB, description="All headers together; then 431.")
+    max_headers: int = Field(default=100, ge=8, le=10_000, description="Headers of one request; then 431.")
+    max_stream_messages: int = Field(
+        default=256, ge=2, le=10_000, description="Messages that a robot may send ahead over a WebSocket."
+    )
+    max_stream_fragments: int = Field(
+        default=1024, ge=1, le=1_000_000, description="Fragments of one message over a WebSocket."
+    )
+    max_maps: int = Field(default=1000, ge=1, le=100_000, description="Maps of the data directory; then 409.")
+    max_places: int = Field(default=10_000_000, ge=1, description="Places of one map; then 409.")
     max_image_bytes: int = Field(default=16 * MIB, ge=1024, le=1024 * MIB, description="Largest frame, in bytes.")
     max_image_pixels: int = Field(
         default=40_000_000, ge=256, le=1_000_000_000, description="Largest frame, in pixels; read from its header."
@@ -79,12 +143,47 @@ class Settings(BaseSettings):
     max_batch_bytes: int = Field(
         default=128 * MIB, ge=1024, le=4096 * MIB, description="Largest multipart request, in bytes."
     )
+    max_bulk_items: int = Field(
+        default=10_000, ge=1, le=200_000, description="Most frames in one multipart request that a job enrols."
+    )
+    max_bulk_bytes: int = Field(
+        default=4096 * MIB, ge=1024, description="Largest multipart request that a job enrols, in bytes; on disk."
+    )
+    max_staged_bytes: int = Field(
+        default=16384 * MIB, ge=1024, description="Bytes on disk that wait for such jobs; more are answered with 503."
+    )
+    bulk_timeout: Seconds = Field(
+        default=3600.0, description="Seconds within which a request that a job enrols has to come whole."
+    )
     max_upload_memory: int = Field(
         default=512 * MIB, ge=1024, description="Bytes of request bodies held at one time; more are answered with 503."
     )
     max_json_bytes: int = Field(default=1 * MIB, ge=1024, le=64 * MIB, description="Largest JSON body, in bytes.")
     max_metadata_bytes: int = Field(
         default=16 * 1024, ge=2, le=MIB, description="Largest metadata of one place, as JSON bytes."
+    )
+    max_import_bytes: int = Field(
+        default=64 * 1024 * MIB, ge=1024, description="Largest file of a map that is imported, in bytes; on disk."
+    )
+    max_imports: int = Field(
+        default=2, ge=1, le=1000, description="Maps that are being imported, or wait for it; one more gets 503."
+    )
+    import_timeout: float = Field(
+        default=6 * 3600.0,
+        gt=0,
+        le=7 * 24 * 3600,
+        allow_inf_nan=False,
+        description="Seconds within which the file of a map has to arrive.",
+    )
+    max_exports: int = Field(
+        default=4, ge=1, le=1000, description="Moments of maps that are kept for their downloads; one more gets 503."
+    )
+    export_seconds: float = Field(
+        default=3600.0,
+        gt=0,
+        le=7 * 24 * 3600,
+        allow_inf_nan=False,
+        description="Seconds after its last use for which the moment of a download is kept, so that it can go on.",
     )
     thumbnail_side: int = Field(default=320, ge=16, le=2048, description="Longer side of a kept thumbnail, in pixels.")
     job_workers: int = Field(default=1, ge=1, le=16, description="Jobs that run at one time; at most one of each map.")
@@ -131,16 +230,20 @@ class Settings(BaseSettings):
         except ValueError:
             return self.host == "localhost"
 
-    def check_exposure(self) -> None:
+    def check_exposure(self, has_keys: bool = False) -> None:
         """Refuse to serve other machines without keys.
+
+        Args:
+            has_keys: a key was created at some time, so that every request needs one.
 
         Raises:
             SettingsError: the host is no loopback address and anonymous use is not allowed.
         """
-        if not self.is_loopback() and not self.allow_anonymous:
+        if not has_keys and not self.is_loopback() and not self.allow_anonymous:
             raise SettingsError(
                 f"{PREFIX}HOST is {self.host}: other machines could use the service, and there are no keys. "
-                f"Listen on 127.0.0.1, or set {PREFIX}ALLOW_ANONYMOUS=true if the network is trusted."
+                "Create one with 'placerec keys create', listen on 127.0.0.1, or set "
+                f"{PREFIX}ALLOW_ANONYMOUS=true if the network is trusted."
             )
 
 
@@ -162,5 +265,5 @@ def read_settings() -> Settings:
 
 def unknown_variables() -> list[str]:
     """Variables of the environment that look like settings and are none (a typing error, most likely)."""
-    known = {PREFIX + name.upper() for name in Settings.model_fields} | {f"{PREFIX}URL"}
+    known = {PREFIX + name.upper() for name in Settings.model_fields} | {f"{PREFIX}URL", f"{PREFIX}KEY"}
     return sorted(name for name in os.environ if name.startswith(PREFIX) and name.upper() not in known)

@@ -9,14 +9,14 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from core.storage.disk import refusals
+from core.storage.disk import Damage, refusals
 from core.upkeep.drift import SCORE_BINS, Week
 from core.verdict import Verdict
 
@@ -167,7 +167,7 @@ class QueryStatistics:
             StorageFull, StorageFailure.
         """
         self.flush()
-        with self._file, refusals("read the statistics of queries"):
+        with self._file, self._unspoilt():
             connection = self._open()
             found = connection.execute("SELECT code, since FROM maps WHERE id = ? AND made = ?", key).fetchone()
             if found is None:
@@ -177,6 +177,19 @@ class QueryStatistics:
             counts = {place: PlaceCount(*values) for place, *values in places.fetchall()}
             weeks = connection.execute("SELECT * FROM weeks WHERE map = ? ORDER BY monday", (code,)).fetchall()
             return Statistics(datetime.fromisoformat(since), counts, tuple(_week(row[1:]) for row in weeks))
+        return Statistics()
+
+    @contextmanager
+    def _unspoilt(self) -> Iterator[None]:
+        """Put the file aside if it turns out to be damaged within: it holds nothing but counts."""
+        try:
+            with refusals("use the statistics of queries"):
+                yield
+        except (Damage, ValueError, TypeError) as damage:
+            if self._connection is not None:
+                self._connection.close()
+                self._connection = None
+            _put_aside(self._path, damage)
 
     def flush(self) -> None:
         """Write down what was counted.
@@ -190,8 +203,11 @@ class QueryStatistics:
             if not taken:
                 return
             try:
-                with refusals("write down the statistics of queries"):
+                with self._unspoilt():
                     self._write(taken)
+                    return
+                with refusals("write down the statistics of queries"):
+                    self._write(taken)  # into a new file
             except BaseException:
                 with self._lock:  # in front of what was counted since
                     for key, newer in self._counts.items():
@@ -260,15 +276,20 @@ def _connect(path: Path) -> sqlite3.Connection:
     """The file, which is made if need be; one that cannot be used is put aside, for it holds nothing but counts."""
     try:
         return _opened(path)
-    except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in str(error):
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+        told = str(error)
+        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
             raise
-        aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
-        log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, error)
-        path.rename(aside)
-        for suffix in ("-wal", "-shm"):
-            path.with_name(FILE + suffix).unlink(missing_ok=True)
+        _put_aside(path, error)
         return _opened(path)
+
+
+def _put_aside(path: Path, error: Exception) -> None:
+    aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
+    log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, error)
+    path.rename(aside)
+    for suffix in ("-wal", "-shm"):
+        path.with_name(FILE + suffix).unlink(missing_ok=True)
 
 
 def _opened(path: Path) -> sqlite3.Connection:
@@ -288,6 +309,8 @@ def _opened(path: Path) -> sqlite3.Connection:
         elif version != VERSION:
             raise sqlite3.DatabaseError(f"its schema is {version}, not {VERSION}")
         connection.execute("SELECT last FROM places LIMIT 0")
+        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
+        connection.execute("UPDATE places SET id = id WHERE false")
         connection.execute("PRAGMA synchronous = NORMAL")  # a crash may lose the last counts, never the file
     except BaseException:
         connection.close()

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Protocol
 from core.errors import MapExists, MapQuarantined, PlacerecError, UnknownMap
 from core.storage import Map
 from core.verdict import Verdict
-from service import merging, pruning, reencoding
+from service import bulk_enrolment, calibrating, merging, pruning, rebuilding, reencoding
+from service.faults import TooManyMaps
 from service.statistics import MapKey, QueryStatistics
 
 if TYPE_CHECKING:
@@ -56,22 +57,43 @@ class Upkeep:
         engine.jobs.register(reencoding.KIND, partial(reencoding.reencode, engine))
         engine.jobs.register(pruning.KIND, partial(pruning.prune, engine))
         engine.jobs.register(merging.KIND, partial(merging.merge, engine))
+        engine.jobs.register(rebuilding.REBUILD, partial(rebuilding.rebuild, engine))
+        engine.jobs.register(rebuilding.VERIFY, partial(rebuilding.verify, engine))
+        engine.jobs.register(calibrating.KIND, partial(calibrating.calibrate, engine))
+        engine.jobs.register(
+            bulk_enrolment.KIND, partial(bulk_enrolment.enrol_staged, engine), partial(bulk_enrolment.discard, engine)
+        )
 
     def start(self) -> None:
         """Clear away what no job will finish; call it before the jobs start."""
-        unfinished = {job.arguments.get("to") for job in self._engine.jobs.all() if not job.ended}
+        open_ = [job.arguments for job in self._engine.jobs.all() if not job.ended]
+        unfinished = {arguments.get("to") for arguments in open_}
+        self._engine.staging.clean({arguments["form"] for arguments in open_ if "form" in arguments})
         for map_id in self._engine.atlas.unlisted():
             if map_id not in unfinished:
                 with suppress(PlacerecError):  # at another start
                     self._engine.atlas.abandon(map_id)
         self.statistics.start()
 
+    def check_room(self) -> None:
+        """See that there is room for one more map; those that are damaged or being made count as well.
+
+        Raises:
+            TooManyMaps: there is none.
+        """
+        engine, most = self._engine, self._engine.settings.max_maps
+        count = len(engine.all_records()) + len(engine.atlas.quarantined()) + len(engine.atlas.unlisted())
+        if count >= most:
+            raise TooManyMaps(f"There are {count} maps of at most {most}; delete one that is not needed.")
+
     def check_free(self, map_id: str) -> None:
         """See that a map of this id can be made.
 
         Raises:
             MapExists: there is one, or a job is to make one.
+            TooManyMaps: there are as many as there may be.
         """
+        self.check_room()
         engine = self._engine
         pending = {job.arguments.get("to") for job in engine.jobs.all() if not job.ended}
         if map_id in pending or map_id in engine.atlas.unlisted():

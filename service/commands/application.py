@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import typer
 
+from service.commands.backup import backup
 from service.commands.bench import bench
 from service.commands.calibrate import calibrate
 from service.commands.console import Commands
 from service.commands.enroll import enroll
 from service.commands.evaluate import evaluate
 from service.commands.jobs import jobs
+from service.commands.keys import keys
 from service.commands.maps import maps
 from service.commands.model import model
 from service.commands.query import query
@@ -27,6 +29,8 @@ application = typer.Typer(
 for command in (serve, enroll, query, evaluate, calibrate, bench, settings):
     application.command()(command)
 application.add_typer(maps, name="maps")
+application.add_typer(backup, name="backup")
 application.add_typer(jobs, name="jobs")
+application.add_typer(keys, name="keys")
 application.add_typer(vocabulary, name="vocabulary")
 application.add_typer(model, name="model")

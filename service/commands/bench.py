@@ -12,6 +12,7 @@ import typer
 
 from service.commands.client import Target, ask, path_of, read_bytes
 from service.commands.console import Failure, number, progress, show, table, write_file
+from service.commands.credentials import given_key
 from service.commands.models import ModelsDir, default_encoder, open_catalogue
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def _measure_service(
         task = bar.add_task("Driving", total=len(robots))
         for count in robots:
             try:
-                found = measure(url, path, folder, count, seconds)
+                found = measure(url, path, folder, count, seconds, given_key())
             except subprocess.CalledProcessError as error:
                 raise Failure(f"{url} hung up on the robots: is it still there?") from error
             seen[str(count)] = one = summary(found)

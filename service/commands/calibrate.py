@@ -11,6 +11,7 @@ import typer
 
 from service.commands.client import AsJson, DataDir, Target, Url, ask, media_type, path_of, read_bytes
 from service.commands.console import Failure, number, output, remark, show, show_json, table
+from service.commands.jobs import submit
 
 SHOWN_POINTS = 9
 
@@ -70,7 +71,10 @@ def calibrate(
         order |= {"method": "map"} if itself else {"method": "sequence", "sequence": sequence}
         if pairs is not None:
             order["pairs"] = {place: shown or None for place, shown in _rows(pairs, ("place", "shows"))}
-        report = ask(target, "POST", path, json=order).json()
+        job = submit(target, path, order | {"background": True}, wait=True)  # it may take longer than a request may
+        if job["state"] != "succeeded":
+            raise Failure(job["problem"]["detail"] if job["problem"] else f"The job {job['id']} was cancelled.")
+        report = job["result"]
     show_json(report) if as_json else _show(report)
 
 

@@ -20,7 +20,8 @@ import httpx
 import typer
 
 from core.errors import DataDirectoryLocked
-from service.commands.console import Failure
+from service.commands.console import Failure, remark
+from service.commands.credentials import VARIABLE, given_key, headers_for, travels_openly
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -146,7 +147,9 @@ def refusal(response: httpx.Response) -> Refused:
     """The error that an unsuccessful answer stands for."""
     if response.headers.get("content-type", "").startswith(PROBLEM):
         problem = response.json()
-        return Refused(response.status_code, problem["type"].rpartition(":")[2], problem["detail"])
+        slug = problem["type"].rpartition(":")[2]
+        hint = f" Set {VARIABLE} to a key of this service." if slug == "key-needed" else ""
+        return Refused(response.status_code, slug, problem["detail"] + hint)
     return Refused(response.status_code, "", f"{response.url} answered {response.status_code}: is it placerec?")
 
 
@@ -200,7 +203,10 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
     if target.url is not None:
         if not target.url.startswith(("http://", "https://")):
             raise Failure(f"{target.url} is not a URL: it starts with http:// or https://.")
-        async with httpx.AsyncClient(base_url=target.url, timeout=timeout) as client:
+        key = given_key()
+        if key is not None and travels_openly(target.url):
+            remark(f"The key travels to {target.url} unencrypted: put TLS in front.")
+        async with httpx.AsyncClient(base_url=target.url, timeout=timeout, headers=headers_for(key)) as client:
             yield Service(client, target.url)
         return
     # Imported here because it takes a second: torch, FAISS and the service itself.
@@ -208,7 +214,7 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
 
     # Nobody else can reach it, so its address does not matter; what it would log is answered here.
     settings = read_settings(target.data_dir).model_copy(update={"host": "127.0.0.1", "log_level": "error"})
-    application = create_app(settings)
+    application = create_app(settings, as_owner=True)
     async with AsyncExitStack() as stack:
         try:
             await stack.enter_async_context(application.router.lifespan_context(application))

@@ -24,6 +24,8 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from core.errors import PlacerecError
+from service.commands.credentials import add_key
+from service.faults import Fault
 
 output = Console()
 """Results."""
@@ -39,10 +41,16 @@ class Failure(Exception):
 class Commands(TyperGroup):
     """A group of commands whose foreseen errors end in a sentence and exit status 1, not in a traceback."""
 
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        found = super().get_command(ctx, cmd_name)
+        if found is not None:
+            add_key(found)
+        return found
+
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except (Failure, PlacerecError) as error:
+        except (Failure, PlacerecError, Fault) as error:
             complain(str(error))
             raise typer.Exit(1) from error
 

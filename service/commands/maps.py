@@ -10,12 +10,21 @@ from service.commands.client import AsJson, DataDir, Target, Url, ask, open_serv
 from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
 from service.commands.places import places
 from service.commands.sequences import sequences
-from service.commands.upkeep import health, merge, prune, reencode
+from service.commands.transfers import export, import_
+from service.commands.upkeep import health, merge, prune, rebuild, reencode
 
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
 maps.add_typer(places, name="places")
 maps.add_typer(sequences, name="sequences")
-for name, command in (("health", health), ("re-encode", reencode), ("prune", prune), ("merge", merge)):
+for name, command in (
+    ("health", health),
+    ("re-encode", reencode),
+    ("prune", prune),
+    ("rebuild", rebuild),
+    ("merge", merge),
+    ("export", export),
+    ("import", import_),
+):
     maps.command(name)(command)
 
 MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import math
 import signal
 from pathlib import Path
@@ -16,10 +17,8 @@ from service.commands.console import Failure
 if TYPE_CHECKING:
     from service.settings import Settings
 
-KEEP_ALIVE_SECONDS = 75
-"""A robot that sends a frame now and then keeps its connection."""
-
-STOP_POLL_SECONDS = 0.1
+SPARE_FILES = 1024
+"""Files open besides the connections: those of the maps above all."""
 
 
 def serve(
@@ -40,9 +39,21 @@ def serve(
 
 
 def _serve(settings: Settings) -> None:
+    from service.serving.heap import settle_heap
+    from service.serving.native import logged_stderr
+
+    settle_heap()
+    with logged_stderr():
+        _serve_logged(settings)
+
+
+def _serve_logged(settings: Settings) -> None:
     import uvicorn
 
     from service.app import create_app
+    from service.serving.connections import Connections, patient
+    from service.serving.http import HttpConnection
+    from service.serving.streams import StreamConnection
     from service.settings import SettingsError
     from service.telemetry import configure_logging
 
@@ -51,6 +62,11 @@ def _serve(settings: Settings) -> None:
         application = create_app(settings)
     except SettingsError as error:
         raise Failure(str(error)) from error
+    connections = Connections(settings, application.state.upload_memory, application.state.metrics)
+    protocols: dict[str, Any] = {
+        "http": functools.partial(HttpConnection, connections=connections),
+        "ws": functools.partial(StreamConnection, connections=connections),
+    }
     config = uvicorn.Config(
         application,
         host=settings.host.strip("[]"),
@@ -58,36 +74,50 @@ def _serve(settings: Settings) -> None:
         log_config=None,
         access_log=False,
         server_header=False,
-        ws="websockets-sansio",
         ws_max_size=settings.max_image_bytes,
         ws_per_message_deflate=False,  # frames are compressed already
         lifespan="off",  # kept by _run, so that an error at the start ends in its sentence
-        timeout_keep_alive=KEEP_ALIVE_SECONDS,
+        timeout_keep_alive=math.ceil(settings.keep_alive_timeout),
         timeout_graceful_shutdown=math.ceil(settings.shutdown_timeout),
+        **protocols,
     )
     try:
         socket = config.bind_socket()
     except SystemExit as error:
         raise Failure(f"Port {settings.port} of {settings.host} cannot be had: is another service there?") from error
+    patient(socket, settings)
+    raise_file_limit(settings.max_connections)
     with asyncio.Runner(loop_factory=config.get_loop_factory()) as runner, socket:
-        runner.run(_run(application, uvicorn.Server(config), socket))
+        runner.run(_run(application, config, socket, settings, connections))
 
 
-async def _run(application: Any, server: Any, socket: Any) -> None:
+async def _run(application: Any, config: Any, socket: Any, settings: Settings, connections: Any) -> None:
+    from service.serving.server import DrainingServer
+
+    def drain() -> None:
+        application.state.engine.stopping = connections.draining = True
+
     async with application.router.lifespan_context(application):
         # The server stops at these signals, then sends them again to whoever handled them before:
         # without handlers of ours the process would end there, and not close its maps.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)
-        watch = asyncio.create_task(_stop_early(application.state.engine, server))
-        try:
-            await server.serve(sockets=[socket])
-        finally:
-            watch.cancel()
+        stop_jobs = application.state.engine.jobs.stop_soon
+        server = DrainingServer(config, settings.drain_seconds, drain, stop_jobs)
+        await server.serve(sockets=[socket])
 
 
-async def _stop_early(engine: Any, server: Any) -> None:
-    """Tell jobs, and those who follow them, when the server begins to stop: it waits for them, but not for ever."""
-    while not server.should_exit:
-        await asyncio.sleep(STOP_POLL_SECONDS)
-    engine.jobs.stop_soon()
+def raise_file_limit(connections: int) -> None:
+    """Ask the system for as many open files as the connections and the maps may need; warn if it refuses."""
+    import logging
+    import resource
+
+    wanted = connections + SPARE_FILES
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft != resource.RLIM_INFINITY and soft < most:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+        soft = most
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        log = logging.getLogger("placerec.server")
+        log.warning("the system allows %d open files; %d connections and the maps want %d", soft, connections, wanted)

@@ -70,6 +70,13 @@ def reencode(
     tell(submit(Target(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
 
 
+def rebuild(
+    map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
+) -> None:
+    """Make what a large map is searched by anew from its descriptors, while searches go on."""
+    tell(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+
+
 def prune(
     map_id: MapId,
     max_recall_loss: Annotated[float, typer.Option(min=0, max=1, help="What it may cost in recall.")] = 0.01,

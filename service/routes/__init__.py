@@ -16,6 +16,7 @@ from service.routes import (
     sessions,
     several,
     streams,
+    transfers,
     upkeep,
 )
 
@@ -34,6 +35,7 @@ ROUTERS = (
     explanations.router,
     frames.router,
     upkeep.router,
+    transfers.router,
     jobs.router,
     encoders.router,
 )

@@ -8,25 +8,22 @@ from fastapi import APIRouter, Depends, Request, Response
 from starlette.responses import JSONResponse
 
 from core import errors
-from core.encoder import Encoder, Encoding
-from core.storage import Map, Snapshot
+from core.encoder import Encoding
+from core.storage import Map
 from service.bodies import json_size, parse_json
-from service.calibration import Advance, Questions, calibrated, labelled, map_itself, second_traverse, warnings_on
+from service.calibrating import KIND, arguments_of, measured, store
 from service.dependencies import EngineDep, IfMatch, MapId, PatienceDep, expected_revision, single_values
 from service.engine import Engine, camera_mask, in_thread
 from service.faults import (
-    BodyTooLarge,
     DeadlineExceeded,
     EncoderNotInstalled,
     InvalidRequest,
     JobQueueFull,
-    MalformedBody,
     QueueFull,
     UnsupportedMediaType,
 )
 from service.inference import Patience
-from service.jobs import JobContext
-from service.localization import calibration_of
+from service.job_context import born
 from service.parameters import validated
 from service.problems import problem_documentation
 from service.routes.jobs import router as jobs
@@ -34,32 +31,23 @@ from service.schemas.calibration import CalibrationOrder, CalibrationReport
 from service.schemas.jobs import JobView
 from service.uploads import FORM, check_part, is_file, json_part, media_type, read_many
 
-KIND = "calibrate"
-
 router = APIRouter(
     prefix="/v1/maps/{map}",
     tags=["calibration"],
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
-        MalformedBody,
-        errors.UnknownMap,
         errors.UnknownPlace,
         errors.UnknownSequence,
         errors.UnknownCamera,
         errors.RevisionMismatch,
-        BodyTooLarge,
         UnsupportedMediaType,
-        InvalidRequest,
         errors.CalibrationImpossible,
         errors.InvalidImage,
         errors.NoRegions,
         QueueFull,
-        DeadlineExceeded,
         JobQueueFull,
         EncoderNotInstalled,
-        errors.MapQuarantined,
         errors.StorageFull,
-        errors.StorageFailure,
     ),
 )
 
@@ -108,60 +96,23 @@ async def calibrate_map(
     except errors.UnknownEncoder as error:
         raise EncoderNotInstalled(str(error)) from error
     request.state.noted = {"map": map_id, "method": order.method}
-    if not order.background:
-        return await in_thread(_calibrate, map_, encoder, order, encodings, expected)
+    if order.background:
+        arguments, maps = arguments_of(map_, order, expected), {map_id: born(map_)}
+        job = await in_thread(engine.jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
+        location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+        return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
 
-    def work(context: JobContext) -> dict[str, Any]:
-        def advance(done: int, total: int) -> None:
-            context.check_cancelled()
-            context.progress(done, total)
+    def advance(_done: int, _total: int) -> None:
+        if patience.left() <= 0:
+            raise DeadlineExceeded(
+                "The time was up before all was measured: ask in the background. Nothing was stored."
+            )
 
-        now = engine.atlas.get(map_id)
-        engine.assert_encoder(now, encoder.identity)  # one that was made anew meanwhile may have another
-        return _calibrate(now, encoder, order, [], expected, advance).model_dump(mode="json")
-
-    job = await in_thread(engine.jobs.submit, KIND, map_id, work, order.model_dump(mode="json"))
-    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
-
-
-def _calibrate(
-    map_: Map,
-    encoder: Encoder,
-    order: CalibrationOrder,
-    encodings: list[Encoding],
-    expected: int | None,
-    advance: Advance = lambda _done, _total: None,
-) -> CalibrationReport:
-    """Ask, measure and, unless it is a dry run, store."""
-    snapshot = map_.snapshot()
-    previous = calibration_of(map_, encoder)
-    questions = _questions(map_, snapshot, order, encodings)
-    source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = calibrated(map_, encoder, snapshot, questions, order.target, source, advance)
+    replaces = map_.record.calibration
+    report = await in_thread(measured, map_, encoder, order, encodings, advance)
     if not order.dry_run:
-        map_.edit({"calibration": found.calibration}, expected)
-    return CalibrationReport(
-        map=map_.record.id,
-        encoder=encoder.identity,
-        method=order.method,
-        target=order.target,
-        stored=not order.dry_run,
-        calibration=found.calibration,
-        previous=previous,
-        measurement=found.measurement,
-        warnings=warnings_on(found, order.method),
-    )
-
-
-def _questions(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: list[Encoding]) -> Questions:
-    if order.method == "frames":
-        assert order.labels is not None
-        return labelled(map_, snapshot, encodings, [label.place for label in order.labels])
-    if order.method == "sequence":
-        assert order.sequence is not None
-        return second_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
-    return map_itself(map_, snapshot, order.most)
+        await in_thread(store, map_, report.calibration, replaces, expected)
+    return report
 
 
 async def _order(request: Request) -> CalibrationOrder:
@@ -204,7 +155,7 @@ async def _labelled_frames(
     for label in wanted:
         check_part(files[label], engine.settings)
     masks = [await camera_mask(map_, label.camera) for label in order.labels]
-    with engine.inference.place_in_queue():
+    with engine.inference.place_in_queue(len(wanted)):
         outcomes = await engine.encode_all_for(map_, [files[name].data for name in wanted], patience, masks)
     encodings = []
     for name, outcome in zip(wanted, outcomes, strict=True):

@@ -11,7 +11,7 @@ from core import errors
 from core.places import Camera
 from service.bodies import StrictRoute
 from service.dependencies import EngineDep, MapId, json_body, single_values
-from service.faults import InvalidRequest, MalformedBody, UnsupportedMediaType
+from service.faults import UnsupportedMediaType
 from service.problems import problem_documentation
 from service.schemas.cameras import CameraDefinition, CameraList, CameraView
 
@@ -20,7 +20,6 @@ router = APIRouter(
     tags=["cameras"],
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(errors.UnknownMap, InvalidRequest, errors.StorageFailure, errors.MapQuarantined),
 )
 CameraName = Annotated[Camera, Path(alias="camera", description="As frames name it.", examples=["front"])]
 
@@ -30,7 +29,7 @@ CameraName = Annotated[Camera, Path(alias="camera", description="As frames name 
     dependencies=[Depends(json_body)],
     responses={
         201: {"model": CameraView, "description": "A new camera."},
-        **problem_documentation(MalformedBody, UnsupportedMediaType, errors.InvalidField, errors.StorageFull),
+        **problem_documentation(UnsupportedMediaType, errors.InvalidField, errors.StorageFull),
     },
 )
 def put_camera(

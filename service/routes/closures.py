@@ -15,11 +15,7 @@ from service.dependencies import EngineDep, MapId, PatienceDep, milliseconds_sin
 from service.engine import camera_mask, in_thread
 from service.enrolment import Candidate
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
     EncoderNotInstalled,
-    InvalidRequest,
-    MalformedBody,
     PlaceTaken,
     QueueFull,
     UnsupportedMediaType,
@@ -36,20 +32,13 @@ router = APIRouter(
     tags=["queries"],
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
-        MalformedBody,
-        errors.UnknownMap,
         errors.UnknownCamera,
         errors.WrongEncoder,
         PlaceTaken,
-        BodyTooLarge,
         UnsupportedMediaType,
-        InvalidRequest,
-        errors.InvalidIdentifier,
         errors.StorageFull,
         QueueFull,
-        DeadlineExceeded,
         EncoderNotInstalled,
-        errors.MapQuarantined,
     ),
 )
 

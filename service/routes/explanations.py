@@ -7,11 +7,11 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path
 from starlette.responses import Response
 
-from core import errors
 from service.dependencies import EngineDep, MapId, single_values
 from service.faults import UnknownExplanation
 from service.openapi import BINARY
 from service.problems import problem_documentation
+from service.upkeep import key_of
 
 router = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
 
@@ -21,7 +21,7 @@ router = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], depen
     response_class=Response,
     responses={
         200: {"description": "Both frames side by side.", "content": {"image/png": {"schema": BINARY}}},
-        **problem_documentation(errors.UnknownMap, UnknownExplanation, errors.MapQuarantined, errors.StorageFailure),
+        **problem_documentation(UnknownExplanation),
     },
 )
 def see_explanation(
@@ -33,7 +33,5 @@ def see_explanation(
 
     `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
     """
-    engine.atlas.find(map_id)
-    return Response(
-        engine.pictures.fetch(map_id, name), media_type="image/png", headers={"Cache-Control": "private, max-age=600"}
-    )
+    picture = engine.pictures.fetch(key_of(engine.atlas.find(map_id)), name)
+    return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

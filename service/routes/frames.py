@@ -12,12 +12,8 @@ from starlette.responses import JSONResponse, Response
 from core import errors
 from service.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
 from service.engine import in_thread
-from service.explanations import drawing, explained
+from service.explanations import as_drawn, drawing, explained
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
-    InvalidRequest,
-    MalformedBody,
     QueueFull,
     UnsupportedMediaType,
 )
@@ -35,15 +31,7 @@ router = APIRouter(
     tags=["frames"],
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
-        MalformedBody,
-        BodyTooLarge,
-        errors.TooManyPixels,
-        UnsupportedMediaType,
-        InvalidRequest,
-        errors.NotAnImage,
-        errors.UnknownEncoder,
-        QueueFull,
-        DeadlineExceeded,
+        errors.TooManyPixels, UnsupportedMediaType, errors.NotAnImage, errors.UnknownEncoder, QueueFull
     ),
 )
 JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
@@ -160,7 +148,7 @@ async def match(
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
     with engine.inference.place_in_queue():
-        a = await engine.inference.encode(identity, first, patience)
+        a = await in_thread(as_drawn, await engine.inference.encode(identity, first, patience))
         b = await engine.inference.encode(identity, second, patience)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")

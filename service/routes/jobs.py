@@ -5,20 +5,23 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Path, Query
+from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from pydantic import Field
 from starlette.responses import Response, StreamingResponse
 
 from core import errors
 from core.storage.cursors import Listing, decode_number, encode_cursor
-from service.dependencies import EngineDep, PageParameters, single_values
-from service.faults import JobEnded, TooManyWatchers, UnknownJob
+from service.dependencies import EngineDep, PageParameters, PrincipalDep, single_values
+from service.engine import Engine
+from service.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.job_records import Job, JobState
 from service.jobs import NOTICE_SECONDS, Jobs
+from service.principals import Principal
 from service.problems import problem_documentation
+from service.roles import FORGOTTEN, OPERATIONS, covers
 from service.schemas.jobs import JobPage, JobView
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
@@ -53,7 +56,7 @@ Wait = Annotated[
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-async def list_jobs(page: JobPageQuery, engine: EngineDep) -> JobPage:
+async def list_jobs(page: JobPageQuery, engine: EngineDep, principal: PrincipalDep) -> JobPage:
     """List jobs, the newest first; of those that have ended only the latest are kept."""
     listing: Listing = ["jobs", page.map, page.kind, page.state]
     after = decode_number(listing, page.cursor)
@@ -64,6 +67,7 @@ async def list_jobs(page: JobPageQuery, engine: EngineDep) -> JobPage:
         and page.map in (None, job.map_id)
         and page.kind in (None, job.kind)
         and page.state in (None, job.state)
+        and principal.may_use(*maps_of(job))
     ]
     shown = found[: page.limit]
     more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
@@ -71,9 +75,9 @@ async def list_jobs(page: JobPageQuery, engine: EngineDep) -> JobPage:
 
 
 @router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
-async def read_job(job_id: JobId, engine: EngineDep, wait: Wait = 0.0) -> JobView:
+async def read_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
     """Read how a job stands. With `wait` the answer comes when it has ended, or when that time is up."""
-    job = engine.jobs.get(job_id)
+    job = _job_for(engine, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
         with engine.jobs.watching(job_id) as changed:
@@ -90,22 +94,24 @@ async def read_job(job_id: JobId, engine: EngineDep, wait: Wait = 0.0) -> JobVie
         200: {
             "description": "Server-sent events. Each is named after the state of the job, which is its data; "
             "its id names that moment. The stream ends with the job.",
-            "content": {EVENT_STREAM: {"schema": {"type": "string"}}},
+            "content": {EVENT_STREAM: {}},
         },
         204: {"description": "The job has ended, and its end was received: there is nothing more to come."},
         **problem_documentation(UnknownJob, TooManyWatchers),
     },
 )
-async def follow_job(job_id: JobId, engine: EngineDep, last_event_id: LastEventId = None) -> Response:
+async def follow_job(
+    job_id: JobId, request: Request, engine: EngineDep, principal: PrincipalDep, last_event_id: LastEventId = None
+) -> Response:
     """Follow a job by server-sent events.
 
     Each event tells all there is to know of the job, so that one who comes late, or again with
     `Last-Event-ID`, misses nothing that still holds.
     """
-    job = engine.jobs.get(job_id)
+    job = _job_for(engine, principal, job_id)
     if job.ended and last_event_id == job.version:
         return Response(status_code=204)  # which tells a browser not to come again
-    stream = _events(engine.jobs, job_id, last_event_id)
+    stream = _events(engine.jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
     first = await anext(stream)  # a refusal comes as a problem, not within the stream
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(_after(first, stream), media_type=EVENT_STREAM, headers=headers)
@@ -114,13 +120,35 @@ async def follow_job(job_id: JobId, engine: EngineDep, last_event_id: LastEventI
 @router.post(
     "/{job}/cancel", responses=problem_documentation(UnknownJob, JobEnded, errors.StorageFull, errors.StorageFailure)
 )
-def cancel_job(job_id: JobId, engine: EngineDep) -> JobView:
+def cancel_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep) -> JobView:
     """Ask a job to stop.
 
     One that waits is cancelled at once; one that runs stops where it can and undoes what must not
-    stay half done. Cancelling twice is no error.
+    stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
     """
+    job = _job_for(engine, principal, job_id)
+    needed = OPERATIONS.get(str(job.asker.get("operation")), FORGOTTEN).role
+    if not covers(principal.role, needed):
+        raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this job needs {needed}.")
     return JobView.of(engine.jobs.cancel(job_id))
+
+
+def maps_of(job: Job) -> set[str | None]:
+    """The maps that a job has to do with; None for one that has to do with none in particular."""
+    named = {job.arguments.get(name) for name in ("from", "to")}
+    return {job.map_id, *job.maps, *(name for name in named if isinstance(name, str))}
+
+
+def _job_for(engine: Engine, principal: Principal, job_id: str) -> Job:
+    """A job, if all its maps are the caller's; for any other it is not there.
+
+    Raises:
+        UnknownJob.
+    """
+    job = engine.jobs.get(job_id)
+    if not principal.may_use(*maps_of(job)):
+        raise UnknownJob(f"There is no job {job_id[:80]!r}.")
+    return job
 
 
 async def _wait(changed: asyncio.Event, seconds: float) -> bool:
@@ -134,8 +162,8 @@ async def _wait(changed: asyncio.Event, seconds: float) -> bool:
     return True
 
 
-async def _events(jobs: Jobs, job_id: str, last: str | None) -> AsyncIterator[str]:
-    """The stream, from behind the event ``last`` to the end of the job, or of the service."""
+async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
+    """The stream, from behind the event ``last`` to the end of the job, of the service, or of the caller's key."""
     with jobs.watching(job_id) as changed:
         yield ": placerec\n\n"
         while True:
@@ -151,6 +179,10 @@ async def _events(jobs: Jobs, job_id: str, last: str | None) -> AsyncIterator[st
             if not await _wait(changed, HEARTBEAT_SECONDS):
                 yield ": still there\n\n"
             await asyncio.sleep(NOTICE_SECONDS)
+            try:
+                check_key()
+            except Fault:
+                return
 
 
 def _event(job: Job) -> str:

@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-from typing import Any
+from contextlib import suppress
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
+from starlette.responses import JSONResponse
 
 from core import errors
 from core.places import check_map_id
-from core.storage import Map, MapSettings, VerifyReport
+from core.storage import Map, MapRecord, MapSettings, VerifyReport
+from core.storage.cursors import Listing, decode_name, encode_cursor
 from core.verdict import Calibration
+from service import rebuilding
 from service.bodies import StrictRoute
 from service.dependencies import (
     EngineDep,
     IfMatch,
     MapId,
     Page,
+    PageParameters,
+    PrincipalDep,
     entity_tag,
     expected_revision,
     json_body,
     single_values,
 )
 from service.engine import Engine
-from service.faults import BodyTooLarge, MalformedBody, UnsupportedMediaType
+from service.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.openapi import json_patch
 from service.problems import problem_documentation
+from service.routes.jobs import router as jobs
+from service.schemas.jobs import JobView
 from service.schemas.maps import (
     CalibrationChanges,
     MapChanges,
@@ -41,6 +49,9 @@ router = APIRouter(
     dependencies=[Depends(single_values)],
     responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
 )
+ALL_MAPS = "(all)"
+"""What is possessed while a map is made, so that no two are counted as the last one: no map is called so."""
+
 BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
 
 
@@ -62,18 +73,29 @@ def show_map(engine: Engine, map_: Map) -> MapView:
     status_code=201,
     dependencies=[Depends(json_body)],
     responses=problem_documentation(
-        *BODY_PROBLEMS, errors.MapExists, errors.InvalidIdentifier, errors.UnknownEncoder, errors.StorageFull
+        *BODY_PROBLEMS,
+        errors.MapExists,
+        TooManyMaps,
+        errors.InvalidIdentifier,
+        errors.UnknownEncoder,
+        errors.StorageFull,
     ),
 )
-def create_map(new: NewMap, engine: EngineDep, response: Response) -> MapView:
+def create_map(
+    new: NewMap, request: Request, engine: EngineDep, principal: PrincipalDep, response: Response
+) -> MapView:
     """Create a map, bound for life to one encoder."""
     check_map_id(new.id)
+    request.state.noted = {"map": new.id}
+    principal.require(new.id)
     identity = engine.resolve(new.encoder)
     encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
-    map_ = engine.atlas.create(
-        new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
-    )
+    with engine.writing(ALL_MAPS):
+        engine.upkeep.check_room()
+        map_ = engine.atlas.create(
+            new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
+        )
     map_.open()
     response.headers["ETag"] = entity_tag(map_.record.revision)
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
@@ -81,17 +103,32 @@ def create_map(new: NewMap, engine: EngineDep, response: Response) -> MapView:
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-def list_maps(page: Page, engine: EngineDep) -> MapPage:
-    """List the maps in the order of their ids, and those that are damaged."""
-    records, next_cursor = engine.atlas.records(page.cursor, page.limit)
+def list_maps(page: Page, engine: EngineDep, principal: PrincipalDep) -> MapPage:
+    """List the maps in the order of their ids, and those that are damaged; of a key limited to maps, only those."""
+    if principal.maps is None:
+        records, next_cursor = engine.atlas.records(page.cursor, page.limit)
+    else:
+        records, next_cursor = _records_among(engine, principal.maps, page)
     items = []
     for record in records:
         try:
             items.append(show_map(engine, engine.atlas.find(record.id)))
         except (errors.UnknownMap, errors.MapQuarantined):
             continue  # deleted, or found to be damaged, since it was listed
-    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in engine.atlas.quarantined().items()]
+    damaged = engine.atlas.quarantined().items()
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return MapPage(items=items, next_cursor=next_cursor, quarantined=quarantined)
+
+
+def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters) -> tuple[list[MapRecord], str | None]:
+    """The page of a listing of these maps alone, and its cursor, which names no other map either."""
+    listing: Listing = ["maps-among", *sorted(map_ids)]
+    found = []
+    for map_id in sorted(map_ids):
+        with suppress(errors.UnknownMap, errors.MapQuarantined):
+            found += [engine.atlas.find(map_id).record] if map_id > decode_name(listing, page.cursor) else []
+    more = encode_cursor(listing, found[page.limit - 1].id) if len(found) > page.limit else None
+    return found[: page.limit], more
 
 
 @router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
@@ -160,7 +197,24 @@ def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> No
     engine.metrics.forget_map(map_id)
 
 
-@router.post("/{map}/verify", responses=problem_documentation(errors.UnknownMap))
-def verify_map(map_id: MapId, engine: EngineDep) -> VerifyReport:
+@router.post(
+    "/{map}/verify",
+    response_model=VerifyReport,
+    responses={
+        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        **problem_documentation(errors.UnknownMap, JobQueueFull, errors.StorageFull),
+    },
+)
+def verify_map(
+    map_id: MapId,
+    engine: EngineDep,
+    background: Annotated[
+        bool, Query(description="Answer 202 with a job, whose result is the report: a large map takes minutes.")
+    ] = False,
+) -> VerifyReport | Response:
     """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
-    return engine.atlas.verify(map_id)
+    if not background:
+        return engine.atlas.verify(map_id)
+    job = engine.jobs.submit(rebuilding.VERIFY, map_id, arguments={}, maps=rebuilding.incarnation(engine, map_id))
+    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
-from starlette.responses import Response
+from starlette.responses import JSONResponse, Response
 
 from core import errors
-from core.places import check_place_id
-from core.storage import Map
 from core.storage.patches import merge_patch
-from service.batches import item_problem
+from service import bulk_enrolment
+from service.batches import candidate_of, check_batch, given_id, item_problem
 from service.bodies import StrictRoute
 from service.dependencies import (
     EngineDep,
@@ -28,42 +27,37 @@ from service.dependencies import (
 from service.engine import Engine, camera_mask, in_thread
 from service.enrolment import Candidate, enrol
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
     EncoderNotInstalled,
     InvalidRequest,
-    MalformedBody,
+    JobQueueFull,
     QueueFull,
+    StagingFull,
+    TooManyPlaces,
     UnsupportedMediaType,
 )
-from service.multipart import Part
 from service.openapi import form_body, frame_body, json_patch
-from service.parameters import BatchItem, BatchParameters, EnrolParameters, check_metadata, validated
+from service.parameters import BatchParameters, EnrolParameters, check_metadata
 from service.problems import problem_documentation
+from service.routes.jobs import router as jobs
+from service.schemas.jobs import JobView
 from service.schemas.places import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
-from service.uploads import check_part, json_part, read_frame, read_many
+from service.uploads import json_part, read_frame, read_many
 
 router = APIRouter(
     prefix="/v1/maps/{map}/places",
     tags=["places"],
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(errors.UnknownMap, errors.StorageFailure, errors.MapQuarantined),
 )
-ENROLMENT_PROBLEMS = problem_documentation(
-    MalformedBody,
-    errors.UnknownMap,
+ENROLMENT_PROBLEMS = (
     errors.UnknownCamera,
     errors.WrongEncoder,
-    BodyTooLarge,
     UnsupportedMediaType,
-    InvalidRequest,
     errors.NoRegions,
     errors.StorageFull,
+    TooManyPlaces,
     QueueFull,
-    DeadlineExceeded,
     EncoderNotInstalled,
-    errors.MapQuarantined,
 )
 BATCH_BODY = form_body(
     "A JSON part `places` and the file parts that it names.",
@@ -81,7 +75,10 @@ BATCH_BODY = form_body(
 @router.put(
     "/{place}",
     openapi_extra=frame_body(EnrolParameters),
-    responses={201: {"model": EnrolledPlace, "description": "A new place."}, **ENROLMENT_PROBLEMS},
+    responses={
+        201: {"model": EnrolledPlace, "description": "A new place."},
+        **problem_documentation(*ENROLMENT_PROBLEMS),
+    },
 )
 async def enrol_place(
     map_id: MapId,
@@ -116,24 +113,39 @@ async def enrol_place(
     )
 
 
-@router.post("", response_model_exclude_unset=True, openapi_extra=BATCH_BODY, responses=ENROLMENT_PROBLEMS)
+@router.post(
+    "",
+    response_model=BatchResults,
+    response_model_exclude_unset=True,
+    openapi_extra=BATCH_BODY,
+    responses={
+        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        **problem_documentation(*ENROLMENT_PROBLEMS, JobQueueFull, StagingFull),
+    },
+)
 async def enrol_places(
     map_id: MapId,
     options: Annotated[BatchParameters, Query()],
     request: Request,
     engine: EngineDep,
     patience: PatienceDep,
-) -> BatchResults:
+) -> BatchResults | Response:
     """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
+
+    With `background` the request may be as long as a traverse: it is written to disk as it arrives, and answered with
+    `202` and a job once it is there whole. The job stores frames a few at a time, goes on after a restart of the
+    service, and tells what became of them in its result.
 
     To go on with a traverse that was broken off, name what the places should hold by `sha256` first: only the frames
     answered with `frame-needed` have to be sent.
     """
+    if options.background:
+        return await _enrol_later(map_id, options, request, engine)
     engine.inference.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)
-    _check_batch(entries, files, engine)
+    check_batch(entries, [part.name for part in files], engine.settings.max_batch_items)
     await in_thread(map_.cameras.all)  # from disk, if they are not in memory yet
     engine.metrics.batches.labels("enrol").observe(len(entries))
 
@@ -141,14 +153,14 @@ async def enrol_places(
 
     def reject(position: int, error: Exception) -> None:
         problem = item_problem(request, error)
-        results[position] = BatchResult(id=_given_id(entries[position]), status=problem.status, problem=problem)
+        results[position] = BatchResult(id=given_id(entries[position]), status=problem.status, problem=problem)
 
     ids: set[str] = set()
     candidates: dict[int, Candidate] = {}
     by_name = {part.name: part for part in files}
     for position, entry in enumerate(entries):
         try:
-            candidate = _candidate(entry, by_name, map_, engine)
+            candidate = candidate_of(entry, by_name, by_name.__getitem__, map_, engine.settings)
             if candidate.id in ids:
                 raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
             ids.add(candidate.id)
@@ -170,40 +182,13 @@ async def enrol_places(
     return BatchResults(items=[result for result in results if result is not None], encoder=map_.record.encoder)
 
 
-def _check_batch(entries: Any, files: list[Part], engine: Engine) -> None:
-    """Raise InvalidRequest unless the form as a whole makes sense."""
-    if not isinstance(entries, list) or not entries:
-        raise InvalidRequest("The part 'places' is not a JSON array with at least one place.")
-    if len(entries) > engine.settings.max_batch_items:
-        raise InvalidRequest(f"The batch has {len(entries)} places; the limit is {engine.settings.max_batch_items}.")
-    names = [part.name for part in files]
-    if len(set(names)) != len(names):
-        raise InvalidRequest("Two file parts have the same name.")
-    wanted = {entry.get("file") for entry in entries if isinstance(entry, dict) and isinstance(entry.get("file"), str)}
-    spare = sorted(set(names) - wanted)
-    if spare:
-        raise InvalidRequest(f"No place of the batch names the file part {spare[0][:80]!r}.")
-
-
-def _candidate(entry: Any, files: dict[str, Part], map_: Map, engine: Engine) -> Candidate:
-    item = validated(BatchItem, entry)
-    check_place_id(item.id)
-    fields = item.fields(item.metadata, engine.settings)
-    if item.file is None:
-        return Candidate(
-            item.id, fields, None, map_.cameras.mask(fields.camera), sha256=bytes.fromhex(str(item.sha256))
-        )
-    if item.file not in files:
-        raise InvalidRequest(f"file: the form has no part named {item.file[:80]!r}.")
-    part = files[item.file]
-    check_part(part, engine.settings)
-    return Candidate(item.id, fields, part.data, map_.cameras.mask(fields.camera))
-
-
-def _given_id(entry: Any) -> str | None:
-    given = entry.get("id") if isinstance(entry, dict) else None
-    # Half a character can stand in JSON's escapes, but not in the answer.
-    return given[:200].encode("utf-8", "replace").decode() if isinstance(given, str) else None
+async def _enrol_later(map_id: str, options: BatchParameters, request: Request, engine: Engine) -> Response:
+    map_ = await engine.map(map_id)
+    engine.assert_encoder(map_, options.encoder)
+    job = await bulk_enrolment.receive(engine, map_, request)
+    request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
+    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
@@ -223,9 +208,7 @@ def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView
     "/{place}",
     dependencies=[Depends(json_body)],
     openapi_extra=json_patch(PlaceChanges),
-    responses=problem_documentation(
-        MalformedBody, UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull
-    ),
+    responses=problem_documentation(UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull),
 )
 def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
     """Edit what is known of a place by a merge patch: `null` clears, what is left out stays."""

@@ -10,14 +10,11 @@ from core import errors
 from service.answers import answer_queries
 from service.batches import item_problem
 from service.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
-from service.engine import camera_mask
-from service.explanations import explained_match
+from service.engine import camera_mask, in_thread
+from service.explanations import as_drawn, explained_match
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
     EncoderNotInstalled,
     InvalidRequest,
-    MalformedBody,
     QueueFull,
     UnsupportedMediaType,
 )
@@ -35,17 +32,7 @@ router = APIRouter(
     route_class=QuickRoute,
     dependencies=[Depends(single_values)],
     responses=problem_documentation(
-        MalformedBody,
-        errors.UnknownMap,
-        errors.UnknownCamera,
-        errors.WrongEncoder,
-        BodyTooLarge,
-        UnsupportedMediaType,
-        InvalidRequest,
-        QueueFull,
-        DeadlineExceeded,
-        EncoderNotInstalled,
-        errors.MapQuarantined,
+        errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
     ),
 )
 QueryOptions = Annotated[QueryParameters, Query()]
@@ -75,6 +62,7 @@ async def query(
         encoded = await engine.encode_for(map_, frame.data, patience, mask)
     (answer,) = await answer_queries(engine, map_, [encoded], options.k, selection)
     if options.explain and answer.matches:
+        encoded = await in_thread(as_drawn, encoded)
         answer.explanation = await explained_match(engine, map_, encoded, answer.matches[0].place.id, patience)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
@@ -104,7 +92,7 @@ async def query_batch(
     engine.metrics.batches.labels("query").observe(len(files))
     items = [BatchAnswer(file=part.name, status=200) for part in files]
     encoded: dict[int, Encoded] = {}
-    with engine.inference.place_in_queue():
+    with engine.inference.place_in_queue(len(files)):
         outcomes = await engine.encode_all_for(map_, [part.data for part in files], patience, [mask] * len(files))
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:

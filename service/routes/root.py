@@ -11,7 +11,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import HTMLResponse, JSONResponse, Response
 
 from service import openapi
-from service.dependencies import EngineDep
+from service.dependencies import EngineDep, PrincipalDep
 from service.documentation import SECURITY_POLICY, page
 from service.engine import in_thread
 from service.faults import NotReady
@@ -29,13 +29,14 @@ async def check_liveness() -> Health:
 
 
 @router.get("/readyz", responses=problem_documentation(NotReady))
-async def check_readiness(engine: EngineDep) -> Readiness:
+async def check_readiness(engine: EngineDep, principal: PrincipalDep) -> Readiness:
     """Whether frames can be served: encoder loaded and true to its golden values, maps open, disk writable.
 
-    A damaged map does not make the service unready; it is named here.
+    A damaged map does not make the service unready; it is named here to whoever may use it.
     """
     checks = await engine.check_readiness()
-    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in engine.atlas.quarantined().items()]
+    damaged = engine.atlas.quarantined().items()
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return Readiness(checks=checks, encoder=engine.settings.encoder, quarantined=quarantined)
 
 

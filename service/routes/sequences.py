@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Request
 
 from core import errors
 from service.dependencies import EngineDep, MapId, Page, SequenceName, single_values
@@ -13,7 +13,6 @@ router = APIRouter(
     prefix="/v1/maps/{map}/sequences",
     tags=["sequences"],
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(errors.UnknownMap, errors.StorageFailure, errors.MapQuarantined),
 )
 
 
@@ -25,7 +24,8 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
 
 
 @router.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
-def delete_sequence(map_id: MapId, sequence: SequenceName, engine: EngineDep) -> ForgottenSequence:
+def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
     """Forget all places of a traverse at once."""
     count = engine.atlas.get(map_id).forget_sequence(sequence)
+    request.state.noted = {"places": count}
     return ForgottenSequence(name=sequence, places=count)

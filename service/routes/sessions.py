@@ -22,12 +22,8 @@ from service.dependencies import (
 )
 from service.engine import in_thread
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
     EncoderNotInstalled,
     FrameOutOfOrder,
-    InvalidRequest,
-    MalformedBody,
     QueueFull,
     SessionExpired,
     TooManySessions,
@@ -46,7 +42,6 @@ router = APIRouter(
     tags=["sessions"],
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(errors.UnknownMap, errors.StorageFailure, errors.MapQuarantined),
 )
 SessionId = Annotated[str, Path(alias="session", description="Id of the session.", examples=["s-4f2a9c01d37be586"])]
 FrameOptions = Annotated[FrameParameters, Query()]
@@ -58,14 +53,7 @@ GONE = problem_documentation(UnknownSession, SessionExpired)
     status_code=201,
     dependencies=[Depends(json_body)],
     responses=problem_documentation(
-        MalformedBody,
-        BodyTooLarge,
-        UnsupportedMediaType,
-        InvalidRequest,
-        errors.UnknownSequence,
-        errors.UnknownCamera,
-        TooManySessions,
-        errors.StorageFull,
+        UnsupportedMediaType, errors.UnknownSequence, errors.UnknownCamera, TooManySessions, errors.StorageFull
     ),
 )
 def create_session(map_id: MapId, new: NewSession, engine: EngineDep, response: Response) -> SessionView:
@@ -114,22 +102,16 @@ async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep
     openapi_extra=frame_body(FrameParameters),
     responses=GONE
     | problem_documentation(
-        MalformedBody,
-        errors.UnknownMap,
         errors.UnknownCamera,
         UnknownSession,
         errors.WrongEncoder,
         FrameOutOfOrder,
-        BodyTooLarge,
         errors.TooManyPixels,
         UnsupportedMediaType,
-        InvalidRequest,
         errors.NotAnImage,
         errors.TruncatedImage,
         QueueFull,
-        DeadlineExceeded,
         EncoderNotInstalled,
-        errors.MapQuarantined,
     ),
 )
 async def send_frame(

@@ -10,15 +10,20 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.probability import sigmoid
-from service.answers import answer_of, estimated_pose
+from service.answers import answer_of, blank_answer, estimated_pose
 from service.batches import item_problem
-from service.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.dependencies import (
+    EngineDep,
+    PatienceDep,
+    PrincipalDep,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
 from service.engine import Engine, in_thread
 from service.faults import (
-    BodyTooLarge,
-    DeadlineExceeded,
     InvalidRequest,
-    MalformedBody,
     QueueFull,
     UnsupportedMediaType,
 )
@@ -35,16 +40,7 @@ router = APIRouter(
     prefix="/v1",
     tags=["queries"],
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(
-        MalformedBody,
-        BodyTooLarge,
-        UnsupportedMediaType,
-        InvalidRequest,
-        errors.InvalidIdentifier,
-        errors.InvalidImage,
-        QueueFull,
-        DeadlineExceeded,
-    ),
+    responses=problem_documentation(UnsupportedMediaType, errors.InvalidIdentifier, errors.InvalidImage, QueueFull),
 )
 
 MOST_FRAMES = 16
@@ -53,7 +49,11 @@ MOST_FRAMES = 16
 
 @router.post("/query", openapi_extra=frames_body(SeveralParameters))
 async def query_maps(
-    options: Annotated[SeveralParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[SeveralParameters, Query()],
+    request: Request,
+    engine: EngineDep,
+    principal: PrincipalDep,
+    patience: PatienceDep,
 ) -> SeveralAnswer:
     """Locate one moment's frames in several maps, ranked together by calibrated probability.
 
@@ -68,13 +68,17 @@ async def query_maps(
     selection = options.selection()
     map_ids = options.map_ids()
     if map_ids is None:
-        map_ids = await in_thread(_all_maps, engine)
+        map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
+    principal.require(*map_ids)
     with engine.inference.place_in_queue():
         reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
     answers = [_map_answer(request, engine, report) for report in reports]
+    for report in reports:
+        if report is recognized or len(reports) == 1:
+            _count_for_health(engine, report)
     matches = _matches(reports, options.k)
     place = pose = None
     if recognized is not None and recognized.located is not None:
@@ -173,6 +177,16 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
         reason=answer.reason,
         encoder=encoder,
     )
+
+
+def _count_for_health(engine: Engine, report: MapReport) -> None:
+    """Count an answer for the health of its map: of several only the one that has the place, for a frame of elsewhere
+    says nothing of the others."""
+    seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
+    if report.map_ is None or report.error is not None or seen is None:
+        return
+    answer = blank_answer(report.map_, seen) if report.located is None else answer_of(seen, report.located)
+    engine.upkeep.observe(report.map_id, answer)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

@@ -25,7 +25,11 @@ from service.engine import Engine, in_thread
 from service.faults import (
     BodyTooLarge,
     Fault,
+    ForeignPage,
     InvalidRequest,
+    KeyNeeded,
+    KeyRefused,
+    KeysUnreadable,
     MalformedBody,
     SessionExpired,
     StreamTaken,
@@ -37,7 +41,6 @@ from service.problems import Problem, problem_of, problem_response
 from service.schemas.sessions import FrameParameters
 from service.session_frames import take_in
 from service.sessions import Session
-from service.telemetry import request_id
 from service.uploads import check_frame
 
 router = APIRouter()
@@ -48,7 +51,6 @@ POLICY_VIOLATION = 1008
 @router.websocket("/v1/maps/{map}/sessions/{session}/stream")
 async def stream_frames(socket: WebSocket) -> None:
     """Take in the frames of a run as they come, until the robot closes the connection or the session ends."""
-    socket.scope.setdefault("state", {})["request_id"] = request_id(socket.scope["headers"])
     engine: Engine = socket.app.state.engine
     try:
         map_id, session_id = check_map_id(socket.path_params["map"]), socket.path_params["session"]
@@ -72,7 +74,12 @@ async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocke
     told: dict[str, Any] | None = None
     refused = False
     while True:
-        message = await socket.receive()
+        try:
+            async with asyncio.timeout(session.expires_after):
+                message = await socket.receive()
+        except TimeoutError:
+            await socket.close(POLICY_VIOLATION, "No frame came for too long.")
+            return
         if message["type"] != "websocket.receive":
             return
         try:
@@ -86,11 +93,15 @@ async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocke
             if refused:
                 refused = False
                 continue
+            await socket.app.state.gate.turn(socket.scope)
             answer = await _answer(engine, map_id, session, message["bytes"], given or {})
         except (Fault, PlacerecError) as error:
             await _tell(socket, error)
             if isinstance(error, UnknownSession | SessionExpired):
                 await socket.close(POLICY_VIOLATION, "The session is over.")
+                return
+            if isinstance(error, KeyNeeded | KeyRefused | KeysUnreadable | ForeignPage):
+                await socket.close(POLICY_VIOLATION, "The key is not valid any more.")
                 return
             continue
         if socket.application_state is WebSocketState.CONNECTED:

@@ -9,21 +9,22 @@ from pydantic import Field
 
 from core import errors
 from core.places import check_map_id
-from service import merging, pruning, reencoding
+from core.storage import Map
+from service import merging, pruning, rebuilding, reencoding
 from service.bodies import StrictRoute
-from service.dependencies import EngineDep, MapId, json_body, single_values
+from service.dependencies import EngineDep, MapId, PrincipalDep, json_body, single_values
 from service.engine import Engine, in_thread
 from service.faults import (
-    BodyTooLarge,
     EncoderNotInstalled,
     ImagesMissing,
     InvalidRequest,
     JobQueueFull,
-    MalformedBody,
     MergeConflict,
+    TooManyMaps,
     UnsupportedMediaType,
 )
 from service.health import examine_health
+from service.job_context import born
 from service.parameters import Parameters
 from service.problems import problem_documentation
 from service.routes.jobs import router as jobs
@@ -36,9 +37,8 @@ router = APIRouter(
     tags=["upkeep"],
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
-    responses=problem_documentation(errors.UnknownMap, errors.StorageFailure, errors.MapQuarantined),
 )
-ASKING_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType, JobQueueFull, errors.StorageFull)
+ASKING_PROBLEMS = (UnsupportedMediaType, JobQueueFull, errors.StorageFull)
 
 
 class HealthParameters(Parameters):
@@ -54,8 +54,16 @@ class HealthParameters(Parameters):
     limit: int = Field(default=20, ge=1, le=1000, description="Most places, gaps and stretches that are named each.")
 
 
-def _submit(engine: Engine, response: Response, kind: str, map_id: str, arguments: dict[str, Any]) -> JobView:
-    job = engine.jobs.submit(kind, map_id, arguments=arguments)
+def submit(
+    engine: Engine, response: Response, kind: str, arguments: dict[str, Any], map_: Map, *others: Map
+) -> JobView:
+    """Ask for a job of a registered kind, on this map and none that comes under its id later.
+
+    Raises:
+        JobQueueFull, StorageFull, StorageFailure.
+    """
+    maps = {one.record.id: born(one) for one in (map_, *others)}
+    job = engine.jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
     response.headers["Location"] = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
     return JobView.of(job)
 
@@ -65,21 +73,35 @@ def _submit(engine: Engine, response: Response, kind: str, map_id: str, argument
     status_code=202,
     dependencies=[Depends(json_body)],
     responses=problem_documentation(
-        *ASKING_PROBLEMS, errors.MapExists, errors.InvalidIdentifier, errors.UnknownEncoder, ImagesMissing
+        *ASKING_PROBLEMS, errors.MapExists, TooManyMaps, errors.UnknownEncoder, ImagesMissing
     ),
 )
-def reencode_map(map_id: MapId, wanted: Reencoding, engine: EngineDep, response: Response) -> JobView:
+def reencode_map(
+    map_id: MapId, wanted: Reencoding, engine: EngineDep, principal: PrincipalDep, response: Response
+) -> JobView:
     """Make a map anew, under another id, for another encoder or for the masks as they are now.
 
     It has to keep the images of all its places. The old map serves meanwhile; what is changed in it
     is caught up with. The new one is listed when it is whole, never before.
     """
     check_map_id(wanted.to)
+    principal.require(wanted.to)
     map_ = engine.atlas.get(map_id)
     identity = engine.resolve(wanted.encoder)
     reencoding.check_images(map_)
     engine.upkeep.check_free(wanted.to)
-    return _submit(engine, response, reencoding.KIND, map_id, {"to": wanted.to, "encoder": identity})
+    return submit(engine, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
+
+
+@router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
+def rebuild_map(map_id: MapId, engine: EngineDep, response: Response) -> JobView:
+    """Make what a map is searched by, codes and lists, anew from its checksummed descriptors.
+
+    Searches go on in what is there until the new ones are put in their place, from one moment to the next. For a
+    map whose places are not what they were when its codes were learnt, or whose caches somebody put back from a
+    backup. A map that is searched exactly has nothing to be made.
+    """
+    return submit(engine, response, rebuilding.REBUILD, {}, engine.atlas.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))
@@ -104,7 +126,7 @@ async def check_health(map_id: MapId, options: Annotated[HealthParameters, Query
     "/prune",
     status_code=202,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*ASKING_PROBLEMS, errors.UnknownSequence, InvalidRequest),
+    responses=problem_documentation(*ASKING_PROBLEMS, errors.UnknownSequence),
 )
 def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, response: Response) -> JobView:
     """Forget places that their neighbours stand in for; at first only report what that would cost in recall.
@@ -112,22 +134,25 @@ def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, response: Respo
     A place goes only if a place that stays is the same place by the map's settings and looks alike. With
     `"dry_run": false` they go, all in one commit, for good.
     """
-    there = engine.atlas.get(map_id).transfer.sequence_ends()
+    map_ = engine.atlas.get(map_id)
+    there = map_.transfer.sequence_ends()
     for name in (wanted.sequence, wanted.queries):
         if name is not None and name not in there:
             raise errors.UnknownSequence(f"The map has no sequence {name!r}.")
     if wanted.queries is not None and wanted.queries == wanted.sequence:
         raise InvalidRequest("queries: the frames that are asked for are not pruned; name another sequence.")
-    return _submit(engine, response, pruning.KIND, map_id, wanted.model_dump())
+    return submit(engine, response, pruning.KIND, wanted.model_dump(), map_)
 
 
 @router.post(
     "/merge",
     status_code=202,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*ASKING_PROBLEMS, errors.WrongEncoder, MergeConflict, InvalidRequest),
+    responses=problem_documentation(*ASKING_PROBLEMS, errors.WrongEncoder, MergeConflict),
 )
-def merge_map(map_id: MapId, wanted: Merging, engine: EngineDep, response: Response) -> JobView:
+def merge_map(
+    map_id: MapId, wanted: Merging, engine: EngineDep, principal: PrincipalDep, response: Response
+) -> JobView:
     """Take the places of another map of the same encoder into this one; at first only report.
 
     The report says what would come, what stands against it, and how many of the other map's places this one
@@ -136,6 +161,7 @@ def merge_map(map_id: MapId, wanted: Merging, engine: EngineDep, response: Respo
     """
     if wanted.source == map_id:
         raise InvalidRequest("from: a map cannot be merged with itself.")
+    principal.require(wanted.source)
     map_, other = engine.atlas.get(map_id), engine.atlas.get(wanted.source)
     merging.check_encoders(map_, other)
     arguments = wanted.model_dump(by_alias=True) | {"prefix": wanted.prefix or f"{wanted.source}-"}
@@ -143,4 +169,4 @@ def merge_map(map_id: MapId, wanted: Merging, engine: EngineDep, response: Respo
         plan = merging.planned(map_, other, arguments, map_.transfer.outline())
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
-    return _submit(engine, response, merging.KIND, map_id, arguments)
+    return submit(engine, response, merging.KIND, arguments, map_, other)

@@ -42,8 +42,10 @@ class CalibrationOrder(BaseModel):
         "others. `map`: the map's own frames, each asked of its neighbours; better than nothing."
     )
     target: Target = Field(default=Target(rule="precision", value=0.95), description="What the threshold is to reach.")
-    dry_run: bool = Field(default=False, description="Measure and tell, store nothing.")
-    background: bool = Field(default=False, description="Answer 202 with a job, whose result is the report.")
+    dry_run: bool = Field(strict=True, default=False, description="Measure and tell, store nothing.")
+    background: bool = Field(
+        strict=True, default=False, description="Answer 202 with a job, whose result is the report."
+    )
     sequence: str | None = Field(default=None, max_length=128, description="The traverse that is asked.")
     pairs: dict[str, str | None] | None = Field(
         default=None,
@@ -52,7 +54,7 @@ class CalibrationOrder(BaseModel):
         description="Of places of the sequence to the places among the others that show the same, null for one that "
         "they lack; only these are asked. Left out: the poses tell.",
     )
-    most: int = Field(default=300, ge=20, le=MOST_FRAMES, description="Frames to ask, spread evenly.")
+    most: int = Field(strict=True, default=300, ge=20, le=MOST_FRAMES, description="Frames to ask, spread evenly.")
     labels: list[Label] | None = Field(
         default=None, min_length=1, max_length=MOST_FRAMES, description="One for each frame of the form."
     )

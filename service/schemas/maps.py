@@ -111,8 +111,8 @@ class CalibrationChanges(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    threshold: float | None = Field(default=None, allow_inf_nan=False)
-    margin: float | None = Field(default=None, ge=0, allow_inf_nan=False)
+    threshold: float | None = Field(strict=True, default=None, allow_inf_nan=False)
+    margin: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
 
 
 class MapChanges(BaseModel):
@@ -125,8 +125,8 @@ class MapChanges(BaseModel):
 
     description: str | None = Field(default=None, max_length=2000)
     keep: Keep | None = None
-    same_place_radius: float | None = Field(default=None, ge=0, allow_inf_nan=False)
-    same_place_frames: int | None = Field(default=None, ge=0, le=2**31)
+    same_place_radius: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
+    same_place_frames: int | None = Field(strict=True, default=None, ge=0, le=2**31)
     index: TierSetting | None = Field(
         default=None,
         description=f"auto, exact, compact (auto from {COMPACT_FROM} places on) or inverted (from {INVERTED_FROM}).",

@@ -52,14 +52,18 @@ class NewSession(BaseModel):
         "frames, as SeqSLAM searches for; it knows neither odometry nor a speed limit.",
     )
     advance: float = Field(
+        strict=True,
         default=1.0,
         ge=0,
         le=100,
         description="Frames of the map's traverse that usually go by from one frame to the next, where neither "
         "odometry nor a speed limit tells more.",
     )
-    backwards: bool = Field(default=False, description="The robot may go against the traverse as readily as with it.")
+    backwards: bool = Field(
+        strict=True, default=False, description="The robot may go against the traverse as readily as with it."
+    )
     speed_limit: float | None = Field(
+        strict=True,
         default=None,
         gt=0,
         le=1000,
@@ -70,11 +74,16 @@ class NewSession(BaseModel):
         default=None, min_length=1, max_length=100, description="Only the places of these traverses."
     )
     lag: int = Field(
-        default=0, ge=0, le=20, description="Tell once more where the robot was so many frames ago, given all since."
+        strict=True,
+        default=0,
+        ge=0,
+        le=20,
+        description="Tell once more where the robot was so many frames ago, given all since.",
     )
-    path_frames: int = Field(default=10, ge=2, le=50, description="Frames of a path; for the filter path.")
+    path_frames: int = Field(strict=True, default=10, ge=2, le=50, description="Frames of a path; for the filter path.")
     camera: CameraName = None
     expires_after: float | None = Field(
+        strict=True,
         default=None,
         gt=0,
         allow_inf_nan=False,

@@ -11,7 +11,7 @@ from core.places import Sequence, Timestamp
 from core.upkeep.attention import Reason
 from core.upkeep.coverage import Measure
 
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 
 
 class Reencoding(BaseModel):
@@ -32,9 +32,10 @@ class Pruning(BaseModel):
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"max_recall_loss": 0.01}]})
 
-    dry_run: bool = Field(default=True, description="Only report what would go, and what it would cost.")
+    dry_run: bool = Field(strict=True, default=True, description="Only report what would go, and what it would cost.")
     max_recall_loss: Share = Field(default=0.01, description="What it may cost: share of the queries asked.")
     similarity: float | None = Field(
+        strict=True,
         default=None,
         allow_inf_nan=False,
         description="How alike two frames of one place must look (score by the first stage) for one to stand in for "
@@ -46,7 +47,7 @@ class Pruning(BaseModel):
         description="Measure the cost with the frames of this traverse, which is then neither searched nor pruned. "
         "Left out, each frame is asked for without itself, which flatters: its neighbours were taken with it.",
     )
-    sample: int = Field(default=500, ge=10, le=10_000, description="Most frames to ask.")
+    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="Most frames to ask.")
 
 
 class Merging(BaseModel):
@@ -55,7 +56,9 @@ class Merging(BaseModel):
     model_config = ConfigDict(extra="forbid", populate_by_name=True, json_schema_extra={"examples": [{"from": "hall"}]})
 
     source: str = Field(alias="from", max_length=256, description="Id of the other map; it stays as it is.")
-    dry_run: bool = Field(default=True, description="Only report what would come, and how far the maps overlap.")
+    dry_run: bool = Field(
+        strict=True, default=True, description="Only report what would come, and how far the maps overlap."
+    )
     on_conflict: Literal["refuse", "rename", "skip"] = Field(
         default="refuse",
         description="Where an id means another frame here, both maps have a sequence of one name, or a camera has "
@@ -67,7 +70,9 @@ class Merging(BaseModel):
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._~-]{0,63}$",
         description="Put before names on conflict; the other map's id and a hyphen if left out.",
     )
-    sample: int = Field(default=200, ge=0, le=10_000, description="Most places by which the overlap is measured.")
+    sample: int = Field(
+        strict=True, default=200, ge=0, le=10_000, description="Most places by which the overlap is measured."
+    )
 
 
 class WeekView(BaseModel):

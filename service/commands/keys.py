@@ -1,0 +1,131 @@
+"""``placerec keys``: who is let in.  Works on the data directory, beside a service that runs or without one."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, time, timedelta
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from service.commands.client import AsJson, DataDir, read_settings
+from service.commands.console import Commands, Failure, remark, show, show_json, table
+
+if TYPE_CHECKING:
+    from service.keys import Key, KeyStore
+
+keys = typer.Typer(cls=Commands, help="Create, list and revoke the keys of a data directory.", no_args_is_help=True)
+
+UNITS = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
+SPAN = re.compile(r"([0-9]{1,6})([mhdw])")
+
+
+@keys.command("create")
+def create(
+    name: Annotated[str, typer.Argument(help="Whose it is; it stands in logs.", show_default=False)],
+    role: Annotated[
+        Literal["query", "enrol", "admin"],
+        typer.Option(help="What it may do: enrol may also query, admin everything.", show_default=False),
+    ],
+    maps: Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this map; several times.")] = None,
+    expires: Annotated[str | None, typer.Option(help="After 30m, 12h, 30d or 8w, or at a date (UTC).")] = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Create a key and write it to standard output: it is shown this once, and kept nowhere.
+
+    The first key of a data directory makes keys necessary for every request, within a second also in a service that
+    runs already. It stays so when all keys are revoked or have expired.
+    """
+    store = _store(data_dir)
+    is_first = not store.exists()
+    key, token = store.create(name, role, maps or None, None if expires is None else moment(expires))
+    if as_json:
+        show_json(_view(key) | {"key": token})
+    else:
+        typer.echo(token)
+    if is_first:
+        remark("From now on every request needs a key.")
+    remark(f"The key {key.name} ({key.id}, {_described(key)}) is shown this once: keep it now.")
+
+
+@keys.command("list")
+def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
+    """List every key that was ever created, without its secret; the last use may be a minute behind."""
+    found = _store(data_dir).all()
+    if as_json:
+        show_json([_view(key) for key in found])
+        return
+    shown = table("id", "name", "role", "maps", "state", "created", "expires", "last used")
+    for key in found:
+        maps = "all" if key.maps is None else ",".join(sorted(key.maps))
+        moments = (_shown(moment) for moment in (key.created_at, key.expires_at, key.last_used_at))
+        shown.add_row(key.id, key.name, key.role, maps, state_of(key), *moments)
+    show(shown)
+    if not found:
+        remark("No key was ever created: the service asks nobody for one.")
+
+
+@keys.command("revoke")
+def revoke(
+    wanted: Annotated[str, typer.Argument(metavar="ID|NAME", help="Of the key.", show_default=False)],
+    data_dir: DataDir = None,
+) -> None:
+    """Let nobody in with a key any more; a running service knows within a second."""
+    store = _store(data_dir)
+    revoked = store.revoke(wanted)
+    remark(f"The key {revoked.name} ({revoked.id}) is revoked.")
+    if not any(state_of(other) == "in force" for other in store.all()):
+        remark("No key is in force: the service refuses every request that is not open to all.")
+
+
+def moment(text: str) -> datetime:
+    """The moment that a span from now, a date or a date and time names; UTC unless it says otherwise.
+
+    Raises:
+        Failure: it is none of them.
+    """
+    span = SPAN.fullmatch(text)
+    if span is not None:
+        return datetime.now(UTC) + timedelta(**{UNITS[span[2]]: int(span[1])})
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise Failure(f"{text!r} is no span such as 30d and no date such as 2027-01-31.") from error
+    if len(text) == len("2027-01-31"):
+        found = datetime.combine(found.date(), time())
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
+def state_of(key: Key) -> str:
+    """Whether a key is in force, by this machine's clock."""
+    if key.revoked_at is not None:
+        return "revoked"
+    return "expired" if key.expires_at is not None and key.expires_at <= datetime.now(UTC) else "in force"
+
+
+def _store(data_dir: Any) -> KeyStore:
+    from service.keys import KeyStore  # with it comes numpy
+
+    return KeyStore(read_settings(data_dir).data_dir)
+
+
+def _described(key: Key) -> str:
+    maps = "all maps" if key.maps is None else f"maps {', '.join(sorted(key.maps))}"
+    return f"{key.role}, {maps}, {'no expiry' if key.expires_at is None else f'until {_shown(key.expires_at)}'}"
+
+
+def _shown(moment: datetime | None) -> str:
+    return "–" if moment is None else f"{moment:%Y-%m-%d %H:%M}"
+
+
+def _view(key: Key) -> dict[str, Any]:
+    moments = {name: getattr(key, name) for name in ("created_at", "expires_at", "revoked_at", "last_used_at")}
+    return {
+        "id": key.id,
+        "name": key.name,
+        "role": key.role,
+        "maps": None if key.maps is None else sorted(key.maps),
+        "state": state_of(key),
+        **{name: None if at is None else at.isoformat() for name, at in moments.items()},
+    }

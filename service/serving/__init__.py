@@ -1,0 +1,1 @@
+"""Between the sockets and the application: connections and their limits, signals, the stop."""

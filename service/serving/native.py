@@ -1,0 +1,71 @@
+"""What libraries write to standard error by themselves, past Python: made into lines of the log.
+
+libjpeg and libpng say "Corrupt JPEG data" there, which would stand between the lines of JSON.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import logging
+import os
+import re
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+LONGEST = 500
+"""Bytes of a line; the rest of it is left out."""
+
+NOISE = re.compile(r"JPEG|libpng|WebP|\[ *WARN:.*grfmt_")
+"""Said of frames that are broken, whose callers hear of it: of no use to an operator."""
+
+log = logging.getLogger("placerec.native")
+
+
+@contextmanager
+def logged_stderr() -> Iterator[None]:
+    """Within, descriptor 2 leads into the log, and ``sys.stderr`` to where descriptor 2 led before.
+
+    Set logging up within: a handler that holds the old ``sys.stderr`` would be logged in turn.  A crash of the
+    interpreter is still told on the old one.
+    """
+    before = sys.stderr
+    before.flush()
+    kept = os.dup(2)
+    reading, writing = os.pipe()
+    # A library that finds the pipe full goes on without its line, rather than to wait for a thread that waits for it.
+    os.set_blocking(writing, False)
+    os.dup2(writing, 2)
+    os.close(writing)
+    own = os.fdopen(os.dup(kept), "w", buffering=1, encoding="utf-8", errors="backslashreplace")
+    sys.stderr = own
+    faulthandler.enable(own)
+    thread = threading.Thread(target=_log_lines, args=(reading,), name="native-log", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)  # which closes the last end that writes
+        thread.join(1.0)
+        faulthandler.enable(kept)
+        sys.stderr = before
+        # Both stay open: a handler of the log may still hold the one, the crash handler the other.
+
+
+def _log_lines(reading: int) -> None:
+    with os.fdopen(reading, "rb", buffering=0) as pipe:
+        line, cut = b"", False
+        while chunk := pipe.read(4096):
+            *whole, rest = chunk.split(b"\n")
+            for part in whole:
+                _log_line(line + part if not cut else line)
+                line, cut = b"", False
+            line, cut = (line + rest)[:LONGEST], cut or len(line) + len(rest) > LONGEST
+        _log_line(line)
+
+
+def _log_line(line: bytes) -> None:
+    text = line[:LONGEST].decode("utf-8", "backslashreplace").strip()
+    if text:
+        log.log(logging.DEBUG if NOISE.search(text) else logging.WARNING, "%s", text)
