@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from service.settings import Settings
+from service.settings import Settings, SettingsError
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
@@ -94,11 +94,67 @@ def test_service_is_confined() -> None:
     assert any(environment()["NUMBA_CACHE_DIR"].startswith(place.split(":")[0]) for place in placerec["tmpfs"])
 
 
-def test_the_proxy_asks_for_a_certificate() -> None:
-    configuration = (DOCKER / "tls.conf").read_text()
-    assert "ssl_verify_client on;" in configuration
-    limit = re.search(r"client_max_body_size (\d+)m;", configuration)
-    assert limit and int(limit[1]) * 2**20 == Settings.model_fields["max_batch_bytes"].default
+def compose_tls() -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load((DOCKER / "compose.tls.yaml").read_text())
+    return found
+
+
+def seconds(text: str) -> float:
+    return float(text.removesuffix("s"))
+
+
+def test_no_more_is_let_in_from_elsewhere_than_keys_let_in() -> None:
+    assert service()["environment"]["PLACEREC_ALLOW_ANONYMOUS"] == "true"
+    open_to_others = compose_tls()["services"]["placerec"]["environment"]
+    assert open_to_others["PLACEREC_ALLOW_ANONYMOUS"] == "false"
+    with pytest.raises(SettingsError, match="no keys"):
+        Settings(host="0.0.0.0", allow_anonymous=False).check_exposure(has_keys=False)
+
+
+def test_only_the_proxy_is_believed() -> None:
+    services = compose_tls()["services"]
+    address = services["tls"]["networks"]["front"]["ipv4_address"]
+    assert services["placerec"]["environment"]["FORWARDED_ALLOW_IPS"] == address
+    assert "proxy_set_header X-Forwarded-For $remote_addr;" in (DOCKER / "tls.conf").read_text()
+
+
+def test_the_proxy_is_confined() -> None:
+    tls = compose_tls()["services"]["tls"]
+    assert tls["read_only"] is True and tls["cap_drop"] == ["ALL"]
+    assert "no-new-privileges:true" in tls["security_opt"] and "mem_limit" in tls
+
+
+def test_stopping_gets_the_time_that_it_takes() -> None:
+    given = {name.removeprefix("PLACEREC_").lower(): value for name, value in service()["environment"].items()}
+    needed = sum(
+        float(given.get(name, Settings.model_fields[name].default)) for name in ("drain_seconds", "shutdown_timeout")
+    )
+    assert seconds(service()["stop_grace_period"]) >= needed + 5
+
+
+def test_limits_of_the_proxy_are_those_of_the_service() -> None:
+    text = re.sub(r"#.*", "", (DOCKER / "tls.conf").read_text())
+    limits = dict(re.findall(r"^\s*(\w+) ([^;]+);", text, re.MULTILINE))
+    default = {name: field.default for name, field in Settings.model_fields.items()}
+    assert limits["client_max_body_size"] == "0"
+    assert int(limits["large_client_header_buffers"].split()[1].removesuffix("k")) * 1024 > default["max_url_bytes"]
+    for ours, theirs in (
+        ("client_header_timeout", "head_timeout"),
+        ("client_body_timeout", "read_timeout"),
+        ("send_timeout", "write_timeout"),
+    ):
+        assert seconds(limits[ours]) == default[theirs]
+    assert seconds(limits["proxy_read_timeout"]) > default["request_timeout"]
+    upstream = text[text.index("upstream") : text.index("}")]
+    assert seconds(re.findall(r"keepalive_timeout (\w+);", upstream)[0]) < default["keep_alive_timeout"]
+
+
+def test_the_image_has_nothing_that_changes_its_user_or_installs() -> None:
+    run = final_stage()["RUN"]
+    assert "find / -xdev -type f -perm /6000 -exec chmod a-s {} +" in run
+    assert all(path in run for path in ("ensurepip", "/usr/local/bin/pip*", "site-packages/pip*"))
+    assert any("pip uninstall --yes pip" in argument for _, argument in instructions())
+    assert "--shell /usr/sbin/nologin" in run
 
 
 @pytest.fixture

@@ -112,6 +112,31 @@ def test_nothing_reads_a_pickle() -> None:
     assert calls == []
 
 
+RUNNING = {
+    "eval", "exec", "compile", "os.system", "os.popen", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.load",
+    "torch.jit.load", "torch.hub.load", "torch.package.PackageImporter", "cv2.FileStorage", "tarfile.open",
+    "shutil.unpack_archive", "np.lib.format.read_array", "numpy.lib.format.read_array", "pandas.read_pickle",
+    "scipy.io.loadmat", "loadmat", "importlib.import_module", "__import__",
+}  # fmt: skip
+"""Calls by which bytes that were read could run, or be laid out as files."""
+
+
+@pytest.mark.parametrize("folder", ["core", "service", "training"])
+def test_nothing_runs_what_it_reads(folder: str) -> None:
+    """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""
+    calls = []
+    for path in FILES:
+        if not path.is_relative_to(ROOT / folder):
+            continue
+        for node in ast.walk(syntax_of(path)):
+            if isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                shell = any(word.arg == "shell" for word in node.keywords)
+                if name in RUNNING or shell or name.endswith((".extractall", ".extract")):
+                    calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}")
+    assert calls == []
+
+
 def test_no_file_is_too_long() -> None:
     lengths = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in FILES}
     assert {path: length for path, length in lengths.items() if length > LONGEST} == {}

@@ -79,7 +79,7 @@ def test_no_registry_is_named(folder: str) -> None:
     addresses = [
         f"{path.relative_to(ROOT)}: {address}"
         for path in files
-        for address in re.findall(r"\w+://[^\s/:\"'$]+", path.read_text())
+        for address in re.findall(r"\w+://[^\s/:;\"'$]+", path.read_text())
         if address not in ("http://127.0.0.1", "http://placerec", "https://the-host")
     ]
     assert addresses == []

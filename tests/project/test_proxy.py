@@ -1,0 +1,140 @@
+"""docker/tls.conf as nginx runs it: keys, a query and a WebSocket through TLS, and what its log does not say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import ssl
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+import pytest
+from websockets.sync.client import connect
+
+from tests.service.scenes import jpeg
+from tests.service.server import ROOT, Server, free_port
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("nginx") is None or shutil.which("openssl") is None, reason="nginx or openssl is not installed"
+)
+
+NGINX = """
+daemon off;
+pid {folder}/nginx.pid;
+error_log {folder}/error.log;
+events {{}}
+http {{
+    client_body_temp_path {folder}/body;
+    proxy_temp_path {folder}/proxy;
+    fastcgi_temp_path {folder}/fastcgi;
+    uwsgi_temp_path {folder}/uwsgi;
+    scgi_temp_path {folder}/scgi;
+    include {folder}/tls.conf;
+}}
+"""
+
+
+@dataclass
+class Proxied:
+    """A service behind nginx.  log: of nginx, of what was asked."""
+
+    port: int
+    server: Server
+    trust: ssl.SSLContext
+    log: Path
+    key: str
+
+    def client(self, key: str | None = None) -> httpx.Client:
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        return httpx.Client(base_url=f"https://localhost:{self.port}", verify=self.trust, headers=headers, timeout=30)
+
+
+def certify(folder: Path) -> None:
+    """An authority of our own, and a certificate of it for this machine."""
+    curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
+    own = ["-subj", "/CN=authority", "-keyout", f"{folder}/authority.key", "-out", f"{folder}/authority.pem"]
+    host = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-addext", "basicConstraints=CA:FALSE"]
+    signed = ["-CA", f"{folder}/authority.pem", "-CAkey", f"{folder}/authority.key"]
+    files = ["-keyout", f"{folder}/server.key", "-out", f"{folder}/server.pem"]
+    for words in (own, [*host, *signed, *files]):
+        subprocess.run(["openssl", "req", "-x509", *curve, *words], check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
+    folder = tmp_path_factory.mktemp("proxy")
+    folder.chmod(0o755)
+    certify(folder)
+    command = [sys.executable, "-m", "service.commands", "keys", "create", "op", "--role", "admin"]
+    made = subprocess.run(
+        [*command, "--data-dir", folder / "data"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    server, port = Server(folder), free_port()
+    text = (ROOT / "docker/tls.conf").read_text()
+    for old, new in (
+        ("placerec:8000", f"127.0.0.1:{server.port}"),
+        ("/etc/nginx/certificates", str(folder)),
+        ("listen 443", f"listen 127.0.0.1:{port}"),
+        ("/dev/stdout", f"{folder}/access.log"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "tls.conf").write_text(text)
+    (folder / "nginx.conf").write_text(NGINX.format(folder=folder))
+    words = ["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)]
+    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    nginx = subprocess.Popen(words)
+    try:
+        server.wait()
+        until = time.monotonic() + 10
+        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
+            time.sleep(0.02)
+        trust = ssl.create_default_context(cafile=str(folder / "authority.pem"))
+        yield Proxied(port, server, trust, folder / "access.log", made.stdout.strip())
+    finally:
+        nginx.terminate()
+        nginx.wait(10)
+        server.stop()
+
+
+def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
+    with proxied.client() as stranger:
+        assert stranger.get("/readyz").status_code == 200
+        refused = stranger.get("/v1/maps")
+        assert (refused.status_code, refused.headers["www-authenticate"][:6]) == (401, "Bearer")
+    with proxied.client(proxied.key) as operator:
+        assert operator.post("/v1/maps", json={"id": "lab"}).status_code == 201
+        kind = {"Content-Type": "image/jpeg"}
+        enrolled = operator.put("/v1/maps/lab/places/p1?metadata={}", content=jpeg(1), headers=kind)
+        assert enrolled.status_code == 201, enrolled.text
+        answer = operator.post("/v1/maps/lab/query", content=jpeg(1), headers=kind).json()
+        assert answer["matches"][0]["place"]["id"] == "p1"
+        # Longer than nginx would take by itself, as long as the service does; it is the service that refuses.
+        refused = operator.get(f"/v1/maps/lab/places?cursor={'x' * 60_000}")
+        assert refused.headers["content-type"] == "application/problem+json"
+
+        session = operator.post("/v1/maps/lab/sessions", json={"filter": "bayes"}).json()["id"]
+    address = f"wss://localhost:{proxied.port}/v1/maps/lab/sessions/{session}/stream"
+    headers = {"Authorization": f"Bearer {proxied.key}"}
+    with connect(address, ssl=proxied.trust, compression=None, additional_headers=headers) as stream:
+        stream.send(json.dumps({"frame": 0}))
+        stream.send(jpeg(1))
+        assert json.loads(stream.recv(timeout=30))["single"]["matches"][0]["place"]["id"] == "p1"
+
+    # What a caller says of its own address is not believed; what nginx says of it is.
+    transport = httpx.HTTPTransport(verify=proxied.trust, local_address="127.0.0.9")
+    forged = {"Authorization": headers["Authorization"], "X-Forwarded-For": "6.6.6.6"}
+    with httpx.Client(transport=transport, base_url=f"https://localhost:{proxied.port}", headers=forged) as elsewhere:
+        assert elsewhere.delete("/v1/maps/lab/places/p1").status_code == 204
+    trail = [json.loads(line) for line in proxied.server.log_file.read_text().splitlines() if "forget_place" in line]
+    assert [line["client"] for line in trail if line["logger"] == "placerec.audit"] == ["127.0.0.9"]
+
+    logged = proxied.log.read_text()
+    assert '"POST /v1/maps/lab/query" 200' in logged
+    assert proxied.key not in logged and "metadata" not in logged
