@@ -54,12 +54,15 @@ def peak_memory(pid: int) -> float:
 
 
 @contextmanager
-def service(data_dir: Path, threads: int = 0, settings: Mapping[str, object] | None = None) -> Iterator[Process]:
+def service(
+    data_dir: Path, threads: int = 0, settings: Mapping[str, object] | None = None, log: Path = Path("/dev/stderr")
+) -> Iterator[Process]:
     """``placerec serve`` on a directory, until the block ends.
 
     Args:
         threads: of a forward pass, 0 for torch's choice.
         settings: others, by their variables without the prefix.
+        log: where it logs to.
     """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -68,7 +71,8 @@ def service(data_dir: Path, threads: int = 0, settings: Mapping[str, object] | N
     environment = {**os.environ, **{f"PLACEREC_{name}": str(value) for name, value in own.items()}}
     command = [sys.executable, "-m", "service.commands", "serve", "--host", "127.0.0.1", "--port", str(port)]
     began = time.monotonic()
-    process = subprocess.Popen(command, cwd=ROOT, env=environment)
+    with log.open("ab") as opened:
+        process = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=opened)
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60) as client:
             yield Process(client, process.pid, _wait(client, process, began))

@@ -1,0 +1,119 @@
+"""A robot's queries while others hold as many half-sent requests open as the service lets them.
+
+    python -m benchmarks.siege --addresses 3 --connections 600 --seconds 12
+
+Each address of this machine opens its connections, sends the half of a head over each, a byte more now and then, and
+after six seconds begins anew. The robot sends a frame when it has the answer to the last, over a new connection each
+time, as one has to who was turned away before. Memory and descriptors are the service's own.
+"""
+
+from __future__ import annotations
+
+import socket
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import httpx
+import typer
+
+from benchmarks.frames import camera_frames
+from benchmarks.process import median, service
+from benchmarks.report import report
+
+HALF = b"GET /v1/maps HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
+COLUMNS = ("", "answered", "refused", "failed", "median", "memory", "descriptors")
+ANEW_SECONDS, BETWEEN_BYTES = 6.0, 0.5
+
+
+def resident(pid: int) -> float:
+    """Resident memory of a process, in MB (10^6 bytes)."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line.split()[1] for line in lines if line.startswith("VmRSS:"))) * 1024 / 1e6
+
+
+def descriptors(pid: int) -> int:
+    """Open files of a process."""
+    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def besiege(address: str, port: int, connections: int, over: threading.Event) -> None:
+    """Hold half-sent requests open until it is over."""
+    while not over.is_set():
+        held = []
+        for _ in range(connections):
+            one = socket.socket()
+            one.bind((address, 0))
+            one.setblocking(False)
+            one.connect_ex(("127.0.0.1", port))
+            held.append(one)
+        began, sent = time.monotonic(), HALF
+        while time.monotonic() - began < ANEW_SECONDS and not over.wait(BETWEEN_BYTES):
+            for one in held:
+                try:
+                    one.send(sent)
+                except OSError:
+                    continue  # closed by the service, which is what it is for
+            sent = b"x"
+        for one in held:
+            one.close()
+
+
+def robot(url: str, frames: list[bytes], seconds: float) -> dict[str, Any]:
+    """What one robot sees: answers, refusals, failures, and the median time of an answer in milliseconds."""
+    times: list[float] = []
+    refused, failed = 0, 0
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        began = time.perf_counter()
+        try:
+            frame = frames[len(times) % len(frames)]
+            answer = httpx.post(f"{url}/v1/encode", content=frame, headers={"Content-Type": "image/jpeg"}, timeout=30)
+        except httpx.TransportError:
+            failed += 1
+            continue
+        refused += answer.status_code == 503
+        if answer.status_code == 200:
+            times.append(1e3 * (time.perf_counter() - began))
+    return {"answered": len(times), "refused": refused, "failed": failed, "median": median(times) if times else None}
+
+
+def main(
+    addresses: Annotated[int, typer.Option(min=1, max=200, help="From which the siege comes.")] = 3,
+    connections: Annotated[int, typer.Option(min=1, help="Of each of them.")] = 600,
+    seconds: Annotated[float, typer.Option(help="Of the siege.")] = 12.0,
+) -> None:
+    """Measure a robot without and within a siege."""
+    frames, pictures = camera_frames(16)
+    with tempfile.TemporaryDirectory() as folder, service(Path(folder), log=Path(folder) / "log") as process:
+        url = str(process.client.base_url).rstrip("/")
+        port = process.client.base_url.port or 80
+        robot(url, frames, 2)  # whatever is slow the first time
+        found: dict[str, Any] = {"before": robot(url, frames, seconds)}
+        found["before"] |= {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        over = threading.Event()
+        besiegers = [
+            threading.Thread(target=besiege, args=(f"127.0.0.{10 + number}", port, connections, over))
+            for number in range(addresses)
+        ]
+        for besieger in besiegers:
+            besieger.start()
+        time.sleep(2)
+        within = found["within"] = robot(url, frames, seconds)
+        within |= {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        over.set()
+        for besieger in besiegers:
+            besieger.join()
+        time.sleep(1)
+        found["after"] = {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        metrics = process.client.get("/metrics").text.splitlines()
+        found["ended"] = [line for line in metrics if line.startswith("placerec_connections_ended_total")]
+    rows = [(name, *(found[name].get(column, "") for column in COLUMNS[1:])) for name in ("before", "within", "after")]
+    title = f"One robot, {pictures}, and {addresses} x {connections} connections with half a request"
+    report("siege", title, [*COLUMNS[:4], "median ms", "memory MB", "descriptors"], rows, found)
+
+
+if __name__ == "__main__":
+    typer.run(main)

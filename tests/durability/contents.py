@@ -1,0 +1,87 @@
+"""Everything that a data directory holds, read by the real code, as plain values that can be compared."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from typing import Any
+
+import numpy as np
+
+from core.storage import Atlas, Map
+
+SETTLING_SECONDS = 60.0
+
+
+def sha(data: bytes) -> str:
+    """Hexadecimal SHA-256."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def contents(atlas: Atlas) -> dict[str, Any]:
+    """All maps, unlisted ones too, read whole, verified and searched.
+
+    Raises:
+        AssertionError: a map is quarantined, damaged, not searched as it is stored, or its index does not get ready.
+    """
+    assert atlas.quarantined() == {}, atlas.quarantined()
+    listed = [record.id for record in atlas.records(None, 1000)[0]]
+    found = {name: map_contents(atlas.get(name), True) for name in listed}
+    return found | {name: map_contents(map_, False) for name, map_ in atlas.unlisted().items()}
+
+
+def map_contents(map_: Map, listed: bool) -> dict[str, Any]:
+    """One map."""
+    _wait_for_index(map_)
+    record = map_.record.model_dump(mode="json")
+    settings = map_.record.settings().model_dump(mode="json")
+    report = map_.verify()
+    assert report.ok, report.problems
+    assert report.stale_caches == [], report.stale_caches
+    assert map_.count_places() == report.places
+    ends: list[list[Any]] = sorted(([name, end] for name, end in map_.transfer.sequence_ends().items()), key=str)
+    return {
+        "listed": listed,
+        "settings": settings,
+        **{name: record[name] for name in ("precision", "revision", "created_at", "updated_at", "calibration")},
+        "cameras": {one.name: one.mask and one.mask.model_dump(mode="json") for one in map_.cameras.all()},
+        "ends": ends,
+        "places": _places(map_),
+    }
+
+
+def _wait_for_index(map_: Map) -> None:
+    map_.open()
+    until = time.monotonic() + SETTLING_SECONDS
+    while (status := map_.index_status()).state == "building":
+        assert time.monotonic() < until, status
+        time.sleep(0.002)
+    assert status.tier == status.wanted, status
+
+
+def _places(map_: Map) -> list[dict[str, Any]]:
+    outline, snapshot = map_.transfer.outline(), map_.snapshot()
+    rows = np.array([place.row for place in outline], np.int64)
+    descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
+    shown = {place.row: place.digest.hex() for place in outline}
+    by_id: dict[str, Any] = {}
+    cursor = None
+    while True:
+        page, cursor = map_.places(cursor, 500)
+        by_id |= {place.id: place.model_dump(mode="json") for place in page}
+        if cursor is None:
+            break
+    assert list(by_id) == [place.id for place in outline], "the two listings differ"
+    found, rankings = [], snapshot.search_batch(descriptors)
+    for position, place in enumerate(outline):
+        picture = map_.transfer.picture(place.id)
+        found.append({
+            **by_id[place.id],
+            "digest": place.digest.hex(),
+            "ordinal": place.ordinal,
+            "kept": None if picture is None else sha(picture),
+            "descriptor": sha(descriptors[position].tobytes()),
+            "local": sha(local[position].tobytes()),
+            "found_first": shown[int(rankings[position][0][0])],
+        })  # fmt: skip
+    return found

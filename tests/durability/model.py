@@ -1,0 +1,309 @@
+"""What must be true of a data directory: maps, places and their order, in plain values, with none of the real code.
+
+Only the rules of field values (:class:`core.places.PlaceFields`) are shared with what is tested.  A value that is not
+known, such as the time of a write that nobody was told of, is ``ANY`` and learnt from what is found.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from core.places import PlaceFields
+
+
+class _Any:
+    """Equal to whatever is found."""
+
+    def __repr__(self) -> str:
+        return "ANY"
+
+    def __deepcopy__(self, memo: object) -> _Any:
+        return self
+
+
+ANY: Any = _Any()
+
+Fields = dict[str, Any]
+
+
+class Refused(Exception):
+    """The operation must fail with the error of this name, and change nothing."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A frame: what is told of it, and SHA-256 of what may be kept of it, all hexadecimal or ``ANY``.
+
+    descriptor, local: by the precision of the map.
+    """
+
+    digest: str
+    regions: Any
+    thumbnail: Any
+    image: Any
+    descriptor: Mapping[str, Any]
+    local: Mapping[str, Any]
+
+
+@dataclass
+class PlaceModel:
+    """One place."""
+
+    shown: Shown
+    fields: Fields
+    kept: str
+    ordinal: int
+    created: Any = ANY
+    updated: Any = ANY
+    descriptor: Any = ANY
+    regions: Any = ANY
+
+    @property
+    def sequence(self) -> str | None:
+        """The traverse it belongs to."""
+        name: str | None = self.fields.get("sequence")
+        return name
+
+
+def canonical(fields: Fields) -> Fields:
+    """Fields as they are told."""
+    return PlaceFields.model_validate(fields).model_dump(mode="json")
+
+
+def merged(target: Any, patch: Any) -> Any:
+    """RFC 7396."""
+    if not isinstance(patch, dict):
+        return patch
+    result = dict(target) if isinstance(target, dict) else {}
+    for name, value in patch.items():
+        if value is None:
+            result.pop(name, None)
+        else:
+            result[name] = merged(result.get(name), value)
+    return result
+
+
+@dataclass
+class MapModel:
+    """One map.  ``ends`` are the ordinals that come next in each sequence."""
+
+    settings: dict[str, Any]
+    precision: str = "half"
+    listed: bool = True
+    revision: int = 1
+    created: Any = ANY
+    updated: Any = ANY
+    calibration: Any = None
+    places: dict[str, PlaceModel] = field(default_factory=dict)
+    ends: dict[str | None, int] = field(default_factory=lambda: {None: 0})
+    cameras: dict[str, Any] = field(default_factory=dict)
+
+    # Writes; each returns what the answer must say
+
+    def enrol(self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None) -> str:
+        """One frame: created, replaced, updated or unchanged."""
+        known = self.places.get(place_id)
+        if known is not None and known.shown.digest == shown.digest:
+            return self.set_fields(place_id, fields)
+        kept = self.settings["keep"] if keep is None else keep
+        if known is None:
+            made = PlaceModel(shown, dict(fields), kept, self._next(fields.get("sequence")))
+            self.places[place_id] = made
+        else:
+            known.shown, known.kept = shown, kept
+            self._place_in(known, fields)
+            made = known
+        made.descriptor, made.regions, made.updated = shown.descriptor.get(self.precision, ANY), shown.regions, ANY
+        return "created" if known is None else "replaced"
+
+    def set_fields(self, place_id: str, fields: Fields) -> str:
+        """Other fields for the same frame."""
+        place = self.place(place_id)
+        if canonical(place.fields) == canonical(fields):
+            return "unchanged"
+        self._place_in(place, fields)
+        place.updated = ANY
+        return "updated"
+
+    def patch(self, place_id: str, changes: Fields) -> str:
+        """A merge patch."""
+        return self.set_fields(place_id, merged(self.place(place_id).fields, changes))
+
+    def adopt(self, place_id: str, of: PlaceModel, ordinal: int | None) -> None:
+        """A place of another map with its history."""
+        before = self.places.get(place_id)
+        same = before is not None and before.shown.digest == of.shown.digest
+        self.enrol(place_id, of.shown, of.fields, of.kept)
+        place = self.places[place_id]
+        place.created, place.updated = of.created, of.updated
+        if not same:
+            place.descriptor = of.descriptor
+        place.ordinal = place.ordinal if ordinal is None else ordinal
+        self.ends[place.sequence] = max(self.ends[place.sequence], place.ordinal + 1)
+
+    def forget(self, place_id: str) -> None:
+        """One place."""
+        gone = self.place(place_id)
+        del self.places[place_id]
+        self._drop_if_empty(gone.sequence)
+
+    def forget_sequence(self, name: str) -> int:
+        """All of a traverse."""
+        gone = [place_id for place_id, place in self.places.items() if place.sequence == name]
+        if not gone:
+            raise Refused("UnknownSequence")
+        for place_id in gone:
+            self.forget(place_id)
+        return len(gone)
+
+    def edit(self, changes: dict[str, Any]) -> int:
+        """Settings; the revision that follows."""
+        if any(self.settings[name] != value for name, value in changes.items()):
+            self.settings = {**self.settings, **changes}
+            self.revision, self.updated = self.revision + 1, ANY
+        return self.revision
+
+    def place(self, place_id: str) -> PlaceModel:
+        """The place of this id."""
+        if place_id not in self.places:
+            raise Refused("UnknownPlace")
+        return self.places[place_id]
+
+    def _next(self, sequence: str | None) -> int:
+        ordinal = self.ends.setdefault(sequence, 0)
+        self.ends[sequence] = ordinal + 1
+        return ordinal
+
+    def _place_in(self, place: PlaceModel, fields: Fields) -> None:
+        before, place.fields = place.sequence, dict(fields)
+        if place.sequence != before:
+            place.ordinal = self._next(place.sequence)
+            self._drop_if_empty(before)
+
+    def _drop_if_empty(self, sequence: str | None) -> None:
+        if sequence is not None and all(place.sequence != sequence for place in self.places.values()):
+            self.ends.pop(sequence, None)
+
+    # What is to be found
+
+    def expected(self) -> dict[str, Any]:
+        """As :func:`tests.durability.contents.contents` tells of a map."""
+        return {
+            "listed": self.listed,
+            "settings": self.settings,
+            "precision": self.precision,
+            "revision": self.revision,
+            "created_at": self.created,
+            "updated_at": self.updated,
+            "calibration": self.calibration,
+            "cameras": self.cameras,
+            "ends": sorted(([name, end] for name, end in self.ends.items()), key=str),
+            "places": [self._expected_place(place_id, place) for place_id, place in self.places.items()],
+        }
+
+    def _expected_place(self, place_id: str, place: PlaceModel) -> dict[str, Any]:
+        shown = place.shown
+        kept = {"none": None, "thumbnail": shown.thumbnail, "image": shown.image}[place.kept]
+        return {
+            "id": place_id,
+            **canonical(place.fields),
+            "regions": place.regions,
+            "picture": place.kept,
+            "created_at": place.created,
+            "updated_at": place.updated,
+            "digest": shown.digest,
+            "ordinal": place.ordinal,
+            "kept": kept,
+            "descriptor": place.descriptor,
+            "local": shown.local.get(self.precision, ANY),
+            "found_first": shown.digest,
+        }
+
+    def told(self, places: Sequence[Mapping[str, Any]]) -> None:
+        """Fill in the times of places that an answer told; what was known already must be said again.
+
+        Raises:
+            Lost: it is not.
+        """
+        for told in places:
+            place = self.places[told["id"]]
+            if wrong := differences([place.created, place.updated], [told["created_at"], told["updated_at"]]):
+                raise Lost(f"the answer about {told['id']}: {wrong[0]}")
+            place.created, place.updated = told["created_at"], told["updated_at"]
+
+    def learn(self, found: Mapping[str, Any]) -> None:
+        """Fill in what was not known from what was found."""
+        self.created, self.updated = found["created_at"], found["updated_at"]
+        self.calibration = found["calibration"]
+        for told in found["places"]:
+            place = self.places[told["id"]]
+            place.created, place.updated = told["created_at"], told["updated_at"]
+            place.descriptor, place.regions = told["descriptor"], told["regions"]
+
+
+World = dict[str, MapModel]
+"""Maps by id."""
+
+Change = Callable[[World], Any]
+"""An operation on the model; returns what the answer must be, or raises :class:`Refused`."""
+
+
+def changed(world: World, change: Change) -> tuple[World, Any]:
+    """The world after an operation, and the answer that it must give; the world before stays as it is."""
+    after = copy.deepcopy(world)
+    try:
+        return after, change(after)
+    except Refused as refused:
+        return world, {"error": str(refused)}
+
+
+def differences(expected: Any, found: Any, where: str = "") -> list[str]:
+    """In words, where what is found is not what is expected."""
+    if expected is ANY:
+        return []
+    if isinstance(expected, dict) and isinstance(found, dict):
+        told = []
+        for name in sorted({*expected, *found}, key=str):
+            if name not in expected:
+                told.append(f"{where}/{name}: is there, though it must not be")
+            elif name not in found:
+                told.append(f"{where}/{name}: is not there")
+            else:
+                told += differences(expected[name], found[name], f"{where}/{name}")
+        return told
+    if isinstance(expected, list) and isinstance(found, list):
+        names = [[item.get("id") if isinstance(item, dict) else None for item in items] for items in (expected, found)]
+        if len(expected) != len(found) or names[0] != names[1]:
+            shown = names if any(names[0] + names[1]) else [expected, found]
+            return [f"{where}: {shown[0]} expected, {shown[1]} found"]
+        return [
+            line
+            for number, (one, other) in enumerate(zip(expected, found, strict=True))
+            for line in differences(one, other, f"{where}/{number}")
+        ]
+    return [] if expected == found else [f"{where}: {expected!r} expected, {found!r} found"]
+
+
+class Lost(AssertionError):
+    """What is on disk is none of what it may be."""
+
+
+def settled(candidates: Sequence[World], found: Mapping[str, Mapping[str, Any]]) -> tuple[World, int]:
+    """The one of several worlds that was found, with all that was unknown learnt, and its number.
+
+    Raises:
+        Lost: none of them is.
+    """
+    told = []
+    for number, world in enumerate(candidates):
+        wrong = differences({name: one.expected() for name, one in world.items()}, dict(found))
+        if not wrong:
+            world = copy.deepcopy(world)
+            for name, one in world.items():
+                one.learn(found[name])
+            return world, number
+        told.append(f"not as {'before' if number == 0 else 'after'} the last operation:\n  " + "\n  ".join(wrong[:12]))
+    raise Lost("\n".join(told))

@@ -1,0 +1,60 @@
+"""Real servers, each forked off a process that has imported everything and started no thread: ``python -m`` it.
+
+Each line on standard input is a JSON object, ``environment``, ``log`` and ``traced``, and is answered with the number
+of a process that runs ``placerec serve`` so; with ``traced`` not before a tracer follows it.  A start then takes what
+opening the data directory and loading the encoder take.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+MODULES = (
+    "torch",
+    "uvicorn",
+    "uvloop",
+    "service.app",
+    "service.commands.serve",
+    "service.serving.connections",
+    "service.serving.http",
+    "service.serving.native",
+    "service.serving.server",
+    "service.serving.streams",
+)
+
+
+def main() -> None:
+    """Fork one server a line, until the input ends."""
+    for name in MODULES:
+        importlib.import_module(name)
+    from service.commands import main as placerec
+
+    gc.freeze()
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    for line in sys.stdin:
+        wanted = json.loads(line)
+        process = os.fork()
+        if process == 0:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            log = os.open(wanted["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+            for stream in (1, 2):
+                os.dup2(log, stream)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            while wanted["traced"] and "TracerPid:\t0\n" in Path("/proc/self/status").read_text():
+                time.sleep(0.002)
+            os.environ.update(wanted["environment"])
+            sys.argv = ["placerec", "serve"]
+            placerec()
+            os._exit(0)
+        print(process, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""The storage layer on a disk that loses power: at many moments, all that was not synced is lost, or a part of it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from random import Random
+
+from tests.durability.lives import Dead, Life, Lives
+from tests.durability.model import Lost, World, settled
+from tests.durability.storage_kills import Worker
+from tests.durability.traced_disk import VARIANTS, Disk, arguments
+
+ATTACHING_SECONDS = 30.0
+
+
+def attach(life: Life, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
+    """Let a tracer follow a process that waits, then let that go on."""
+    with log.open("ab") as told:
+        process = subprocess.Popen([*tracer, "-p", str(life.number)], stderr=told)
+    until = time.monotonic() + ATTACHING_SECONDS
+    while "TracerPid:\t0\n" in Path(f"/proc/{life.number}/status").read_text():
+        assert process.poll() is None and time.monotonic() < until, log.read_text()[-2000:]
+        time.sleep(0.002)
+    time.sleep(0.02)  # it has stopped by now, and goes on when the tracer lets it
+    life.voices[0].begin()
+    return process
+
+
+@dataclass
+class PowerTally:
+    """What a replay has done."""
+
+    operations: int = 0
+    writes: int = 0
+    syncs: int = 0
+    moments: int = 0
+    disks: int = 0
+
+    def __add__(self, other: PowerTally) -> PowerTally:
+        return PowerTally(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+
+
+def record(lives: Lives, folder: Path, seed: object, operations: int) -> tuple[Path, list[World]]:
+    """A traced process that does random operations; its trace, and the world after each acknowledgement.
+
+    Raises:
+        Lost: an answer was wrong.
+    """
+    worker, trace = Worker(seed, 0), folder / "trace"
+    worlds = [worker.candidates[0]]
+    life = lives.begin(folder / "data", waiting=True)
+    tracer = attach(life, arguments(trace), folder / "strace.log")
+    try:
+        for _ in range(operations):
+            worker.acknowledge(life.voices[0].ask(worker.next()))
+            worlds.append(worker.candidates[0])
+    except Dead as dead:
+        raise Lost(f"the process ended by itself: {folder / 'log'}") from dead
+    finally:
+        life.kill()
+        life.close()
+        tracer.wait(60)
+    return trace, worlds
+
+
+def told(sent: bytes) -> str | None:
+    """An acknowledgement of the process."""
+    return "ack" if sent.startswith(b"ack ") else None
+
+
+def moments(disk: Disk, trace: Path) -> Iterator[int]:
+    """After each change of the disk: how many operations were acknowledged."""
+    acknowledged = 0
+    with trace.open() as lines:
+        for what in disk.replay(lines, told):
+            acknowledged += what is not None
+            yield acknowledged
+
+
+def power(lives: Lives, folder: Path, seed: object, operations: int, disks: int) -> PowerTally:
+    """Trace, cut the power at so many moments, and compare what is found.
+
+    Raises:
+        Lost: something that was acknowledged is not there, or something is half there.
+    """
+    trace, worlds = record(lives, folder, seed, operations)
+    count = sum(1 for _ in moments(Disk(folder / "data"), trace))
+    random = Random(f"{seed}/power")
+    chosen = sorted(random.sample(range(count), min(count, disks)))
+    disk, tally = Disk(folder / "data"), PowerTally(operations)
+    for number, acknowledged in enumerate(moments(disk, trace)):
+        if not chosen or number < chosen[0]:
+            continue
+        chosen.pop(0)
+        tally.moments += 1
+        variant = VARIANTS[0] if random.random() < 0.4 else random.choice(VARIANTS[1:])
+        shutil.rmtree(folder / "disk", ignore_errors=True)
+        disk.image(folder / "disk", variant, Random(f"{seed}/disk/{number}"))
+        try:
+            check(lives, folder / "disk", worlds[acknowledged : acknowledged + 2])
+        except (Dead, Lost) as lost:
+            why = str(lost) or "the directory does not open"
+            raise Lost(f"seed {seed}, power cut at change {number}, {variant}: {why}") from lost
+        tally.disks += 1
+    tally.writes, tally.syncs = disk.writes, disk.syncs
+    return tally
+
+
+def check(lives: Lives, directory: Path, may: Sequence[World]) -> None:
+    """Open a directory and compare all of it with the worlds that may be there.
+
+    Raises:
+        Lost: none of them is.
+        Dead: it does not open.
+    """
+    life = lives.begin(directory)
+    try:
+        settled(may, life.voices[0].ask({"do": "contents"})["answer"])
+    finally:
+        life.kill()
+        life.close()

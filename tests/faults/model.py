@@ -1,0 +1,72 @@
+"""What must be true of the maps after each operation: plain dictionaries, which know nothing of files."""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any
+
+import numpy as np
+
+from core.storage import Atlas, Map
+from tests.core.storage.frames import descriptor_of, local_of, stored_of
+
+State = dict[str, Any]
+"""Maps by id; of each its description, tier setting, cameras, and its places in the order of their enrolment."""
+
+
+def place(shown: str, keep: str = "thumbnail", **fields: Any) -> State:
+    """A place as it must be told: whatever is not said of it is nothing."""
+    pose, sequence, metadata = fields.get("x"), fields.get("sequence"), fields.get("metadata", {})
+    picture = {"thumbnail": f"thumbnail of {shown}", "image": f"image of {shown}"}[keep]
+    return {
+        "x": pose,
+        "sequence": sequence,
+        "camera": fields.get("camera"),
+        "metadata": metadata,
+        "picture": picture,
+        "regions": len(shown),
+        "descriptor": zlib.crc32(stored_of(shown).tobytes()),
+        "local": zlib.crc32(local_of(shown).tobytes()),
+    }
+
+
+def told(map_: Map) -> State:
+    """A map as it is told through its own interface, read anew; what is searched is compared as well."""
+    snapshot, listed = map_.snapshot(), map_.places(None, 1000)[0]
+    rows = map_.rows_of([found.id for found in listed])
+    places = {}
+    for found, row in zip(listed, rows, strict=True):
+        kept = map_.transfer.picture(found.id)
+        places[found.id] = {
+            "x": None if found.pose is None else found.pose.x,
+            "sequence": found.sequence,
+            "camera": found.camera,
+            "metadata": found.metadata,
+            "picture": None if kept is None else kept.decode(),
+            "regions": found.regions,
+            "descriptor": None if row is None else zlib.crc32(snapshot.descriptors_at(_rows(row)).tobytes()),
+            "local": None if row is None else zlib.crc32(snapshot.locals_at(_rows(row)).tobytes()),
+        }
+    assert len(snapshot) == len(places)
+    return {
+        "description": map_.record.description,
+        "index": map_.record.index,
+        "cameras": {camera.name: camera.mask is not None for camera in map_.cameras.all()},
+        "places": places,
+    }
+
+
+def _rows(row: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.array([row], dtype=np.int64)
+
+
+def all_told(atlas: Atlas) -> State:
+    """Every map in service."""
+    return {record.id: told(atlas.get(record.id)) for record in atlas.records(None, 1000)[0]}
+
+
+def best_of(map_: Map, shown: str) -> str | None:
+    """The place that is found first for a frame that shows ``shown``."""
+    rows, _ = map_.snapshot().search(descriptor_of(shown))
+    found = map_.places_at(rows[:1].tolist())
+    return None if not found or found[0] is None else found[0].id

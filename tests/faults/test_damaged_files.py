@@ -1,0 +1,280 @@
+"""Files that are damaged on the disk: found or harmless, never a wrong answer, and no other map is the worse for it."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+import time
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.errors import MapQuarantined, StorageFailure
+from core.storage import Atlas, Map, MapSettings, index_files
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+from tests.faults.damage import DAMAGES, Damage, flip, flip_anywhere, flip_used
+from tests.faults.model import State, told
+from tests.faults.script import MASK
+
+SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
+MAPS = ("lab", "hall", "coded")
+
+
+def make_map(atlas: Atlas, name: str) -> Map:
+    """A dozen places of every kind, some of them changed and gone since."""
+    made = atlas.create(name, ENCODER, DIMENSION, MapSettings(keep="image"), LOCAL_SHAPE)
+    made.cameras.put("left", MASK)
+    made.enrol(
+        [
+            frame(f"{name}{i}", x=i + 0.5, sequence=("mo", "tu")[i % 2], metadata={"floor": i % 3, "note": "n" * 40})
+            for i in range(12)
+        ]
+    )
+    made.enrol([frame(f"{name}3", "again")])
+    made.set_fields(f"{name}4", made.place(f"{name}4").model_copy(update={"camera": "left"}))
+    made.forget(f"{name}5")
+    return made
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_groups() -> Any:
+    """Codes of a few segments are one file, so that there are several."""
+    before, index_files.GROUP_ROWS = index_files.GROUP_ROWS, 4
+    yield
+    index_files.GROUP_ROWS = before
+
+
+@dataclass(frozen=True)
+class Sound:
+    """A data directory, and of each map what it may answer: what was committed last comes first."""
+
+    directory: Path
+    allowed: dict[str, list[State]]
+
+
+@pytest.fixture(scope="module")
+def closed(tmp_path_factory: pytest.TempPathFactory) -> Sound:
+    """As an orderly end leaves it; of the map "coded" with its caches."""
+    folder = tmp_path_factory.mktemp("sound")
+    atlas = Atlas(folder / "data", rows_per_segment=4)
+    for name in MAPS:
+        make_map(atlas, name)
+    coded = atlas.get("coded")
+    coded.edit({"index": "inverted"})
+    until = time.monotonic() + 60
+    while coded.index_status().state != "ready" or coded.index_status().tier != "inverted":
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    allowed = {name: [answers(atlas.get(name))] for name in MAPS}
+    atlas.close()
+    return Sound(folder / "data", allowed)
+
+
+@pytest.fixture(scope="module")
+def crashed(closed: Sound, tmp_path_factory: pytest.TempPathFactory) -> Sound:
+    """As a crash leaves it, with two more commits in SQLite's log."""
+    folder = tmp_path_factory.mktemp("crashed")
+    shutil.copytree(closed.directory, folder / "written")
+    atlas, allowed = Atlas(folder / "written"), {name: list(states) for name, states in closed.allowed.items()}
+    for late in ("a", "b"):
+        for name in ("lab", "coded"):
+            atlas.get(name).enrol([frame(f"late-{late}", x=77.0)])
+            allowed[name].insert(0, answers(atlas.get(name)))
+    while atlas.get("coded").index_status().state != "ready":
+        time.sleep(0.01)
+    shutil.copytree(folder / "written", folder / "data")
+    atlas.close()
+    return Sound(folder / "data", allowed)
+
+
+def answers(map_: Map) -> State:
+    """All that is told of a map, and found in it."""
+    found = []
+    for name in ("lab2", "again", "coded7", "nobody"):
+        rows, products = map_.snapshot().search(descriptor_of(name))
+        found.append((rows.tolist()[:8], zlib.crc32(products[:8].tobytes())))
+    by_metadata = map_.attributes.rows_with({"floor": 2}).tolist()
+    whereabouts = vars(map_.snapshot().whereabouts.take(map_.snapshot().alive.nonzero()[0]))
+    spots = zlib.crc32(b"".join(column.tobytes() for column in whereabouts.values()))
+    ends = map_.transfer.sequence_ends()
+    return {**told(map_), "found": found, "by_metadata": by_metadata, "spots": spots, "ends": ends}
+
+
+def outcome(sound: Sound, copy: Path, name: str, may_lose: bool = False) -> str:
+    """What became of a map whose files were damaged: ``harmless``, or how it was found out; the others serve.
+
+    Args:
+        may_lose: commits at the end, as if they had never been made: a log that ends early is what a crash leaves.
+
+    Raises:
+        AssertionError: it answers otherwise than before, and nothing tells.
+    """
+    atlas = Atlas(copy)
+    try:
+        found = _outcome(atlas, name, sound.allowed[name] if may_lose else sound.allowed[name][:1])
+        for other in set(MAPS) - {name}:
+            assert answers(atlas.get(other)) == sound.allowed[other][0], f"{other} is the worse for it"
+        assert set(atlas.quarantined()) <= {name}
+        return found
+    finally:
+        atlas.close()
+
+
+def _outcome(atlas: Atlas, name: str, allowed: list[State]) -> str:
+    try:
+        read = answers(atlas.get(name))
+    except MapQuarantined:
+        report = atlas.verify(name)
+        assert not report.ok
+        assert any(".sqlite" in line or ".seg" in line for line in report.problems), report
+        return "quarantined"
+    except StorageFailure:
+        with suppress(StorageFailure):  # that the disk does not let it be read is told as well
+            assert not atlas.verify(name).ok
+        return "refused"
+    report = atlas.verify(name)
+    if read not in allowed:
+        assert not report.ok, "another answer, and verify finds nothing"
+        return "wrong until verified"
+    return "harmless" if report.ok else "verified"
+
+
+def damaged(sound: Sound, folder: Path, path: Path, damage: Damage, chosen: random.Random) -> Path:
+    """A copy of a data directory with one file damaged."""
+    copy = folder / "copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(sound.directory, copy)
+    damage(copy / path.relative_to(sound.directory), chosen)
+    return copy
+
+
+def files_of(sound: Sound) -> list[Path]:
+    """Of the two maps that are damaged."""
+    found = [path for name in ("lab", "coded") for path in sorted((sound.directory / "maps" / name).iterdir())]
+    assert len(found) > 12
+    return found
+
+
+def run_cases(
+    sound: Sound, folder: Path, paths: list[Path], count: int, damages: Sequence[Damage] = DAMAGES
+) -> Counter[str]:
+    """``count`` seeded cases; what became of them, counted."""
+    chosen, outcomes, failures = random.Random(SEED), Counter[str](), []
+    for number in range(count):
+        path, damage = paths[number % len(paths)], chosen.choice(damages)
+        try:
+            copy = damaged(sound, folder, path, damage, chosen)
+            outcomes[outcome(sound, copy, path.parent.name, path.name.endswith("-wal"))] += 1
+        except Exception as error:
+            where = f"seed {SEED}, case {number}, {path.relative_to(sound.directory)}, {damage.__name__}"
+            failures.append(f"{where}: {type(error).__name__}: {str(error)[:300]}")
+    assert not failures, f"{len(failures)} of {count}:\n" + "\n".join(failures)
+    return outcomes
+
+
+def kind(sound: Sound, suffix: str) -> list[Path]:
+    """The files of a kind."""
+    return [path for path in files_of(sound) if path.name.endswith(suffix)]
+
+
+def test_a_damaged_database_is_found(closed: Sound, tmp_path: Path) -> None:
+    outcomes = run_cases(closed, tmp_path, kind(closed, ".sqlite"), 10)
+    assert outcomes["quarantined"] and not outcomes["wrong until verified"]
+
+
+def test_a_damaged_database_with_a_log_is_found(crashed: Sound, tmp_path: Path) -> None:
+    paths = [path for suffix in (".sqlite", "-wal", "-shm") for path in kind(crashed, suffix)]
+    run_cases(crashed, tmp_path, paths, 8)
+
+
+def test_damaged_descriptors_are_found(closed: Sound, tmp_path: Path) -> None:
+    outcomes = run_cases(closed, tmp_path, kind(closed, ".seg"), 8)
+    assert outcomes["quarantined"]
+
+
+def test_a_damaged_cache_is_made_again(closed: Sound, tmp_path: Path) -> None:
+    """Every file of the index, each in another way: the answers stay the same to the last bit, and it is made again."""
+    chosen = random.Random(SEED)
+    for number, path in enumerate(kind(closed, ".index")):
+        copy = damaged(closed, tmp_path, path, DAMAGES[(number + SEED) % len(DAMAGES)], chosen)
+        assert outcome(closed, copy, "coded") == "harmless"
+        check_rebuilt(copy)
+
+
+def check_rebuilt(copy: Path) -> None:
+    """Are all files of the index there again?"""
+    atlas = Atlas(copy)
+    try:
+        coded = atlas.get("coded")
+        until = time.monotonic() + 60
+        while (coded.index_status().state != "ready" or coded.verify().stale_caches) and time.monotonic() < until:
+            time.sleep(0.01)
+        assert coded.index_status().tier == "inverted"
+        assert coded.verify().stale_caches == []
+    finally:
+        atlas.close()
+
+
+def test_a_log_that_is_damaged_in_its_middle_is_found(crashed: Sound, tmp_path: Path) -> None:
+    """What was committed after the damage was acknowledged, so the map must not go on without it."""
+    path, chosen = crashed.directory / "maps" / "lab" / "map.sqlite-wal", random.Random(SEED)
+    for offset in (16, 32 + 16, 32 + 24 + 5):  # the header's salt, the first frame's checksum, its page
+        copy = damaged(crashed, tmp_path, path, lambda found, _, at=offset: flip(found, at), chosen)  # type: ignore[misc]
+        assert outcome(crashed, copy, "lab") == "quarantined"
+
+
+def test_the_end_of_a_log_that_is_damaged_is_as_a_crash_leaves_it(crashed: Sound, tmp_path: Path) -> None:
+    path = crashed.directory / "maps" / "lab" / "map.sqlite-wal"
+    copy = damaged(crashed, tmp_path, path, lambda found, _: flip(found, found.stat().st_size - 9), random.Random(SEED))
+    atlas = Atlas(copy)
+    assert answers(atlas.get("lab")) == crashed.allowed["lab"][1], "all but the last commit"
+    assert atlas.verify("lab").ok
+    atlas.get("lab").enrol([frame("goes-on")])
+    atlas.close()
+
+
+def test_every_value_of_a_row_has_a_checksum(closed: Sound, tmp_path: Path) -> None:
+    """Values that are changed behind the map's back in a way that SQLite finds nothing wrong with."""
+    moment = "'2026-01-01T00:00:00.000000+00:00'"
+    changes = {
+        "places": {
+            "x": "99.5", "heading": "12.0", "timestamp": moment, "regions": "regions + 1", "metadata": "'{}'",
+            "created_at": moment, "digest": "randomblob(32)", "camera": "'right'",
+        },
+        "map": {"description": "'b'", "same_place_radius": "7.5", "revision": "9", "keep": "'none'"},
+        "cameras": {"mask": "NULL"},
+        "sequences": {"next_ordinal": "0"},
+    }  # fmt: skip
+    for table, columns in changes.items():
+        for column, value in columns.items():
+            copy = damaged(closed, tmp_path, closed.directory / "FORMAT", lambda *_: None, random.Random(SEED))
+            connection = sqlite3.connect(copy / "maps" / "lab" / "map.sqlite")
+            places = "WHERE id = 'lab7'" if table == "places" else ""
+            before = connection.execute(f"SELECT {column} FROM {table} {places}").fetchall()
+            connection.execute("DROP TRIGGER place_values_changed") if column == "metadata" else None
+            connection.execute(f"UPDATE {table} SET {column} = {value} {places}")
+            assert connection.execute(f"SELECT {column} FROM {table} {places}").fetchall() != before
+            connection.commit()
+            connection.close()
+            found = outcome(closed, copy, "lab")
+            assert found in ("quarantined", "verified"), f"{table}.{column}: {found}"
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("state", ["closed", "crashed"])
+def test_every_file_in_every_way(state: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    sound: Sound = request.getfixturevalue(state)
+    count = int(os.environ.get("PLACEREC_FAULT_CASES", "1500"))
+    outcomes = run_cases(sound, tmp_path, files_of(sound), count)
+    print(dict(outcomes))
+    flips = (flip_anywhere, flip_used)
+    print(dict(run_cases(sound, tmp_path, kind(sound, ".sqlite"), count, flips)))

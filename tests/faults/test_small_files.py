@@ -1,0 +1,147 @@
+"""The small files beside the maps, and exports: damaged ones are put aside or refused; nothing ends in a crash."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+from collections import Counter
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
+from core.storage import Atlas
+from core.storage.archives.reading import Archive, check
+from service.faults import KeysUnreadable
+from service.job_records import Job, JobRecords
+from service.keys import KeyStore
+from service.session_store import SessionStore, StoredSession
+from service.statistics import QueryStatistics, Statistics
+from tests.core.storage.archives.files import exported
+from tests.faults.damage import DAMAGES
+from tests.faults.test_damaged_files import make_map
+
+SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
+CASES = 8
+CONTENT = [damage for damage in DAMAGES if damage.__name__.startswith(("flip", "cut", "zero", "append"))]
+"""An export is what somebody brings; that it cannot be opened is between them and their disk."""
+
+Use = Callable[[Path], object]
+REFUSALS = (StorageFull, StorageFailure, DataDirectoryTooNew, KeysUnreadable, InvalidArchive, ArchiveTooNew)
+KEY = ("lab", "2026-11-21T10:00:00+00:00")
+
+
+def use_jobs(folder: Path) -> object:
+    """All jobs there are; then one more is taken."""
+    records = JobRecords(folder)
+    try:
+        found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in records.read()]
+        number = records.last_number() + 1
+        records.put(Job(number, f"j{number}", "verify", "lab", {"a": "x" * 50}, True, datetime(2026, 1, 1, tzinfo=UTC)))
+        return found
+    finally:
+        records.close()
+
+
+def use_sessions(folder: Path) -> object:
+    """All sessions there are, with what they believe; then one more is taken."""
+    store = SessionStore(folder)
+    try:
+        found = [store.read(session.id) for session in store.all()]
+        store.write(StoredSession(f"s{len(found)}", "lab", KEY[1], "{}", 1.0, 2.0, state=b"believed" * 20))
+        return found
+    finally:
+        store.close()
+
+
+def use_statistics(folder: Path) -> object:
+    """What was counted of a map; then one more answer is."""
+    statistics = QueryStatistics(folder, 3600, lambda: {KEY: 5}, lambda _: set())
+    try:
+        found: Statistics = statistics.read(KEY)
+        statistics.observe(KEY, "recognized", "p0", 0.5, 0.5)
+        statistics.flush()
+        return {place: count.best for place, count in found.places.items()}
+    finally:
+        statistics.close()
+
+
+def use_keys(folder: Path) -> object:
+    """Who may come in."""
+    return [(key.id, key.name, key.role, key.maps, key.digest) for key in KeyStore(folder).all()]
+
+
+def use_export(folder: Path) -> object:
+    """All parts of an export, compared with their checksums."""
+    with Archive(folder / "export.tar") as archive:
+        check(archive)
+    return True
+
+
+USES: dict[str, Use] = {
+    "jobs.sqlite": use_jobs,
+    "sessions.sqlite": use_sessions,
+    "statistics.sqlite": use_statistics,
+    "keys.sqlite": use_keys,
+    "export.tar": use_export,
+}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one of each, in use for a while."""
+    folder = tmp_path_factory.mktemp("small")
+    for _ in range(4):
+        for use in (use_jobs, use_sessions, use_statistics):
+            use(folder)
+    store = KeyStore(folder)
+    for name in ("robot", "operator"):
+        store.create(name, "query" if name == "robot" else "admin")
+    atlas = Atlas(folder / "maps", rows_per_segment=4)
+    (folder / "export.tar").write_bytes(exported(make_map(atlas, "lab"), folder / "kept"))
+    atlas.close()
+    for left in ("maps", "kept"):
+        shutil.rmtree(folder / left, ignore_errors=True)
+    return folder
+
+
+@pytest.mark.parametrize("name", USES)
+def test_a_damaged_file_ends_in_no_crash(sound: Path, tmp_path: Path, name: str) -> None:
+    run_cases(sound, tmp_path, name, CASES)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", USES)
+def test_a_damaged_file_in_every_way(sound: Path, tmp_path: Path, name: str) -> None:
+    print(name, dict(run_cases(sound, tmp_path, name, int(os.environ.get("PLACEREC_FAULT_CASES", "1500")))))
+
+
+def run_cases(sound: Path, folder: Path, name: str, count: int) -> Counter[str]:
+    """``count`` seeded cases of damage to a file; what became of them, counted."""
+    chosen, outcomes, failures = random.Random(SEED), Counter[str](), []
+    expected = USES[name](shutil.copytree(sound, folder / "sound"))
+    for number in range(count):
+        copy = folder / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(sound, copy)
+        damage = chosen.choice(CONTENT if name == "export.tar" else DAMAGES[:-1])
+        damage(copy / name, chosen)
+        try:
+            found = USES[name](copy)
+            put_aside = list(copy.glob(f"{name}.damaged*"))
+            outcomes["put aside" if put_aside else "harmless" if found == expected else "other"] += 1
+        except (*REFUSALS, sqlite3.Error) as refusal:
+            assert not isinstance(refusal, sqlite3.Error) or name == "sessions.sqlite"
+            assert str(refusal)
+            outcomes["refused"] += 1
+        except Exception as error:
+            failures.append(f"seed {SEED}, case {number}, {damage.__name__}: {type(error).__name__}: {error}")
+    assert not failures, f"{name}: {len(failures)} of {count}:\n" + "\n".join(failures)
+    if name == "export.tar":
+        assert not outcomes["other"], "what is imported is what was written"
+    return outcomes

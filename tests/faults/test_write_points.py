@@ -1,0 +1,191 @@
+"""ENOSPC and EIO at every write point of the storage layer: what is taken is there, what is refused is not."""
+
+from __future__ import annotations
+
+import copy
+import os
+import random
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.storage import Atlas
+from tests.faults.injection import Nursery, Point, write_points
+from tests.faults.model import State, all_told
+from tests.faults.script import AFTERWARDS, PLAIN, STEPS, Step, empty
+from tests.syscalls import strace
+
+pytestmark = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
+
+SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
+"""Chooses the points of the short run; named when one fails."""
+
+REFUSALS = {"StorageFull", "StorageFailure"}
+FOLLOWING = {"UnknownMap", "UnknownPlace", "UnknownSequence", "KeyError", "AssertionError"}
+"""What a step says whose own ground was refused before it: no such map, because it was not made."""
+
+
+@pytest.fixture(scope="module")
+def nursery() -> Iterator[Nursery]:
+    with Nursery() as nursery:
+        yield nursery
+
+
+@pytest.fixture(scope="module")
+def points(nursery: Nursery) -> list[Point]:
+    return write_points(nursery)
+
+
+def possible_states(steps: Sequence[Step], outcomes: Sequence[str]) -> list[State]:
+    """What the maps may hold after these outcomes: one state, and more where a refusal leaves it open.
+
+    While the disk refuses to sync, SQLite's log may hold a commit that was refused and cannot be emptied.  In the
+    process it is as if it had never been; should the map be opened anew before a write is taken, it is there, whole.
+    """
+    states: list[State] = [{}]
+    refused: list[Step] = []
+    for step, outcome in zip(steps, outcomes, strict=True):
+        if step.name == "open again":
+            states += [after for state in states for one in refused if (after := changed_by(one, state)) is not None]
+        if outcome in REFUSALS:
+            refused.append(step)
+        elif outcome == "taken" and not step.of_atlas:
+            refused.clear()
+        changed = [after for state in states if (after := changed_by(step, state)) is not None]
+        if outcome == "taken":
+            states = changed
+        elif outcome in REFUSALS and not step.is_whole:
+            states += changed
+    return states
+
+
+def changed_by(step: Step, state: State) -> State | None:
+    """The state after a step; None if the step cannot be done in it."""
+    after = copy.deepcopy(state)
+    try:
+        step.effect(after)
+    except KeyError:
+        return None
+    return after
+
+
+def check(told: dict[str, Any], directory: Path, steps: Sequence[Step]) -> None:
+    """No surprise on the way, the state one of those that may be, and the same after a restart."""
+    assert "unexpected" not in told, told["unexpected"]
+    outcomes = told["outcomes"]
+    assert not [outcome for outcome in outcomes if outcome.startswith("unexpected")], outcomes
+    refused = [number for number, outcome in enumerate(outcomes) if outcome in REFUSALS]
+    following = [number for number, outcome in enumerate(outcomes) if outcome not in REFUSALS | {"taken"}]
+    assert {outcomes[number] for number in following} <= FOLLOWING, outcomes
+    assert not following or min(refused) < min(following), outcomes
+    assert told["quarantined"] == {}
+    allowed = possible_states(steps, outcomes)
+    assert told["state"] in allowed, outcomes
+    assert not any(told["problems"].values()), told["problems"]
+    assert (told["last"], told["best"]) == ("taken", "afterwards")
+    state = told["state"]
+    state.setdefault("lab", empty())
+    AFTERWARDS.effect(state)
+    atlas = Atlas(directory)
+    try:
+        assert atlas.quarantined() == {}
+        assert all_told(atlas) == state
+        assert all(atlas.verify(map_id).ok for map_id in state)
+        assert atlas.unlisted().keys() <= {"hall"}
+    finally:
+        atlas.close()
+    assert not list(directory.rglob("*.tmp"))
+    assert not [path for path in (directory / "maps").iterdir() if path.name.startswith((".making", ".removing"))]
+
+
+def inject(nursery: Nursery, folder: Path, point: Point, error: str, count: int = 1, indexed: bool = False) -> None:
+    """Refuse ``count`` calls from a point on, and check."""
+    when = f"{point.number}..{point.number + count - 1}" if count > 1 else str(point.number)
+    fault = f"inject={point.call}:error={error}:when={when}"
+    arguments = ["-o", str(folder.with_suffix(".trace")), "-e", f"trace={point.call}", "-e", fault]
+    try:
+        told = nursery.run(folder, arguments, indexed)
+        assert "INJECTED" in folder.with_suffix(".trace").read_text() or indexed
+        check(told, folder / "data", STEPS if indexed else PLAIN)
+    except AssertionError as error_found:
+        raise AssertionError(f"seed {SEED}, {fault}: {point.text[:120]}: {error_found}") from error_found
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.with_suffix(".trace").unlink(missing_ok=True)
+
+
+def test_the_write_points_are_of_every_kind(points: list[Point]) -> None:
+    assert {point.call for point in points} >= {
+        "openat", "pwrite64", "fsync", "fdatasync", "ftruncate", "mkdir", "rename", "unlink", "mmap",
+    }  # fmt: skip
+    assert len(points) > 400
+
+
+def sample(points: Sequence[Point], count: int) -> list[Point]:
+    """Of each kind of call so many, the same for the same seed."""
+    chosen = random.Random(SEED)
+    calls = sorted({point.call for point in points})
+    by_call = {call: [point for point in points if point.call == call] for call in calls}
+    return [point for call in calls for point in chosen.sample(by_call[call], min(count, len(by_call[call])))]
+
+
+@pytest.mark.parametrize("error", ["ENOSPC", "EIO"])
+def test_a_refused_call_at_a_write_point(nursery: Nursery, points: list[Point], tmp_path: Path, error: str) -> None:
+    for number, point in enumerate(sample(points, 1)):
+        inject(nursery, tmp_path / str(number), point, error)
+
+
+def test_a_disk_that_is_full_for_a_while(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
+    """Not one call fails but all of a kind, for a time; then the same process goes on."""
+    chosen = random.Random(SEED)
+    for number, call in enumerate(("pwrite64", "pwrite64", "fsync", "fdatasync", "openat")):
+        point = chosen.choice([point for point in points if point.call == call])
+        inject(nursery, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO"]), chosen.randint(2, 12))
+
+
+def test_a_directory_that_is_read_only_for_a_while(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
+    chosen = random.Random(SEED)
+    for number, call in enumerate(("openat", "mkdir", "rename")):
+        point = chosen.choice([point for point in points if point.call == call])
+        inject(nursery, tmp_path / str(number), point, "EROFS", 3)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("error", ["ENOSPC", "EIO"])
+def test_every_write_point(nursery: Nursery, points: list[Point], tmp_path: Path, error: str) -> None:
+    failures = []
+    for number, point in enumerate(points):
+        try:
+            inject(nursery, tmp_path / str(number), point, error)
+        except AssertionError as failure:
+            failures.append(str(failure))
+    assert not failures, f"{len(failures)} of {len(points)}:\n" + "\n".join(failures)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_every_window_of_refusals(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
+    failures, chosen = [], random.Random(SEED)
+    for number, point in enumerate(points):
+        try:
+            inject(nursery, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO", "EROFS"]), 1 + number % 40)
+        except AssertionError as failure:
+            failures.append(str(failure))
+    assert not failures, f"{len(failures)} of {len(points)}:\n" + "\n".join(failures)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(7200)
+def test_the_index_at_its_write_points(nursery: Nursery, tmp_path: Path) -> None:
+    failures = []
+    chosen = [point for point in write_points(nursery, indexed=True) if point.call not in ("pwrite64", "mmap")]
+    for number, point in enumerate(chosen):
+        try:
+            inject(nursery, tmp_path / str(number), point, ("ENOSPC", "EIO")[number % 2], indexed=True)
+        except AssertionError as failure:
+            failures.append(str(failure))
+    assert not failures, f"{len(failures)} of {len(chosen)}:\n" + "\n".join(failures)

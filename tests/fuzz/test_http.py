@@ -1,0 +1,30 @@
+"""Bytes that are no HTTP, and a WebSocket full of nonsense."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.fuzz import images, streams
+from tests.fuzz.http import MALFORMED, complaint, mangled, spoken
+from tests.fuzz.originals import originals
+from tests.fuzz.sending import MAP
+from tests.service.server import Server
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_what_is_no_request_is_refused_or_hung_up_on(fuzzed: Server, name: str) -> None:
+    statuses, ended = spoken(fuzzed.port, MALFORMED[name])
+    assert ended and len(statuses) <= 1, "bytes behind a request that is refused are none"
+    assert all(400 <= status < 500 for status in statuses), statuses
+    assert fuzzed.client.get("/livez").status_code == 200
+    assert fuzzed.client.get("/v1/maps/smuggled").status_code == 404
+
+
+def test_mangled_requests_hurt_nobody(fuzzed: Server) -> None:
+    assert [wrong for sent in mangled(1, 60) if (wrong := complaint(fuzzed.port, sent))] == []
+    assert fuzzed.client.get("/readyz").status_code == 200
+
+
+def test_a_stream_of_nonsense_is_answered(fuzzed: Server) -> None:
+    images.prepare(fuzzed.client)
+    assert streams.run(str(fuzzed.client.base_url), MAP, originals(), seed=2, count=120) == []

@@ -1,0 +1,226 @@
+"""Whatever the bytes of a file or a header: a parser gives a value or its own error, and takes no time over it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+from scipy.io import savemat
+
+from core.checkpoints import read_checkpoint
+from core.containers import find_exif
+from core.encoders import load_encoder
+from core.errors import InvalidArchive, InvalidCursor, InvalidImage, InvalidModel, PlacerecError
+from core.exif import read_orientation, read_whereabouts
+from core.images import decode
+from core.matfiles import read_mat
+from core.network import load_network, read_definition
+from core.storage.archives.manifest import read_manifest
+from core.storage.archives.tape import manifest_size
+from core.storage.arrays import StaleArrays, read_arrays, write_arrays
+from core.storage.cursors import decode_name, decode_number, encode_cursor
+from service.faults import Fault
+from service.filters import FilterParameters, parse_box, parsed_json
+from service.multipart import FormReader
+from service.parameters import EnrolParameters, validated
+from service.traces import read_trace
+from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
+
+FEW = settings(max_examples=60, deadline=2000, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+
+Reader = Callable[[Path], object]
+
+
+@st.composite
+def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
+    """A sound file with bytes changed, taken out, put in, or its end cut off."""
+    data = bytearray(sound)
+    for _ in range(draw(st.integers(1, 5))):
+        # Most of what a parser decides on stands at the start and at the end.
+        near = st.integers(0, min(len(data), 400)) | st.integers(max(0, len(data) - 300), len(data))
+        at = draw(near | st.integers(0, len(data)))
+        match draw(st.sampled_from(["change", "change", "cut", "insert", "truncate", "extreme"])):
+            case "change":
+                data[at : at + 1] = draw(st.binary(min_size=1, max_size=2))
+            case "cut":
+                del data[at : at + draw(st.integers(1, 40))]
+            case "insert":
+                data[at:at] = draw(st.binary(min_size=1, max_size=12))
+            case "truncate":
+                del data[at:]
+            case _:
+                data[at : at + 8] = draw(st.sampled_from([b"\xff" * 8, b"\0" * 8, b"\x7f" + b"\xff" * 7, b"\x80" * 4]))
+    return bytes(data)
+
+
+def _mat(path: Path, compressed: bool) -> None:
+    net = {"layers": np.array([1.0, 2.0]), "name": "x", "weights": np.arange(24, dtype=np.float32).reshape(2, 3, 4)}
+    savemat(path, {"net": net, "more": 3.0}, do_compression=compressed)
+
+
+def _everything(path: Path) -> object:
+    return {name: tensor.shape for name, tensor in read_checkpoint(path).items()}
+
+
+def _state() -> dict[str, torch.Tensor]:
+    return {"conv.weight": torch.arange(24.0).reshape(2, 3, 2, 2), "conv.bias": torch.zeros(2)}
+
+
+FILES: dict[str, tuple[Callable[[Path], object], Reader]] = {
+    "mat": (lambda path: _mat(path, False), read_mat),
+    "mat-compressed": (lambda path: _mat(path, True), read_mat),
+    "checkpoint-zip": (lambda path: torch.save(_state(), path), _everything),
+    "checkpoint-legacy": (
+        lambda path: torch.save(_state(), path, _use_new_zipfile_serialization=False),
+        _everything,
+    ),
+    "checkpoint-safetensors": (lambda path: save_file(_state(), path), _everything),
+    "arrays": (
+        lambda path: write_arrays(path, "codes", "x", {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros(3, np.uint8)}),
+        lambda path: read_arrays(path, "codes", "x"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_damaged_files_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    write, read = FILES[name]
+    write(tmp_path / "sound")
+    sound = (tmp_path / "sound").read_bytes()
+    assert read(tmp_path / "sound")
+
+    @FEW
+    @given(damaged(sound))
+    def check(data: bytes) -> None:
+        path = tmp_path / "damaged"
+        path.write_bytes(data)
+        try:
+            read(path)
+        except (InvalidModel, StaleArrays) as error:
+            assert str(error)
+
+    check()
+
+
+def test_damaged_models_are_refused_or_are_themselves() -> None:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        install_small_encoder(folder)
+        network, encoder = folder / f"{SMALL}.network.safetensors", folder / f"{SMALL}.encoder.safetensors"
+        sound = {path: path.read_bytes() for path in (network, encoder)}
+
+        @FEW
+        @given(st.sampled_from([network, encoder]).flatmap(lambda path: st.tuples(st.just(path), damaged(sound[path]))))
+        def check(given_: tuple[Path, bytes]) -> None:
+            path, data = given_
+            for each, content in sound.items():
+                each.write_bytes(data if each == path else content)
+            try:
+                assert read_definition(network).name
+                load_network(network, ("conv1",))
+                load_encoder(encoder, network)
+            except InvalidModel as error:
+                assert str(error)
+
+        check()
+        assert NETWORK.name == SMALL
+
+
+NESTED = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@FEW
+@given(st.text(max_size=80) | st.binary(max_size=80).map(lambda raw: raw.decode("latin-1")), st.data())
+def test_cursors(text: str, data: st.DataObject) -> None:
+    sound = encode_cursor(["places", "lab", None], 7)
+    for cursor in (text, data.draw(damaged(sound.encode())).decode("latin-1"), "[" * 3000, "W" * 2000):
+        for read in (decode_number, decode_name):
+            try:
+                read(["places", "lab", None], cursor)
+            except InvalidCursor as error:
+                assert str(error)
+
+
+@FEW
+@given(damaged(b"00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01") | st.binary(max_size=300))
+def test_traces(value: bytes) -> None:
+    found = read_trace([(b"traceparent", value)])
+    assert found is None or (len(found.trace_id) == 32 and len(found.response) == 55)
+
+
+TURNED = bytes.fromhex("49492a0008000000020012010300010000000600000025880400010000001a000000") + bytes(60)
+
+
+@FEW
+@given(damaged(TURNED))
+def test_exif_blocks(block: bytes) -> None:
+    assert 1 <= read_orientation(block) <= 8
+    read_whereabouts(b"\xff\xd8\xff\xe1" + (len(block) + 8).to_bytes(2, "big") + b"Exif\0\0" + block + b"\xff\xd9")
+
+
+@FEW
+@given(st.binary(max_size=300))
+def test_image_bytes(data: bytes) -> None:
+    find_exif(data)
+    with pytest.raises(InvalidImage):
+        decode(data)
+
+
+@FEW
+@given(st.binary(max_size=600) | damaged(b'{"format": "placerec-map", "version": 1, "parts": []}'))
+def test_manifests_and_tapes(text: bytes) -> None:
+    for read in (read_manifest, lambda text: manifest_size(text.ljust(512, b"\0"))):
+        try:
+            read(text)
+        except PlacerecError as error:
+            assert isinstance(error, InvalidArchive) or type(error).__name__ == "ArchiveTooNew"
+
+
+@FEW
+@given(st.dictionaries(st.sampled_from([*FilterParameters.model_fields]), NESTED, max_size=6), st.text(max_size=40))
+def test_parameters_and_filters(given_: dict[str, Any], text: str) -> None:
+    def filtered() -> object:
+        found = validated(FilterParameters, given_)
+        return found.position(), found.selection()
+
+    reads: list[Callable[[], object]] = [
+        filtered,
+        lambda: validated(EnrolParameters, given_),
+        lambda: parse_box(text),
+        lambda: parsed_json(text, "it"),
+    ]
+    for read in reads:
+        try:
+            read()
+        except (Fault, PlacerecError) as error:
+            assert str(error)
+
+
+FORM = (
+    b'--b\r\nContent-Disposition: form-data; name="a"; filename="x"\r\nContent-Type: image/png\r\n\r\nxyz\r\n--b--\r\n'
+)
+
+
+@FEW
+@given(damaged(FORM), st.text(st.characters(max_codepoint=255), max_size=30), st.integers(1, 50))
+def test_forms(body: bytes, boundary: str, size: int) -> None:
+    for kind in ("multipart/form-data; boundary=b", f"multipart/form-data; boundary={boundary}"):
+        try:
+            reader = FormReader(kind, 4, 100)
+            for start in range(0, len(body), size):
+                reader.feed(body[start : start + size])
+            assert len(reader.close()) <= 4
+        except Fault as error:
+            assert str(error)
