@@ -4,12 +4,13 @@
 
 Each image of the folder stands for one camera frame; without ``--frames`` it draws some itself.
 What to copy into a robot is ``localize``: a deadline, the same request id however often the frame
-is sent, pauses that grow, and no retry where the answer would be the same.
+is sent, pauses that grow, and no retry where the answer would be the same.  A key comes from PLACEREC_KEY.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import sys
 import tempfile
@@ -111,7 +112,9 @@ def camera(folder: Path) -> Iterator[tuple[str, bytes, str]]:
 
 def drive(url: str, map_id: str, folder: Path, deadline: float) -> None:
     """The robot's loop."""
-    with httpx.Client(base_url=url) as client:  # one connection for the whole run
+    key = os.environ.get("PLACEREC_KEY")  # not an option: others can see the words of a command
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    with httpx.Client(base_url=url, headers=headers) as client:  # one connection for the whole run
         for name, frame, media_type in camera(folder):
             began = time.monotonic()
             try:

@@ -4,12 +4,14 @@
 
 Each image of the folder stands for one camera frame.  The session is begun over HTTP; then every frame is a text
 message with what the robot knows of it (its number, when it was taken, its odometry) and a binary one with the picture.
+A key comes from PLACEREC_KEY.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,11 +46,14 @@ def act(answer: dict[str, Any]) -> str:
 def stream(url: str, map_id: str, frames: Path) -> None:
     """One run: a session, its frames, its end."""
     sessions = f"{url}/v1/maps/{map_id}/sessions"
-    begun = httpx.post(sessions, json={"filter": "bayes"})
+    key = os.environ.get("PLACEREC_KEY")  # not an option: others can see the words of a command
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    begun = httpx.post(sessions, json={"filter": "bayes"}, headers=headers)
     begun.raise_for_status()
     session = f"{sessions}/{begun.json()['id']}"
     try:
-        with connect(session.replace("http", "ws", 1) + "/stream", compression=None) as connection:
+        address = session.replace("http", "ws", 1) + "/stream"
+        with connect(address, compression=None, additional_headers=headers) as connection:
             for number, path in enumerate(sorted(frames.iterdir())):
                 if path.suffix.lower() not in PICTURES:
                     continue
@@ -56,7 +61,7 @@ def stream(url: str, map_id: str, frames: Path) -> None:
                 connection.send(path.read_bytes())
                 print(f"{path.name}: {act(json.loads(connection.recv(timeout=30)))}", flush=True)
     finally:
-        httpx.delete(session)
+        httpx.delete(session, headers=headers)
 
 
 def main() -> None:

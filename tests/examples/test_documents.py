@@ -35,6 +35,7 @@ def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) ->
         root = str(service.client.base_url).rstrip("/")
         path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
         environment = {**os.environ, "url": root, "api": f"{root}/v1", "PATH": path}
+        environment["PLACEREC_DATA_DIR"] = str(service.data_dir)  # for what is done beside a running service
         script = PRELUDE + "\n".join(BLOCK.findall(document.read_text()))
         done = subprocess.run(
             ["bash", "-euxo", "pipefail", "-c", script],

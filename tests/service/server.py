@@ -17,7 +17,7 @@ from typing import Any
 import httpx
 
 ROOT = Path(__file__).parents[2]
-START_SECONDS = 60.0
+START_SECONDS = 120.0
 
 
 def free_port() -> int:
@@ -34,9 +34,16 @@ class Server:
         folder: for its data and its log.
         settings: names without the prefix, such as ``{"queue_length": 1}``.
         wrapper: words before the command, such as those of strace.
+        key: that the client sends.
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, object] | None = None, wrapper: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        settings: Mapping[str, object] | None = None,
+        wrapper: Sequence[str] = (),
+        key: str | None = None,
+    ) -> None:
         self.folder, self.port = folder, free_port()
         self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
@@ -47,7 +54,8 @@ class Server:
         command = [*wrapper, sys.executable, "-m", "service.commands", "serve"]
         with self.log_file.open("ab") as log:
             self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
-        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60)
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60, headers=headers)
 
     def check_running(self) -> None:
         """Fail with the end of the log if the process has ended."""

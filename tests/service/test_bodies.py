@@ -54,7 +54,8 @@ def complete(answer: bytes) -> bool:
 
 
 def head(path: str, *lines: str) -> bytes:
-    return "\r\n".join([f"POST {path} HTTP/1.1", "Host: test", "Content-Type: image/jpeg", *lines, "", ""]).encode()
+    start = [f"POST {path} HTTP/1.1", "Host: localhost", "Content-Type: image/jpeg"]
+    return "\r\n".join([*start, *lines, "", ""]).encode()
 
 
 def test_a_body_that_announces_too_much_is_refused_unread(tight_server: Server) -> None:
@@ -120,7 +121,7 @@ def test_uploads_share_a_bounded_memory(tight_server: Server, tight_map: str) ->
         picture = encoded(scene(1), quality=60)
         response = tight_server.client.post("/v1/encode", content=picture, headers=JPEG)
         assert_problem(response, 503, "memory-full")
-        assert response.headers["retry-after"] == "1"
+        assert 1 <= int(response.headers["retry-after"]) <= 3
     finally:
         for connection in connections:
             connection.close()

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import time
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from core.errors import RevisionMismatch
+from core.storage import Map
+from core.verdict import Calibration
+from service import calibrating
+from service.schemas.calibration import CalibrationOrder, CalibrationReport
+from tests.service.engines import ENCODER, end_of, engine_at
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
@@ -219,3 +226,51 @@ def test_bodies_that_are_none(client: httpx.Client, walked: str) -> None:
 def test_an_edit_in_between_is_noticed(client: httpx.Client, walked: str) -> None:
     response = client.post(f"/v1/maps/{walked}/calibrate", json=order(dry_run=False), headers={"If-Match": '"999"'})
     assert_problem(response, 412, "revision-mismatch")
+
+
+def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The job, a restart between its commit and its end, and an order that came too late; without HTTP."""
+    with engine_at(tmp_path) as engine:
+        lab = engine.atlas.create("lab", ENCODER, 8)
+        manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
+        found = manual.model_copy(update={"source": "map", "threshold": 0.25})
+
+        def measured(map_: Map, *_: object) -> CalibrationReport:
+            if happens is not None:
+                map_.edit({"calibration": happens})
+            return CalibrationReport.model_construct(
+                map="lab", encoder=ENCODER, method="map", stored=True, calibration=found, previous=manual, warnings=[]
+            )
+
+        monkeypatch.setattr(calibrating, "measured", measured)
+        monkeypatch.setattr(calibrating, "load_encoder", lambda *_: None)
+        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        happens: Calibration | None = manual
+        job = end_of(engine, engine.jobs.submit(calibrating.KIND, "lab", arguments=wanted))
+        assert job.problem is not None and job.problem["type"] == "urn:placerec:problem:revision-mismatch"
+        assert lab.record.calibration == manual
+
+        happens = None
+        lab.edit({"description": "any other change does not matter"})
+        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        lab.edit({"description": "nor one that comes later"})
+        assert end_of(engine, engine.jobs.submit(calibrating.KIND, "lab", arguments=wanted)).state == "succeeded"
+        assert lab.record.calibration == found
+
+        with pytest.raises(RevisionMismatch):
+            calibrating.store(lab, manual, manual, None)
+        with pytest.raises(RevisionMismatch):
+            calibrating.store(lab, manual, found, lab.record.revision - 1)
+        calibrating.store(lab, manual, found, lab.record.revision)
+        assert lab.record.calibration == manual
+
+
+def test_what_takes_longer_than_the_request_may_is_given_up(server: Server, walked: str) -> None:
+    before = server.client.get(f"/v1/maps/{walked}").json()["calibration"]
+    response = server.client.post(
+        f"/v1/maps/{walked}/calibrate",
+        json=order(dry_run=False, target={"rule": "precision", "value": 0.5}),
+        headers={"X-Request-Timeout": "0.001"},
+    )
+    assert_problem(response, 503, "deadline-exceeded")
+    assert server.client.get(f"/v1/maps/{walked}").json()["calibration"] == before

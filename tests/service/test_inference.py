@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import pytest
 
@@ -166,7 +167,7 @@ def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> No
     for answer in answers:
         if answer.status_code == 503:
             assert_problem(answer, 503, "queue-full")
-            assert answer.headers["retry-after"] == "1"
+            assert 1 <= int(answer.headers["retry-after"]) <= 3
     assert tight_server.client.post("/v1/encode", content=frame, headers=HEADERS).status_code == 200
     assert 'placerec_problems_total{type="queue-full"}' in tight_server.client.get("/metrics").text
 
@@ -188,10 +189,28 @@ def test_a_server_at_work_is_alive_and_keeps_deadlines(server: Server) -> None:
     assert refused, "a frame that would have waited for a large one was dropped"
     for answer in refused:
         assert_problem(answer, 503, "deadline-exceeded")
-        assert answer.headers["retry-after"] == "1"
+        assert 1 <= int(answer.headers["retry-after"]) <= 3
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "soon", "nan", "inf", "1e9"])
 def test_a_bad_deadline(server: Server, value: str) -> None:
     response = server.client.post("/v1/encode", content=jpeg(1), headers={**HEADERS, "X-Request-Timeout": value})
     assert_problem(response, 422, "invalid-request")
+
+
+def test_requests_of_many_frames_have_half_of_the_queue() -> None:
+    inference = Inference(EncoderCatalogue(), Limits(), 8, 0, Metrics())
+    try:
+        with ExitStack() as places:
+            for _ in range(4):
+                places.enter_context(inference.place_in_queue(2))
+            with pytest.raises(QueueFull), inference.place_in_queue(2):
+                pass
+            for _ in range(4):
+                places.enter_context(inference.place_in_queue(1))
+            with pytest.raises(QueueFull), inference.place_in_queue(1):
+                pass
+        with inference.place_in_queue(2):
+            assert inference.waiting == 1
+    finally:
+        inference.close()

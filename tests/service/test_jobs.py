@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -270,3 +271,125 @@ def test_work_goes_on_when_the_disk_refuses_to_remember_it(tmp_path: Path, monke
             gate.open.set()
             assert end_of(jobs, job).state == "succeeded"
         assert [found.id for found in jobs.all()] == [job.id], "what was refused is not there"
+
+
+def test_a_kind_that_is_gone_after_an_upgrade_ends_in_a_stated_failure(tmp_path: Path) -> None:
+    gate, discarded = Gate(), list[str]()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        job = jobs.submit("gate", "lab", arguments={"form": "f"})
+        assert gate.begun.wait(5)
+    with running(tmp_path, {"other": gate}) as jobs:
+        failed = jobs.get(job.id)
+        assert failed.state == "failed" and failed.problem is not None
+        assert failed.problem["type"] == "urn:placerec:problem:job-lost" and "gate" in failed.problem["detail"]
+    assert not discarded
+
+
+@pytest.mark.parametrize("how", ["a record", "the file"])
+def test_what_is_left_of_damaged_records_is_told_as_lost(tmp_path: Path, how: str) -> None:
+    import sqlite3
+
+    gate = Gate()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
+        job = jobs.submit("gate", "lab", arguments={})
+        assert gate.begun.wait(5)
+    connection = sqlite3.connect(tmp_path / FILE)
+    if how == "a record":
+        connection.execute("UPDATE jobs SET arguments = '{' WHERE id = ?", (job.id,))
+    else:
+        connection.execute("CREATE TABLE foreign_one (x)")
+        connection.execute("PRAGMA user_version = 0")
+    connection.commit()
+    connection.close()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        assert jobs.get(done.id).result == {"kept": True}
+        lost = jobs.get(job.id)
+        assert lost.state == "failed" and lost.problem is not None
+        assert lost.problem["type"] == "urn:placerec:problem:job-lost" and "damaged" in lost.problem["detail"]
+        if how == "the file":
+            with pytest.raises(UnknownJob, match="put aside"):
+                jobs.get("forgotten")
+        gate.open.set()
+        assert end_of(jobs, jobs.submit("gate", "lab", arguments={})).state == "succeeded"
+
+
+def test_a_file_of_the_first_version_is_taken_over(tmp_path: Path) -> None:
+    import sqlite3
+
+    with running(tmp_path) as jobs:
+        done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
+    connection = sqlite3.connect(tmp_path / FILE)
+    for later in ("maps", "asker"):
+        connection.execute(f"ALTER TABLE jobs DROP COLUMN {later}")
+    connection.execute("PRAGMA user_version = 1")
+    connection.commit()
+    connection.close()
+    with running(tmp_path) as jobs:
+        assert jobs.get(done.id) == replace(done, asker={})
+        assert end_of(jobs, jobs.submit("note", None, lambda _: {}, maps={"lab": "then"})).maps == {"lab": "then"}
+
+
+def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
+    gate, discarded = Gate(), list[str]()
+
+    def refuse(_: JobContext) -> dict[str, Any]:
+        raise UnknownMap("There is no map 'lab'.")
+
+    jobs = Jobs(tmp_path)
+    kinds: Kinds = {"gate": gate, "refuse": refuse}
+    for kind, work in kinds.items():
+        jobs.register(kind, work, lambda job: discarded.append(job.id))
+    jobs.start()
+    first, second, third = (jobs.submit(kind, None, arguments={}) for kind in ("gate", "refuse", "gate"))
+    assert gate.begun.wait(5)
+    jobs.cancel(third.id)
+    assert discarded == [third.id], "cancelled before it began"
+    gate.open.set()
+    end_of(jobs, first)
+    end_of(jobs, second)
+    jobs.close(5)
+    assert sorted(discarded) == sorted([first.id, second.id, third.id])
+
+
+def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.job_context.SLICE_SECONDS", 0.0)
+    order, ready = list[str](), threading.Event()
+
+    def stepping(context: JobContext) -> dict[str, Any]:
+        assert ready.wait(5)
+        while (step := context.notes.get("step", 0)) < 3:
+            order.append(f"{context.map_id}{context.arguments['name']}{step}")
+            context.remember(step=step + 1)
+            context.give_way()
+        return {}
+
+    with running(tmp_path, {"step": stepping}) as jobs:
+        maps = ["x", "y", "x"]
+        made = [jobs.submit("step", name, arguments={"name": "ab"[i // 2]}) for i, name in enumerate(maps)]
+        ready.set()
+        assert [end_of(jobs, job).state for job in made] == ["succeeded"] * 3
+    assert [step for step in order if step.startswith("x")] == ["xa0", "xa1", "xa2", "xb0", "xb1", "xb2"]
+    assert order.index("ya0") < order.index("xa2") and order.index("xa1") < order.index("ya2"), order
+
+
+def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None:
+    from core.storage import Atlas
+    from service.job_context import born
+
+    atlas, gate = Atlas(tmp_path / "data"), threading.Event()
+    lab = atlas.create("lab", "some@" + "0" * 64, 8)
+
+    def look(context: JobContext) -> dict[str, Any]:
+        assert gate.wait(5)
+        return {"places": context.map(atlas).count_places()}
+
+    with running(tmp_path) as jobs:
+        bound = jobs.submit("look", "lab", look, maps={"lab": born(lab)})
+        atlas.delete("lab")
+        again = atlas.create("lab", "some@" + "0" * 64, 8)
+        gate.set()
+        failed = end_of(jobs, bound)
+        assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
+        assert end_of(jobs, jobs.submit("look", "lab", look, maps={"lab": born(again)})).result == {"places": 0}
+    atlas.close()

@@ -13,10 +13,11 @@ import pytest
 
 from core.errors import StorageFull
 from core.places import PlaceFields
-from core.storage import Enrolment, MapSettings
+from core.storage import Atlas, Enrolment, MapSettings
 from core.storage.transfer import Transfer
 from service import merging
 from service.engine import Engine
+from service.job_context import born
 from tests.service.engines import ENCODER, end_of, engine_at, enrolments, state_of
 
 COUNT = 5 * merging.CHUNK
@@ -185,3 +186,52 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
         assert lab.digest(last) == newer.digest and lab.transfer.picture(last) == b"newer"
         assert engine.atlas.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
+
+
+@pytest.mark.parametrize("rule", ["rename", "skip"])
+def test_what_somebody_enrols_meanwhile_is_never_replaced(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, rule: str
+) -> None:
+    with engine_at(folder) as engine:
+        lab, last = engine.atlas.get("lab"), f"h{1000 + COUNT}"
+        before = state_of(engine, "lab")
+        (own,) = enrolments(7000, 1, "h", "tuesday")
+
+        def enrol(_: Any) -> None:
+            lab.enrol([Enrolment(last, own.fields, own.descriptor, 5, own.digest, thumbnail=b"theirs")])
+
+        after_two_commits(monkeypatch, enrol)
+        done = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED | {"on_conflict": rule}))
+        assert lab.digest(last) == own.digest and lab.transfer.picture(last) == b"theirs"
+        if rule == "skip":
+            assert done.state == "succeeded" and lab.count_places() == len(before) + COUNT
+        else:
+            assert done.problem is not None and done.problem["type"] == "urn:placerec:problem:merge-conflict"
+            here = state_of(engine, "lab")
+            assert here[:-1] == before and here[-1][0].id == last
+        assert engine.atlas.verify("lab").ok
+
+
+@pytest.mark.parametrize("which", ["lab", "hall"])
+def test_it_does_not_go_on_into_another_map_of_the_same_id(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, which: str
+) -> None:
+    with engine_at(folder) as engine:
+        before = state_of(engine, "lab")
+        maps = {name: born(engine.atlas.get(name)) for name in ("lab", "hall")}
+        after_two_commits(monkeypatch, lambda _: engine.jobs.stop_soon())
+        job = engine.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
+        until = time.monotonic() + 20
+        while not engine.jobs.stopping and time.monotonic() < until:
+            time.sleep(0.01)
+    atlas = Atlas(folder / "data")
+    atlas.delete(which)
+    atlas.create(which, ENCODER, 8).enrol(enrolments(8000, 3, "n", "monday"))
+    atlas.close()
+    with engine_at(folder) as engine:
+        failed = end_of(engine, job)
+        assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
+        if which == "hall":
+            assert state_of(engine, "lab") == before, "what came of the map that was deleted is taken out again"
+        else:
+            assert [entry[0].id for entry in state_of(engine, "lab")] == ["n8000", "n8001", "n8002"]

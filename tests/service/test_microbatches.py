@@ -363,3 +363,20 @@ def test_bulk_does_not_keep_a_robot_waiting(server: Server, traverse: str, map_i
     assert response.status_code == 200 and all(item["status"] == 201 for item in response.json()["items"])
     assert len(waits) > 3
     assert float(np.median(waits)) < 1e3 * seconds / 4, "a robot's frame did not wait for the whole request"
+
+
+def test_bulk_for_a_second_encoder_gets_its_turn(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(microbatches, "MOST_FRAMES", 2)
+    monkeypatch.setattr(microbatches, "MOST_BULK", 2)
+    order: list[object] = []
+    robots = [watched.turn(seed, DEFAULT_ENCODER) for seed in range(12)]
+    bulk = [watched.turn(seed, COARSE, bulk=True) for seed in range(2)]
+    for name, turns in (("robot", robots), ("bulk", bulk)):
+        for turn in turns:
+            turn.result.add_done_callback(noting(order, name))
+    go = watched.hold()
+    watched.batches.put([*bulk, *robots])
+    go()
+    for turn in (*robots, *bulk):
+        turn.result.result(60)
+    assert order.index("bulk") == 6, "three batches of robots, then theirs"

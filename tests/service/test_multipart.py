@@ -84,3 +84,11 @@ def test_what_is_no_form(body: bytes) -> None:
 def test_a_boundary_is_needed(content_type: str) -> None:
     with pytest.raises(MalformedBody):
         FormReader(content_type, 1, 1)
+
+
+@pytest.mark.parametrize("head", ["X-Long: " + "x" * 20_000, "\r\n".join(f"X-{n}: 1" for n in range(40)), "x" * 9_000])
+def test_the_headers_of_a_part_are_bounded(head: str) -> None:
+    with pytest.raises(MalformedBody, match=r"[Hh]eader"):
+        read(form((f"{disposition('a')}\r\n{head}", b"data")), size=1000)
+    with pytest.raises(MalformedBody):
+        FormReader(TYPE, 8, 1000).feed(f"--{BOUNDARY}\r\nX-Endless: ".encode() + b"x" * 1_000_000)

@@ -16,7 +16,9 @@ from service.problems import BY_STATUS, KINDS, TYPE_PREFIX, kind_of, problem_of
 from service.settings import Settings
 from tests.service.server import assert_problem
 
-CONTRACT = {400, 401, 403, 404, 405, 409, 410, 412, 413, 415, 422, 429, 500, 503, 507}
+CONTRACT = {400, 401, 403, 404, 405, 408, 409, 410, 412, 413, 414, 415, 416, 422, 429, 431, 500, 503, 507}
+CONTRACT |= {408, 414, 431}  # of the connection, before there is a request
+CONTRACT |= {416}  # of a download that goes on
 OURS = [
     cls
     for module in (errors, faults)
@@ -100,7 +102,7 @@ def breaking_app() -> FastAPI:
 @pytest.mark.anyio
 async def test_a_defect_of_ours_is_logged_and_not_told(breaking_app: FastAPI, caplog: pytest.LogCaptureFixture) -> None:
     transport = httpx.ASGITransport(breaking_app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
+    async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
         response = await client.get("/break", headers={"X-Request-Id": "seven"})
     problem = assert_problem(response, 500, "internal-error")
     assert "secret" not in response.text and problem["request_id"] == "seven"
@@ -111,7 +113,7 @@ async def test_a_defect_of_ours_is_logged_and_not_told(breaking_app: FastAPI, ca
 @pytest.mark.anyio
 async def test_behind_a_proxy_that_adds_a_path() -> None:
     app = create_app(Settings(host="127.0.0.1", root_path="/placerec"))
-    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test") as client:
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://127.0.0.1") as client:
         for prefix in ("", "/placerec"):
             assert (await client.get(f"{prefix}/livez")).status_code == 200
             response = await client.delete(f"{prefix}/v1/maps")
@@ -120,4 +122,5 @@ async def test_behind_a_proxy_that_adds_a_path() -> None:
 
 
 def test_a_broken_host_header_breaks_nothing(client: httpx.Client) -> None:
-    assert_problem(client.get("/nothing", headers={"Host": "[broken"}), 404, "unknown-path")
+    assert_problem(client.get("/nothing", headers={"Host": "[broken"}), 403, "foreign-page")
+    assert client.get("/livez", headers={"Host": "[broken"}).status_code == 200

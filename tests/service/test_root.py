@@ -50,7 +50,7 @@ def test_a_process_lives_before_it_is_ready_and_says_what_is_missing(tmp_path: P
         time.sleep(0.1)
     problem = assert_problem(response, 503, "not-ready")
     assert "absent" in problem["checks"]["encoder"] and problem["checks"]["disk"] == "ok"
-    assert response.headers["retry-after"] == "1"
+    assert 1 <= int(response.headers["retry-after"]) <= 3
     assert server.client.get("/livez").status_code == 200
     assert server.stop() == 0
 

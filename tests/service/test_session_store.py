@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,11 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert other.read("s-1") == ONE and other.read("s-2") is None
     (head,) = other.all()
     assert (head.id, head.number, head.state, head.answer) == ("s-1", 7, None, None)
+    assert other.renew(replace(ONE, number=8)) and not other.renew(replace(ONE, id="s-2"))
+    renewed = store.read("s-1")
+    assert renewed is not None and renewed.number == 8
     other.end("s-1", "over", 9.0)
+    assert not store.renew(ONE), "a frame that was under way does not bring it back"
     ended = store.read("s-1")
     assert ended is not None and (ended.ended, ended.used, ended.state) == ("over", 9.0, None)
     store.forget("s-1")

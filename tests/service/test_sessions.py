@@ -12,7 +12,9 @@ from typing import Any
 import httpx
 import pytest
 
+from service.schemas.sessions import NewSession
 from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.engines import ENCODER, engine_at, enrolments
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text, typed
 
@@ -283,6 +285,19 @@ def small(tmp_path: Path) -> Iterator[Server]:
     running.create_map("lab")
     yield running
     assert running.stop() == 0
+
+
+def test_what_was_charted_for_a_session_goes_with_it(tmp_path: Path) -> None:
+    with engine_at(tmp_path) as engine:
+        map_ = engine.atlas.create("lab", ENCODER, 8)
+        map_.open()
+        for number in range(4):
+            map_.enrol(enrolments(10 * number, 3, "p", f"s{number}"))
+        engine.sessions.create(map_, NewSession())
+        for number in range(4):
+            engine.sessions.delete(engine.sessions.create(map_, NewSession(sequences=[f"s{number}"])))
+        assert len(engine.sessions._charts) == 1 and engine.sessions.count() == 1
+        engine.sessions.close()
 
 
 def test_sessions_expire_and_are_bounded(small: Server) -> None:

@@ -68,6 +68,7 @@ def test_other_machines_are_not(host: str) -> None:
     with pytest.raises(SettingsError, match="PLACEREC_ALLOW_ANONYMOUS=true"):
         Settings(host=host).check_exposure()
     Settings(host=host, allow_anonymous=True).check_exposure()
+    Settings(host=host).check_exposure(has_keys=True)
 
 
 def test_a_typing_error_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,3 +100,19 @@ def test_the_server_refuses_to_start(tmp_path: Path, variable: str, value: str) 
     assert result.returncode != 0
     assert variable in result.stderr and "Traceback" not in result.stderr
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        ("MAX_IMPORT_BYTES", "100"),
+        ("MAX_IMPORTS", "0"),
+        ("IMPORT_TIMEOUT", "inf"),
+        ("MAX_EXPORTS", "0"),
+        ("EXPORT_SECONDS", "0"),
+    ],
+)
+def test_limits_of_map_files(monkeypatch: pytest.MonkeyPatch, name: str, bad: str) -> None:
+    monkeypatch.setenv(f"PLACEREC_{name}", bad)
+    with pytest.raises(SettingsError, match=f"^PLACEREC_{name}: "):
+        read_settings()

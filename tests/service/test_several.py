@@ -209,3 +209,17 @@ def test_what_cannot_be_asked(fleet: Server) -> None:
     bad = [("a", ("a", b"plainly no picture", "image/jpeg"))]
     assert_problem(fleet.client.post("/v1/query", files=bad), 422, "not-an-image")
     assert_problem(fleet.client.post("/v1/query", content=b"{}"), 415, "unsupported-media-type")
+
+
+def test_answers_count_for_the_health_of_the_map_that_has_the_place(fleet: Server) -> None:
+    def counted(map_id: str) -> tuple[int, int]:
+        answers = fleet.client.get(f"/v1/maps/{map_id}/health").json()["answers"]
+        return answers["queries"], answers["recognized"]
+
+    before = {name: counted(name) for name in ("hall", "twin")}
+    assert ask(fleet, again(5), maps="hall,twin")["map"] == "hall"
+    assert ask(fleet, again(63), maps="hall")["verdict"] == "unknown"
+    assert ask(fleet, encoded(blank()), maps="hall")["verdict"] == "unknown"
+    assert ask(fleet, again(40), maps="hall,twin")["verdict"] == "unknown", "nowhere, so of no map"
+    assert counted("hall") == (before["hall"][0] + 3, before["hall"][1] + 1)
+    assert counted("twin") == before["twin"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import re
 
 import pytest
+from starlette.types import Message, Receive, Scope, Send
 
-from service.telemetry import JsonLines
+from service.metrics import Metrics
+from service.telemetry import JsonLines, Telemetry
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -56,3 +59,37 @@ def test_a_traceback_stays_on_one_line() -> None:
     written = JsonLines().format(record)
     assert "\n" not in written
     assert json.loads(written)["message"] == "broken pipe" and "line two" in json.loads(written)["exception"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("made\nup"), asyncio.CancelledError()])
+def test_a_defect_is_logged_once_with_its_traceback_and_a_request_given_up_is_told_so(
+    error: BaseException, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def broken(scope: Scope, receive: Receive, send: Send) -> None:
+        raise error
+
+    async def nothing() -> Message:
+        return {"type": "http.disconnect"}
+
+    async def sent(message: Message) -> None:
+        answered.append(message)
+
+    answered: list[Message] = []
+    scope: Scope = {"type": "http", "method": "GET", "path": "/livez", "headers": [], "query_string": b"", "app": None}
+    asyncio.run(Telemetry(broken, Metrics())(scope, nothing, sent))
+    problem = json.loads(answered[1]["body"])
+    errors = [record for record in caplog.records if record.levelno >= logging.ERROR]
+    if isinstance(error, RuntimeError):
+        assert problem["type"].endswith(":internal-error") and "made" not in json.dumps(problem)
+        (record,) = errors
+        assert record.exc_info is not None and record.request_id == problem["request_id"]  # type: ignore[attr-defined]
+        assert json.loads(JsonLines().format(record))["exception"].endswith("RuntimeError: made\nup")
+    else:
+        assert problem["type"].endswith(":stopping") and problem["status"] == 503 and not errors
+        assert b"retry-after" in dict(answered[0]["headers"])
+
+
+def test_a_line_is_never_of_megabytes() -> None:
+    record = logging.makeLogRecord({"msg": "x" * 1_000_000, "path": "y" * 1_000_000, "odd": b"z" * 1_000_000})
+    record.exc_info = (ValueError, ValueError("w" * 1_000_000), None)
+    assert len(JsonLines().format(record)) < 60_000

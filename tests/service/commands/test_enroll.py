@@ -250,10 +250,11 @@ def test_a_service_that_takes_little_at_a_time(
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(1800)
 def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) -> None:
     """Of the command's process, whatever the number of frames; what the service holds grows with its maps alone."""
     peaks = []
-    for count in (100, 1200):
+    for count in (400, 1200):  # the smaller one reaches the largest batches, too
         folder, name = tmp_path / str(count), f"soak-{count}"
         folder.mkdir()
         for index in range(count):
@@ -271,8 +272,7 @@ def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) ->
         assert server.client.get(f"/v1/maps/{name}").json()["places"] == count
         peaks.append(peak)
         server.client.delete(f"/v1/maps/{name}")
-    # Kilobytes. A batch, its form, what the client sends of it and the next batch: some 16 MiB each.
-    assert peaks[1] < peaks[0] + 128_000, peaks
+    assert peaks[1] < peaks[0] + 32_000, peaks  # kilobytes
 
 
 def test_the_data_of_a_running_service_is_left_alone(
