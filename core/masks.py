@@ -10,11 +10,11 @@ from typing import Annotated, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, FailFast, Field, model_validator
 
 Coordinate = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 Corner = tuple[Coordinate, Coordinate]
-Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256)]
+Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256), FailFast()]
 
 _FINER = 8
 """Steps of a cell's side in which its covered area is counted."""
@@ -32,7 +32,7 @@ class Mask(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    polygons: tuple[Polygon, ...] = Field(min_length=1, max_length=64)
+    polygons: Annotated[tuple[Polygon, ...], Field(min_length=1, max_length=64), FailFast()]
 
     @model_validator(mode="after")
     def _leaves_something(self) -> Self:

@@ -38,9 +38,9 @@ def may_be_filled(structure: Structure, pixels: Pixels) -> bool:
 
     Args:
         structure: of the JPEG file.
-        pixels: H x W x 3 uint8, BGR, as they are stored, not turned; at least 16 x 16.
+        pixels: H x W x 3 uint8, BGR, as they are stored, not turned.
     """
-    if not structure.plain:
+    if not structure.plain or min(pixels.shape[:2]) < _BLOCK:  # a block that is cut by two edges has few pixels
         return True
     # The last block may be cut by the edge of the picture: its last pixels are looked at by themselves.
     if (pixels[-1, -2:] == _FILLER).all():

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from core.storage import seals
+from core.storage.disk import sync_file
 from core.storage.schema import check_schema, migrate
 
 FILE = "map.sqlite"
@@ -46,6 +47,20 @@ def connect(path: Path, create: bool = False) -> sqlite3.Connection:
     except BaseException:
         connection.close()
         raise
+    return connection
+
+
+def connect_aside(path: Path) -> sqlite3.Connection:
+    """A connection that reads the file as if there were no log beside it, and changes neither.
+
+    Raises:
+        sqlite3.Error: it cannot be read.
+    """
+    connection = sqlite3.connect(
+        f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, isolation_level=None, check_same_thread=False
+    )
+    connection.execute("PRAGMA trusted_schema = OFF")
+    seals.teach(connection)
     return connection
 
 
@@ -132,11 +147,12 @@ class Database:
         crash would bring them to life again.
 
         Raises:
-            sqlite3.Error: the log could not be emptied.
+            OSError, sqlite3.Error: the log could not be emptied.
         """
         (busy, _, _) = self._writer.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         if busy:
             raise sqlite3.OperationalError("readers keep the log from being emptied")
+        sync_file(self._path.with_name(f"{self._path.name}-wal"))  # or a power cut could bring back what was in it
 
     def close(self) -> None:
         """Let the reads under way end, refuse further ones, and close.

@@ -10,12 +10,13 @@ from core.storage import descriptors
 from core.storage.disk import Damage, primary_code
 from core.storage.named import named_segments
 from core.storage.opening import OpenMap
+from core.storage.writing import Write
 
 log = logging.getLogger(__name__)
 
 
 class Doubts:
-    """What stands behind the rows that are named, in the segment files and in SQLite's log of one map?
+    """What stands behind what was acknowledged last, in the segment files and in SQLite's log of one map?
 
     For the thread that writes.
     """
@@ -26,15 +27,15 @@ class Doubts:
         self._rows = False
         self._log = False
 
-    def arise(self, error: BaseException, opened: OpenMap, rows: int) -> None:
-        """A write to a map of ``rows`` rows failed with ``error`` once it had begun to append.
+    def arise(self, error: BaseException, write: Write, opened: OpenMap, rows: int) -> None:
+        """A write to a map of ``rows`` rows failed with ``error``; before it appended or was committed that is nothing.
 
         A COMMIT that found no room wrote no end of the transaction; after any other failure of
-        SQLite the log must be emptied first, or a crash could bring that transaction to life.
+        one the log must be emptied first, or a crash could bring that transaction to life.
         """
-        self._rows = True
         found_no_room = isinstance(error, sqlite3.Error) and primary_code(error) == sqlite3.SQLITE_FULL
-        self._log = not (found_no_room or isinstance(error, OSError))
+        self._rows |= write.appending
+        self._log |= write.committing and not found_no_room
         try:
             self.resolve(opened, rows)
         except (OSError, sqlite3.Error, Damage) as further:

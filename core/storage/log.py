@@ -4,6 +4,11 @@ SQLite takes a log up to the first frame that fails its checksum and forgets the
 behind.  A crash can only touch the last transaction, since each is synced before the next begins.  Where more follow
 the first frame that fails, the log was damaged later, and writes that were acknowledged would vanish without a word.
 
+Behind the last transaction there may be frames of one that was taken back: too large for memory, so that it was
+written before its end, or refused in its sync.  They look like those of the log, but each frame's checksum goes on
+from that of the frame before it, and theirs does not go on from the last transaction: where this chain breaks, what
+comes is not known to have been committed after what was before.
+
 The log is a header of 32 bytes and frames of 24 bytes and a page: https://www.sqlite.org/fileformat2.html#walformat
 """
 
@@ -76,14 +81,24 @@ def check_log(path: Path) -> None:
         log = _header(file, path.name)
         if log is None:
             return
-        sums, is_broken, commits = log.sums, False, 0
+        broken, commits = 0, 0  # the first frame that fails, and the ends of transactions from there on
+        before = {log.sums}  # what the next frame's checksum may go on from
         for number, (head, page) in enumerate(_frames(file, log), start=1):
             _, size, *salts, first, second = _FRAME.unpack(head)
             is_ours = (salts[0], salts[1]) == log.salts
-            if not is_broken:
-                sums = _sums(page, log.order, _sums(head[:8], log.order, sums))
-                is_broken = not is_ours or sums != (first, second)
+            if broken and not is_ours:
+                before, commits = set(), 0
+                continue
+            found = {_sums(page, log.order, _sums(head[:8], log.order, sums)) for sums in before}
+            follows = (first, second) in found
+            before = {(first, second)}
+            if not broken:
+                if is_ours and follows:
+                    continue
                 broken = number
-            if is_broken and commits and is_ours:
+                before |= found  # it may be the checksum itself that is damaged
+            elif not follows:
+                commits = 0
+            elif commits:
                 raise Damage(f"{path.name}: frame {broken} is damaged, and what was committed after it is lost")
-            commits += is_broken and is_ours and size > 0
+            commits += size > 0 and (is_ours or follows)

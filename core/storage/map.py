@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import sqlite3
 import threading
@@ -14,14 +13,12 @@ from typing import Any
 
 from core.errors import (
     MapQuarantined,
-    NoThumbnail,
     PlacerecError,
     RevisionMismatch,
     StorageFailure,
     UnknownMap,
     UnknownSequence,
 )
-from core.images import Limits, decode, encode_thumbnail
 from core.places import Place, PlaceFields
 from core.storage import ledger, pages
 from core.storage.archives.capture import Capturing
@@ -34,6 +31,7 @@ from core.storage.indexing import IndexedMap, Indexer, Stopped
 from core.storage.named import NamedSegment, named_segments
 from core.storage.opening import OpenMap, open_map
 from core.storage.patches import patched_fields, patched_record
+from core.storage.pictures import small_picture
 from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
 from core.storage.snapshot import Snapshot
 from core.storage.tiers import IndexStatus, StorageStatus, storage_of, unopened
@@ -213,6 +211,7 @@ class Map:
         with self._lock:
             opened, before = self._expect_open(), self.snapshot()
             with self._guarded("write to"):
+                opened.remains.clear(before)  # it may be this room that is needed
                 self._doubts.resolve(opened, before.rows)
                 write = None
                 try:
@@ -221,10 +220,12 @@ class Map:
                         yield write
                         after = write.finish()
                 except BaseException as error:
-                    if write is not None and write.appending:
-                        self._doubts.arise(error, opened, before.rows)
+                    if write is not None:
+                        self._doubts.arise(error, write, opened, before.rows)
                     raise
             self._snapshot, self._record = after, write.record
+            del before
+            opened.remains.clear(after)
             if self.indexer is not None and ((write.filled and after.coded) or self.indexer.needs_work(after)):
                 self.indexer.wake()
 
@@ -372,15 +373,7 @@ class Map:
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
             kept = ledger.picture(connection, stored.number)
-        if kept is None:
-            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
-        content, digest = kept
-        if hashlib.sha256(content).digest() != digest:
-            raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
-        if stored.place.picture == "thumbnail":
-            return content
-        # It was accepted when it was enrolled; today's limits are not its limits.
-        return encode_thumbnail(decode(content, Limits(max_bytes=len(content), max_pixels=1 << 40, min_side=1)))
+        return small_picture(stored.place, kept)
 
     def verify(self, progress: Progress = untold) -> VerifyReport:
         """Read all of the map again and check it; writes and searches go on meanwhile.
@@ -394,7 +387,4 @@ class Map:
                 connection = stack.enter_context(self._reading())
                 connection.execute("BEGIN")
                 connection.execute("SELECT id FROM map").fetchall()  # this is when the transaction begins to see
-            try:
-                return inspect(self._folder, connection, snapshot, progress)
-            finally:
-                connection.execute("ROLLBACK")
+            return inspect(self._folder, connection, snapshot, progress)

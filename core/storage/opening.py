@@ -31,7 +31,7 @@ from core.storage.named import NamedSegment, named_segments
 from core.storage.patches import complaint
 from core.storage.reclaiming import Remains, clear_folder
 from core.storage.records import MapRecord
-from core.storage.schema import NO_SEQUENCE, check_schema, contradictions, migrate
+from core.storage.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
 from core.storage.segment import Held, Segment, flat_index, vectors
 from core.storage.shelf import Shelf
 from core.storage.snapshot import Snapshot
@@ -177,7 +177,7 @@ def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable |
     )
 
 
-def _check_rows(connection: sqlite3.Connection) -> None:
+def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
     """All rows of a small map and their indexes, but for the pictures, which are checked as they are read."""
     for table in ("places", "place_values", "sequences"):
         ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
@@ -185,8 +185,11 @@ def _check_rows(connection: sqlite3.Connection) -> None:
             raise Damage(f"{FILE}: {line}")
     if broken := seals.broken(connection, "places"):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := contradictions(connection):
+    if found := cut_sequences(connection):
         raise Damage(f"{FILE}: {found[0]}")
+    if found := misfiled(connection):  # the places themselves are sound, and tell what this must be
+        log.warning("The metadata of map %s is filed anew: %s.", folder.name, found[0])
+        refile(connection)
 
 
 def read_snapshot(
@@ -232,7 +235,7 @@ def read_snapshot(
         held = _load_segment(folder, layout, segment, checksums[part]) if holds else None
         segments.append(Segment(held, first, there, alive[part], checksums[part]))
     if holds:
-        _check_rows(connection)
+        _check_rows(folder, connection)
     lists = None
     if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
         with suppress(StaleArrays):

@@ -11,6 +11,12 @@ from core.errors import InvalidField
 from core.places import PlaceFields
 from core.storage.records import MapRecord, MapSettings
 
+MOST_FAULTS = 10
+"""Are told of one at a time; the others are counted."""
+
+MOST_LISTED = 1000
+"""Of more not even the first are told: pydantic gives all of them or none."""
+
 
 def merge_patch(target: Any, patch: Any) -> Any:
     """RFC 7396: objects are merged member by member, null removes, all else replaces.
@@ -29,13 +35,17 @@ def merge_patch(target: Any, patch: Any) -> Any:
 
 
 def complaint(error: ValueError) -> str:
-    """What is wrong, on one line."""
+    """What is wrong, on one line: the first faults of many."""
     if not isinstance(error, ValidationError):
         return str(error)
+    if (count := error.error_count()) > MOST_LISTED:
+        return f"{count} values are not what they have to be"
     parts = []
-    for fault in error.errors(include_url=False, include_context=False, include_input=False):
+    for fault in error.errors(include_url=False, include_context=False, include_input=False)[:MOST_FAULTS]:
         where = ".".join(str(step) for step in fault["loc"])
         parts.append(f"{where}: {fault['msg']}" if where else fault["msg"])
+    if count > MOST_FAULTS:
+        parts.append(f"and {count - MOST_FAULTS} more")
     return "; ".join(parts)
 
 

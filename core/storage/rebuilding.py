@@ -47,13 +47,18 @@ def remade(newest: Callable[[], Snapshot], with_lists: bool, progress: Callable[
     """
     snapshot = newest()
     progress(0, snapshot.rows)
-    table = CodeTable.empty(fitted_coder(snapshot))
-    while len(table) < snapshot.rows:
+    table = _caught_up(CodeTable.empty(fitted_coder(snapshot)), newest, progress)
+    lists = InvertedLists.built(table, progress=progress) if with_lists and len(table) else None
+    # Lists take long, and what came meanwhile would hold up all writes if it were encoded when this is published.
+    return Remade(_caught_up(table, newest, progress), lists)
+
+
+def _caught_up(table: CodeTable, newest: Callable[[], Snapshot], progress: Callable[[int, int], None]) -> CodeTable:
+    """With the codes of all rows that there are by now."""
+    while len(table) < (snapshot := newest()).rows:
         table = _extended(table, snapshot, min(snapshot.rows, len(table) + _ROWS_AT_ONCE))
         progress(len(table), snapshot.rows)
-        snapshot = newest()
-    lists = InvertedLists.built(table, progress=progress) if with_lists and len(table) else None
-    return Remade(table, lists)
+    return table
 
 
 def _extended(table: CodeTable, snapshot: Snapshot, stop: int) -> CodeTable:

@@ -1,9 +1,10 @@
 """Giving back the room of places that were deleted: a full segment of which no row is alive any more is removed.
 
 What counts is SQLite: the COMMIT that deletes the last place of a segment also says that the segment is removed, and
-its rows keep their numbers.  The file goes later, when no snapshot is left that might read it; a crash in between
-leaves a file that nothing needs, which the next start clears away.  So there is no moment at which a file is missing
-that anything names.  The tail is never removed, and no row is ever moved: one place that lives keeps its segment.
+its rows keep their numbers.  The file goes right after it, or, if a snapshot is left that might read it, before the
+next write that finds none: a full disk may need its room for that.  A crash in between leaves a file that nothing
+needs, which the next start clears away.  So there is no moment at which a file is missing that anything names.  The
+tail is never removed, and no row is ever moved: one place that lives keeps its segment.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import logging
 import sqlite3
 import threading
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ class Remains:
         """Of the map in ``folder``: none yet."""
         self._folder, self._layout = folder, layout
         self._waiting: dict[int, weakref.ref[object]] = {}
+        self._suspects: set[int] | None = None  # segments that may be without life; None: any, nobody has looked
         self._lock, self._keepers = threading.Lock(), 0
 
     @contextmanager
@@ -44,15 +46,19 @@ class Remains:
             with self._lock:
                 self._keepers -= 1
 
-    def remove(self, connection: sqlite3.Connection, after: Snapshot) -> Snapshot:
+    def remove(self, connection: sqlite3.Connection, after: Snapshot, touched: Set[int] = frozenset()) -> Snapshot:
         """Name the segments without a living row as removed, within a transaction; what is to be searched then.
 
         Args:
             after: what would be searched after the COMMIT.
+            touched: numbers of segments in which a row died, and of those from the former tail on.
         """
         size, segments = self._layout.rows_per_segment, list(after.segments)
-        for number, segment in enumerate(segments[:-1]):
-            if segment.removed or segment.has_life:
+        tail = len(segments) - 1
+        suspects = range(tail) if self._suspects is None else sorted(self._suspects | touched)
+        self._suspects = set()
+        for number in suspects:
+            if number >= tail or (segment := segments[number]).removed or segment.has_life:
                 continue
             query = "SELECT count(*) FROM places WHERE row >= ? AND row < ?"
             (places,) = connection.execute(query, (number * size, (number + 1) * size)).fetchone()
@@ -70,7 +76,9 @@ class Remains:
         A segment that it has not removed is one whose COMMIT failed: it stays.
         """
         for number, reading in [] if self._keepers else list(self._waiting.items()):
-            is_removed = current.segments[number].removed
+            is_removed = number < len(current.segments) and current.segments[number].removed
+            if not is_removed and self._suspects is not None:
+                self._suspects.add(number)
             if not is_removed or (reading() is None and _delete(self._folder / segment_name(number))):
                 del self._waiting[number]
 

@@ -7,7 +7,8 @@ Every migration is a list of statements; all that a file lacks are applied in on
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from core.errors import DataDirectoryTooNew
 from core.storage import seals
@@ -16,6 +17,8 @@ from core.storage.disk import Damage
 APPLICATION_ID = 0x504C5243  # "PLRC"
 
 Migration = Sequence[str]
+
+T = TypeVar("T")
 
 NO_SEQUENCE = -1
 """Code of the places that belong to no sequence."""
@@ -104,6 +107,9 @@ def _values_of(place: str) -> str:
     )
 
 
+_FILL_VALUES = (
+    f"INSERT OR IGNORE INTO place_values {_values_of('p').format(source='places p, ')} AND json_valid(p.metadata)"
+)
 _INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(source='')}"
 _DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
 
@@ -117,7 +123,7 @@ _VALUES: Migration = (
         row INTEGER NOT NULL,
         PRIMARY KEY (key, kind, value, row)
     ) STRICT, WITHOUT ROWID""",
-    f"INSERT OR IGNORE INTO place_values {_values_of('p').format(source='places p, ')} AND json_valid(p.metadata)",
+    _FILL_VALUES,
     f"CREATE TRIGGER place_values_made AFTER INSERT ON places BEGIN {_INSERT_VALUES}; END",
     "CREATE TRIGGER place_values_changed AFTER UPDATE OF row, metadata ON places"
     " WHEN old.row <> new.row OR old.metadata <> new.metadata"
@@ -167,7 +173,7 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
     if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
         raise Damage("map.sqlite is not one of placerec's databases")
     if version > len(migrations):
-        if _columns(connection) == _expected(migrations):
+        if _statements(connection) == _expected(migrations, _statements):
             raise Damage(f"map.sqlite says that it is of schema {version}, but its tables are of {len(migrations)}")
         raise DataDirectoryTooNew(
             f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
@@ -189,11 +195,17 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
     return len(migrations) - version
 
 
-def _expected(migrations: Sequence[Migration]) -> dict[str, set[str]]:
+def _statements(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
+    """All that the file was made of: its tables, indexes and triggers, each with the statement that makes it."""
+    return set(connection.execute("SELECT type, name, sql FROM sqlite_schema WHERE name NOT LIKE 'sqlite_%'"))
+
+
+def _expected(migrations: Sequence[Migration], told: Callable[[sqlite3.Connection], T]) -> T:
+    """What is told of a file as ``migrations`` make it."""
     wanted = sqlite3.connect(":memory:", isolation_level=None)
     try:
         migrate(wanted, migrations, create=True)
-        return _columns(wanted)
+        return told(wanted)
     finally:
         wanted.close()
 
@@ -205,21 +217,48 @@ def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration]
         Damage: something is missing.
     """
     found = _columns(connection)
-    for table, columns in _expected(migrations).items():
+    for table, columns in _expected(migrations, _columns).items():
         if missing := columns - found.get(table, set()):
             raise Damage(f"map.sqlite lacks {', '.join(sorted(missing))} of its table {table!r}")
 
 
 def contradictions(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
     """Where the tables do not follow from the places: the values by which they are found, the ends of sequences."""
+    return misfiled(connection, limit) + cut_sequences(connection, limit)
+
+
+def misfiled(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """Where the values by which places are found do not follow from their metadata; :func:`refile` mends it."""
     told = []
     found, due = "SELECT key, kind, value, row FROM place_values", _values_of("p").format(source="places p, ")
     for some, others in ((found, due), (due, found)):
         query = f"SELECT row, key FROM ({some} EXCEPT {others}) LIMIT {limit}"
         for row, key in connection.execute(query).fetchall():
             told.append(f"row {row} is not found by its metadata {key!r} as it must be")
+    return told
+
+
+def refile(connection: sqlite3.Connection) -> None:
+    """Make the values by which places are found anew, in one transaction.
+
+    Raises:
+        sqlite3.Error: the disk refuses; all is as it was.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        connection.execute("DELETE FROM place_values")
+        connection.execute(_FILL_VALUES)
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def cut_sequences(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """The sequences whose next place would not come behind their last."""
     query = (
         "SELECT s.name FROM sequences s JOIN places p ON p.sequence = s.code WHERE s.name IS NOT NULL GROUP BY s.code"
         f" HAVING s.next_ordinal <= max(p.ordinal) LIMIT {limit}"
     )
-    return told + [f"sequence {name!r} ends before its last place" for (name,) in connection.execute(query).fetchall()]
+    return [f"sequence {name!r} ends before its last place" for (name,) in connection.execute(query).fetchall()]

@@ -145,9 +145,14 @@ class Segment:
         return replace(self, alive=alive, checksums=checksums)
 
     @cached_property
+    def living(self) -> int:
+        """How many rows are alive."""
+        return int(np.count_nonzero(self.alive))
+
+    @property
     def has_life(self) -> bool:
         """Whether any row is alive."""
-        return bool(self.alive.any())
+        return self.living > 0
 
     def without_rows(self) -> Segment:
         """Removed: without descriptors, and without a hold on its file."""

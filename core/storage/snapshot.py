@@ -75,7 +75,7 @@ class Snapshot:
     guard: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def __len__(self) -> int:
-        return len(self._living)
+        return self._count
 
     @property
     def rows(self) -> int:
@@ -110,9 +110,9 @@ class Snapshot:
         return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
 
     @cached_property
-    def _living(self) -> NDArray[np.int64]:
-        """The rows of living places, ascending."""
-        return np.flatnonzero(self.alive)
+    def _count(self) -> int:
+        """How many places are alive; counted anew only in the segments that a write touched."""
+        return sum(segment.living for segment in self.segments)
 
     @cached_property
     def _held(self) -> NDArray[np.bool_]:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from core.storage import descriptors, seals
 from core.storage.columns import read_columns
-from core.storage.database import FILE, connect
+from core.storage.database import FILE, connect, connect_aside
 from core.storage.descriptors import Layout
 from core.storage.disk import Damage
 from core.storage.index_files import IndexFiles
 from core.storage.indexing import tier_of
+from core.storage.log import check_log
 from core.storage.named import NamedSegment, named_segments
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
@@ -67,13 +68,21 @@ class _Findings:
 
 
 def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
-    """Check a map that is out of service."""
+    """Check a map that is out of service; a log that is damaged is reported, left aside and kept as it is."""
     findings = _Findings(progress)
+    is_log_sound = False
     with findings.noting():
-        connection = connect(folder / FILE)
+        check_log(folder / f"{FILE}-wal")
+        is_log_sound = True
+    with findings.noting():
+        # SQLite would put what it can read of a damaged log into the file, and remove the log with all the rest.
+        connection = connect(folder / FILE) if is_log_sound else connect_aside(folder / FILE)
         try:
             check_schema(connection)
-            return inspect(folder, connection, None, progress)
+            report = inspect(folder, connection, None, progress)
+            return report.model_copy(
+                update={"ok": report.ok and not findings.problems, "problems": findings.problems + report.problems}
+            )
         finally:
             connection.close()
     return findings.report()
@@ -88,7 +97,9 @@ def inspect(
     pictures' digests, the caches; and that what is searched is what is stored.
 
     Args:
-        connection: in a transaction that sees the moment of the snapshot.
+        connection: in a transaction that sees the moment of the snapshot, which is ended before descriptors are
+            read: that takes long, and meanwhile SQLite's log could not be emptied.
+        snapshot: sees to it that none of its descriptors goes meanwhile.
         progress: told while descriptors are read.
     """
     findings = _Findings(progress)
@@ -105,11 +116,15 @@ def inspect(
         (findings.places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         with findings.noting():
             _check_pictures(connection, findings)
-        with findings.noting():
-            _check_descriptors(folder, connection, layout, segments, snapshot, findings)
         if snapshot is not None:
             with findings.noting():
                 _check_spots(connection, snapshot, findings)
+        query = "SELECT row, id, checksum FROM places"
+        places = {row: (place, checksum) for row, place, checksum in connection.execute(query).fetchall()}
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        with findings.noting():
+            _check_descriptors(folder, layout, places, segments, snapshot, findings)
         if snapshot is not None:
             checked, stale = IndexFiles(folder, layout).check(segments, tier_of(snapshot))
             findings.checked_bytes += checked
@@ -154,14 +169,12 @@ def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None
 
 def _check_descriptors(
     folder: Path,
-    connection: sqlite3.Connection,
     layout: Layout,
+    places: dict[int, tuple[str, int]],
     segments: list[NamedSegment],
     snapshot: Snapshot | None,
     findings: _Findings,
 ) -> None:
-    query = "SELECT row, id, checksum FROM places"
-    places = {row: (place, checksum) for row, place, checksum in connection.execute(query).fetchall()}
     for row, (place, _) in places.items():
         if row >= findings.rows:
             findings.problems.append(f"{FILE}: place {place!r} has row {row}, but there are {findings.rows}")

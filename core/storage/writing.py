@@ -89,6 +89,8 @@ class Write:
         self.connection = connection
         self.appending = False
         """From here on there may be rows in the segment files that nothing names."""
+        self.committing = False
+        """From here on the end of the transaction may be in SQLite's log."""
         self.filled: dict[int, int] = {}
         """The segments that became full, and their checksums."""
         self._folder = folder
@@ -189,5 +191,8 @@ class Write:
             after = before
         after = after.moved(self._moved) if self._moved else after
         after = after.without(self._dead) if self._dead else after
-        self._remains.clear(before)
-        return self._remains.remove(self.connection, after)
+        size, first_new = self._layout.rows_per_segment, max(0, len(before.segments) - 1)
+        touched = {row // size for row in self._dead} | set(range(first_new, len(after.segments)))
+        self._snapshot = self._remains.remove(self.connection, after, touched)  # what was before may go
+        self.committing = True
+        return self._snapshot

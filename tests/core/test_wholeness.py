@@ -100,6 +100,20 @@ def test_a_picture_is_decoded_twice_only_if_it_looks_filled() -> None:
     assert may_be_filled(read_structure(grey, read_header(grey)), decode(grey))
 
 
+@pytest.mark.parametrize(("width", "height"), [(64, 4), (4, 64), (1, 1), (7, 7), (2, 900), (8, 8), (9, 8)])
+def test_a_picture_that_is_smaller_than_a_block(width: int, height: int) -> None:
+    """A frame has no such sides, but the small picture of a panorama may."""
+    limits = images.Limits(min_side=1)
+    for image in (Image.new("RGB", (width, height), SHADES["RGB"]), Image.new("RGB", (width, height), "red")):
+        assert decode(saved(image), limits).shape == (height, width, 3)
+    data = photograph(9, width=width, height=height, quality=95)
+    assert decode(data, limits).shape == (height, width, 3)
+    if min(width, height) < 8 < max(width, height):
+        start = scan_start(data)
+        with pytest.raises(TruncatedImage):
+            decode(data[: start + (len(data) - start) // 3] + b"\xff\xd9", limits)
+
+
 @pytest.mark.parametrize("rows", [8, 16, 50])
 def test_filler_is_seen_at_every_place(rows: int) -> None:
     data = photograph(6)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from core.errors import InvalidArchive, InvalidField, InvalidImage
 from core.storage import descriptors, ledger, seals
-from core.storage.archives.lines import CameraLine, PlaceLine, SequenceLine, read_line
+from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
 from core.storage.cameras import MOST_CAMERAS
@@ -34,6 +34,15 @@ from core.storage.writing import name_appended
 CHUNK_BYTES = 16 << 20
 """Of descriptors that are written, synced and committed together."""
 
+TEXT_BYTES = 2 << 20
+"""Of the lines of their places: read, they take many times the room of their text."""
+
+MOST_PLACE_BYTES = 1 << 30
+"""Of one descriptor with its local descriptors, in full precision."""
+
+LINES_BETWEEN = 1024
+"""After so many lines of sequences the caller is heard: it may break the work off."""
+
 Advance = Callable[[int, int], None]
 """Is told how many places of how many are there; may raise to break the work off."""
 
@@ -48,8 +57,12 @@ def layout_of(manifest: Manifest, rows_per_segment: int = ROWS_PER_SEGMENT) -> L
         InvalidArchive: in a way that cannot be.
     """
     record = manifest.map
+    if 4 * record.dimension + record.local_cells * record.local_values > MOST_PLACE_BYTES:  # numpy cannot count them
+        raise InvalidArchive(f"The manifest says what cannot be: a place has more than {MOST_PLACE_BYTES} bytes.")
     try:
-        return Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
+        layout = Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
+        _ = layout.record, layout.frame  # where numpy has its say
+        return layout
     except ValueError as error:
         raise InvalidArchive(f"The manifest says what cannot be: {error}.") from None
 
@@ -74,8 +87,12 @@ def build(
     rows_per_segment: int = ROWS_PER_SEGMENT,
     advance: Advance = lambda _done, _all: None,
     check_picture: CheckPicture = lambda _content: None,
+    most_picture_bytes: int = MOST_PICTURE_BYTES,
 ) -> None:
     """Make ``folder`` and in it the map of a file, under another id if need be, synced but for the folder's own name.
+
+    Args:
+        most_picture_bytes: of one picture; a larger one is refused before it is read.
 
     Raises:
         InvalidArchive: the file is damaged, or holds what no map may hold.  What is in ``folder`` is then of no use.
@@ -88,7 +105,7 @@ def build(
     connection = connect(folder / FILE)
     try:
         layout = layout_of(manifest, rows_per_segment)
-        _Building(archive, folder, connection, layout, advance, check_picture).run()
+        _Building(archive, folder, connection, layout, advance, check_picture, most_picture_bytes).run()
         archive.check_end()
     except sqlite3.IntegrityError as error:
         raise InvalidArchive(f"The places of the file cannot be those of one map: {error}.") from None
@@ -107,10 +124,13 @@ class _Building:
         layout: Layout,
         advance: Advance,
         check_picture: CheckPicture,
+        most_picture_bytes: int,
     ) -> None:
         self.archive, self.folder, self.connection = archive, folder, connection
         self.layout, self.advance, self.check_picture = layout, advance, check_picture
-        self.codes: dict[str | None, int] = {None: NO_SEQUENCE}
+        self.most_picture_bytes = most_picture_bytes
+        self.latest: tuple[str | None, int] = (None, NO_SEQUENCE)
+        """The sequence that was met last, and its code."""
         self.rows = 0
 
     def run(self) -> None:
@@ -124,46 +144,45 @@ class _Building:
         self._check()
 
     def _sequences(self, part: Part) -> None:
-        reader, seen = self.archive.part(part), 0
-        for number, text in enumerate(reader.lines(), start=1):
-            line = read_line(text, SequenceLine, f"{part.name}, line {number}")
+        places = self.archive.manifest.places
+        if part.rows > places + 1:
+            raise InvalidArchive(f"{part.name}: {places} places are in no more than {places + 1} sequences.")
+        reader = self.archive.part(part)
+        for number, (line, _) in enumerate(_lines(reader, part, SequenceLine), start=1):
+            if number % LINES_BETWEEN == 0:
+                self.advance(0, places)
             if line.name is None:
                 query = "UPDATE sequences SET next_ordinal = ? WHERE name IS NULL"
                 self.connection.execute(query, (line.next_ordinal,))
             else:
                 query = "INSERT INTO sequences (name, next_ordinal) VALUES (?, ?)"
-                code = self.connection.execute(query, (line.name, line.next_ordinal)).lastrowid
-                assert code is not None
-                self.codes[line.name] = code
-            seen = number
-        _finish(reader, part, seen)
+                self.connection.execute(query, (line.name, line.next_ordinal))
+        reader.finish()
 
     def _cameras(self, part: Part) -> None:
         if part.rows > MOST_CAMERAS:
             raise InvalidArchive(f"{part.name}: a map has at most {MOST_CAMERAS} cameras.")
-        reader, seen = self.archive.part(part), 0
-        for number, text in enumerate(reader.lines(), start=1):
-            line = read_line(text, CameraLine, f"{part.name}, line {number}")
+        reader = self.archive.part(part)
+        for line, _ in _lines(reader, part, CameraLine):
             mask = None if line.mask is None else line.mask.model_dump_json()
             values = (line.name, mask, moment_text(line.updated_at))
             self.connection.execute("INSERT INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)", values)
-            seen = number
         seals.seal(self.connection, "cameras")
-        _finish(reader, part, seen)
+        reader.finish()
 
     def _group(self, places: Part, frames: Part, pictures: Part) -> None:
         lines, rows, images = (self.archive.part(part) for part in (places, frames, pictures))
-        seen = 0
         step = max(1, CHUNK_BYTES // self.layout.record.itemsize)
         chunk: list[PlaceLine] = []
-        for number, text in enumerate(lines.lines(), start=1):
-            chunk.append(read_line(text, PlaceLine, f"{places.name}, line {number}"))
-            if len(chunk) == step:
+        held = 0
+        for line, size in _lines(lines, places, PlaceLine):
+            chunk.append(line)
+            held += size
+            if len(chunk) == step or held >= TEXT_BYTES:
                 self._commit(chunk, rows, images)
-                chunk = []
-            seen = number
+                chunk, held = [], 0
         self._commit(chunk, rows, images)
-        _finish(lines, places, seen)
+        lines.finish()
         rows.finish()
         images.finish()
 
@@ -194,9 +213,7 @@ class _Building:
                 raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} is none that can be compared.")
 
     def _insert(self, line: PlaceLine, row: int, checksum: int, images: PartReader) -> None:
-        code = self.codes.get(line.sequence)
-        if code is None:
-            raise InvalidArchive(f"The place {line.id!r} is of a sequence that the file does not list.")
+        code = self._code(line)
         try:
             columns = ledger.field_columns(line.fields())
         except InvalidField as error:
@@ -217,6 +234,9 @@ class _Building:
         query = f"INSERT INTO places ({names}) VALUES ({marks})"
         number = self.connection.execute(query, tuple(columns.values())).lastrowid
         if line.picture is not None:
+            if line.picture.bytes > self.most_picture_bytes:
+                more = f"it has {line.picture.bytes} bytes of at most {self.most_picture_bytes}"
+                raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {more}.")
             content = images.read(line.picture.bytes)
             digest = hashlib.sha256(content).digest()
             if digest.hex() != line.picture.sha256:
@@ -224,10 +244,22 @@ class _Building:
             try:
                 self.check_picture(content)
             except InvalidImage as error:
-                raise InvalidArchive(f"The picture of place {line.id!r} is none: {error}") from None
+                raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
             self.connection.execute(
                 "INSERT INTO pictures (place, digest, bytes) VALUES (?, ?, ?)", (number, digest, content)
             )
+
+    def _code(self, line: PlaceLine) -> int:
+        """Of its sequence, by which the tables know it."""
+        if line.sequence is None:
+            return NO_SEQUENCE
+        if line.sequence != self.latest[0]:
+            query = "SELECT code FROM sequences WHERE name = ?"
+            found = self.connection.execute(query, (line.sequence,)).fetchone()
+            if found is None:
+                raise InvalidArchive(f"The place {line.id!r} is of a sequence that the file does not list.")
+            self.latest = line.sequence, found[0]
+        return self.latest[1]
 
     def _check(self) -> None:
         """Is the whole one map?  What a place needs was checked with it."""
@@ -244,7 +276,13 @@ class _Building:
             raise Damage(f"{FILE} does not name the rows that were written")
 
 
-def _finish(reader: PartReader, part: Part, seen: int) -> None:
+def _lines(reader: PartReader, part: Part, kind: type[Kind]) -> Iterator[tuple[Kind, int]]:
+    """The lines of a part and the length of their texts, as many as the manifest says."""
+    seen = 0
+    for text in reader.lines():
+        seen += 1
+        if seen > part.rows:
+            raise InvalidArchive(f"{part.name} has more lines, not {part.rows}.")
+        yield read_line(text, kind, f"{part.name}, line {seen}"), len(text)
     if seen != part.rows:
         raise InvalidArchive(f"{part.name} has {seen} lines, not {part.rows}.")
-    reader.finish()

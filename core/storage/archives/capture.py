@@ -25,6 +25,7 @@ from core.storage.archives.manifest import (
     CAMERAS,
     FORMAT,
     MANIFEST,
+    MOST_MANIFEST_BYTES,
     SEQUENCES,
     VERSION,
     ArchivedRecord,
@@ -118,7 +119,8 @@ class Capturing:
                     advance(taken.places)
             return taken
         finally:
-            connection.execute("ROLLBACK")
+            if connection.in_transaction:  # SQLite may have ended it by itself: what it met is told, not this
+                connection.execute("ROLLBACK")
 
     def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[list[StoredLine]]:
         most = max(1, min(PLACES_PER_GROUP, BYTES_PER_GROUP // layout.frame.itemsize))
@@ -218,5 +220,7 @@ def _described(taken: _Taken, folder: Path, advance: Advance) -> Playback:
         advance(taken.places)
     manifest = Manifest(format=FORMAT, version=VERSION, map=taken.record, places=taken.places, parts=parts)
     text = written(manifest)
+    if len(text) > MOST_MANIFEST_BYTES:
+        raise StorageFailure(f"The map has too many places for one file: {len(parts)} parts, which no import takes.")
     (folder / MANIFEST).write_bytes(text)
     return Playback(folder, manifest, text, tag_of(text), links)

@@ -12,10 +12,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from core.errors import InvalidArchive
 from core.masks import Mask
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
-from core.storage.archives.manifest import strict_json
+from core.storage.archives.manifest import expect_names, strict_json
 from core.storage.patches import complaint
 
-MOST_LINE_BYTES = 4 << 20
+MOST_METADATA_BYTES = 1 << 20
+"""Of one place, as compact JSON; no service can be set to take more."""
+
+MOST_LINE_BYTES = MOST_METADATA_BYTES + (64 << 10)
+
+MOST_PICTURE_BYTES = 1_000_000_000
+"""What SQLite takes as one value."""
 
 LARGEST = 2**62
 """What SQLite can hold, with room to count on."""
@@ -47,7 +53,7 @@ class Picture(_Line):
     """What is kept of a place's frame: so many bytes of the pictures of its group."""
 
     kind: Literal["thumbnail", "image"]
-    bytes: Annotated[int, Field(ge=0, le=1 << 29, strict=True)]
+    bytes: Annotated[int, Field(ge=0, le=MOST_PICTURE_BYTES, strict=True)]
     sha256: Digest
 
 
@@ -80,6 +86,8 @@ class PlaceLine(_Line):
 
 Kind = TypeVar("Kind", bound=_Line)
 
+_WITHIN: dict[str, type[BaseModel]] = {"pose": Pose, "picture": Picture, "mask": Mask}
+
 
 def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
     """One line of a part.
@@ -88,8 +96,13 @@ def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
         InvalidArchive: it is not what ``kind`` describes.
     """
     value = strict_json(text, where)
+    expect_names(value, kind, where)
+    for name, inner in _WITHIN.items() if isinstance(value, dict) else ():
+        expect_names(value.get(name), inner, f"{where}: {name}")
     try:
         made = kind.model_validate(value)
+        if len(text) > MOST_METADATA_BYTES and _size(value.get("metadata")) > MOST_METADATA_BYTES:
+            raise InvalidArchive(f"{where}: the metadata has more than {MOST_METADATA_BYTES} bytes.")
         if b"\\u" in text:  # half a character, which only an escape can say, is no text of SQLite's
             json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
@@ -98,6 +111,10 @@ def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
         why = complaint(error) if isinstance(error, ValueError) else "nested too deeply"
         raise InvalidArchive(f"{where}: {why[:400]}.") from None
     return made
+
+
+def _size(value: Any) -> int:
+    return len(json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode())
 
 
 def _line(value: dict[str, Any]) -> bytes:

@@ -22,12 +22,14 @@ import json
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.places import check_map_id
+from core.probability import Curve
 from core.storage.patches import complaint
 from core.storage.records import MapRecord
+from core.verdict import Calibration
 
 FORMAT = "placerec map"
 VERSION = 1
@@ -35,7 +37,9 @@ MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
 GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"))
 
-MOST_MANIFEST_BYTES = 64 << 20
+MOST_MANIFEST_BYTES = 8 << 20
+"""A part takes some 165 bytes: room for 17 million places, or for 4 TB of pictures."""
+
 MOST_PART_BYTES = 8 << 30
 """What the header of a tar can say, less one."""
 
@@ -74,7 +78,7 @@ class Manifest(BaseModel):
     version: int
     map: ArchivedRecord
     places: Count
-    parts: list[Part]
+    parts: Annotated[list[Part], FailFast()]
 
     @property
     def groups(self) -> int:
@@ -132,6 +136,24 @@ def strict_json(text: bytes, what: str) -> Any:
         raise InvalidArchive(f"{what} is not JSON in UTF-8: {str(error)[:200]}.") from None
 
 
+def expect_names(value: Any, kind: type[BaseModel], what: str) -> None:
+    """See that an object has no field that ``kind`` has not: each would cost an error of its own.
+
+    Raises:
+        InvalidArchive: it has; the text names one.
+    """
+    if isinstance(value, dict):
+        for name in value:
+            if name not in kind.model_fields:
+                raise InvalidArchive(f"{what}: there is no field {name[:80]!r}.")
+
+
+def _expect_few(text: bytes) -> None:
+    """Read, a value takes many times the room of its text: there are to be no more than parts have, and some."""
+    if sum(map(text.count, (b"{", b"[", b","))) > 8192 + len(text) // 16:
+        raise InvalidArchive(f"{MANIFEST} lists more than the parts of a map.")
+
+
 def read_manifest(text: bytes) -> Manifest:
     """The manifest of a file, of whatever version that is known.
 
@@ -139,6 +161,7 @@ def read_manifest(text: bytes) -> Manifest:
         ArchiveTooNew: a later version of placerec wrote the file.
         InvalidArchive: it is none of ours, or says what cannot be.
     """
+    _expect_few(text)
     value = strict_json(text, MANIFEST)
     if not isinstance(value, dict) or value.get("format") != FORMAT:
         raise InvalidArchive(f"{MANIFEST} is not that of a map of placerec.")
@@ -153,6 +176,14 @@ def read_manifest(text: bytes) -> Manifest:
 
 
 def _read_first(value: dict[str, Any]) -> Manifest:
+    inner: Any = value
+    for name, kind in (("map", ArchivedRecord), ("calibration", Calibration), ("curve", Curve)):
+        inner = inner.get(name) if isinstance(inner, dict) else None
+        expect_names(inner, kind, f"{MANIFEST}: {name}")
+    expect_names(value, Manifest, MANIFEST)
+    parts = value.get("parts")
+    for part in parts if isinstance(parts, list) else ():
+        expect_names(part, Part, f"{MANIFEST}: parts")
     try:
         manifest = Manifest.model_validate(value)
     except (ValidationError, RecursionError) as error:

@@ -84,3 +84,25 @@ def test_a_commit_that_was_refused_does_not_come_back_with_a_crash(directory: Pa
     assert [place.id for place in lab.places(None, 100)[0]] == taken
     assert lab.verify().ok
     atlas.close()
+
+
+@pytest.mark.parametrize(("call", "before"), [("4", ["0"]), ("5", ["0", "1"])], ids=["deletion", "patch"])
+def test_a_change_that_was_refused_does_not_come_true_with_a_crash(
+    directory: Path, call: str, before: list[str]
+) -> None:
+    """A deletion that gives a segment back, a patch: nothing is appended, but SQLite's log has their frames."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    lab.enrol([frame(f"p{i}", sequence="monday" if i < 4 else "tuesday") for i in range(6)])
+    atlas.close()
+    finished = run("die-at-refused-change", directory, "fdatasync", "EIO", call)
+    assert finished.returncode in (-9, 137), finished.stderr.decode()
+    taken = [line.removeprefix("ack ") for line in finished.stdout.decode().splitlines()]
+    assert taken == before
+    atlas = Atlas(directory)
+    lab = atlas.get("lab")
+    assert lab.record.description == "edited"
+    assert [place.id for place in lab.places(None, 9)[0]] == [f"p{i}" for i in range(4 if "1" in taken else 0, 6)]
+    assert lab.place("p4").metadata == {}
+    assert lab.verify().ok
+    atlas.close()

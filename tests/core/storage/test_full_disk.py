@@ -110,6 +110,26 @@ def test_nothing_is_half_written_and_the_map_goes_on(
     atlas.close()
 
 
+def test_deleting_a_sequence_makes_room(small_disk: Path) -> None:
+    atlas = Atlas(small_disk / "data", rows_per_segment=8)
+    lab = atlas.create("lab", ENCODER, LARGE, MapSettings(keep="none"), local_shape=LOCAL_SHAPE)
+    for name in ("monday", "tuesday"):
+        lab.enrol([frame(f"{name}{i}", dimension=LARGE, sequence=name) for i in range(48)])
+    fill_up(small_disk, 250_000)  # a deletion needs a little, too
+    more = [frame(f"new{i}", dimension=LARGE) for i in range(32)]
+    searching = lab.snapshot()
+    with pytest.raises(StorageFull):
+        lab.enrol(more)
+    assert lab.forget_sequence("monday") == 48
+    assert len(searching) == 96, "who began to search reads to the end"
+    with pytest.raises(StorageFull):
+        lab.enrol(more)
+    del searching
+    lab.enrol(more)
+    assert lab.verify().ok and lab.count_places() == 80
+    atlas.close()
+
+
 def test_a_map_that_finds_no_room_is_not_made(small_disk: Path) -> None:
     atlas = Atlas(small_disk / "data")
     atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE).enrol([frame("p")])

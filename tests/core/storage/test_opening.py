@@ -197,3 +197,27 @@ def test_a_damaged_map_is_quarantined_and_the_others_serve(
         assert atlas.verify("hall").ok
     finally:
         atlas.close()
+
+
+def test_metadata_that_is_filed_otherwise_is_filed_anew(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """What places are found by follows from the places, and another SQLite may make it otherwise."""
+    atlas = Atlas(directory)
+    lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+    lab.enrol([frame(f"p{i}", metadata={"floor": i, "note": "a"}) for i in range(3)])
+    atlas.close()
+    folder = directory / "maps" / "lab"
+    run(folder, "UPDATE place_values SET value = 7 WHERE key = 'floor' AND row = 1")
+    run(folder, "DELETE FROM place_values WHERE key = 'note' AND row = 2")
+    atlas = Atlas(directory)
+    lab = atlas.get("lab")
+    assert "filed anew" in caplog.text and "map lab" in caplog.text.lower()
+    assert lab.attributes.rows_with({"floor": 1}).tolist() == [1]
+    assert lab.attributes.rows_with({"floor": 7}).tolist() == []
+    assert lab.attributes.rows_with({"note": "a"}).tolist() == [0, 1, 2]
+    assert lab.verify().ok
+    atlas.close()
+    caplog.clear()
+    atlas = Atlas(directory)
+    atlas.get("lab")
+    assert "filed anew" not in caplog.text
+    atlas.close()

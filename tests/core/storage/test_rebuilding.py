@@ -183,3 +183,17 @@ def test_what_cannot_be_built_is_told_and_tried_again(atlas: Atlas, monkeypatch:
     lab.enrol([frame("new", dimension=DIMENSION)])
     status = settled(lab)
     assert (status.tier, status.problem) == ("compact", None) and finds(lab, "new")
+
+
+def test_what_comes_while_lists_are_made_is_encoded_before_the_lock_is_taken(atlas: Atlas) -> None:
+    lab = make(atlas)
+    begun: list[int] = []
+
+    def progress(done: int, _total: int) -> None:
+        begun.append(done)
+        if begun.count(0) == 2 and done == 0:  # codes begin, lists begin
+            lab.enrol([frame(f"late{i}", dimension=DIMENSION) for i in range(20)])
+
+    made = rebuilding.remade(lab.snapshot, True, progress)
+    assert len(made.table) == lab.snapshot().rows == PLACES + 20
+    assert made.lists is not None and made.lists.rows == PLACES

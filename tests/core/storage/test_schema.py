@@ -97,3 +97,24 @@ def test_a_missing_table_or_column_is_found(connection: sqlite3.Connection) -> N
     connection.execute("DROP TABLE segments")
     with pytest.raises(Damage, match="segments"):
         check_schema(connection)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE INDEX places_of_camera ON places (camera)",
+        "CREATE TRIGGER no_more AFTER INSERT ON places BEGIN DELETE FROM pictures WHERE place = 0; END",
+    ],
+)
+def test_a_later_file_with_the_same_columns_is_refused_as_such(connection: sqlite3.Connection, statement: str) -> None:
+    migrate(connection, (*MIGRATIONS, (statement,)), create=True)
+    with pytest.raises(DataDirectoryTooNew):
+        migrate(connection)
+
+
+def test_a_version_that_is_not_that_of_the_tables_is_damage(connection: sqlite3.Connection) -> None:
+    migrate(connection, MIGRATIONS[:1], create=True)
+    migrate(connection)  # by way of an older file
+    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) | 64}")
+    with pytest.raises(Damage, match="schema"):
+        migrate(connection)

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
 import pytest
 
+from core.errors import MapQuarantined
 from core.storage import Atlas, Map, MapSettings
 from core.storage.descriptors import HEADER_BYTES
 from core.storage.segment import vectors
@@ -155,3 +157,53 @@ def test_places_enrolled_meanwhile_are_not_in_the_report(hall: Map, monkeypatch:
     report = hall.verify()
     assert (report.problems, report.places, report.rows) == ([], 9, 10)
     assert hall.count_places() == 13
+
+
+def test_the_log_can_be_emptied_while_descriptors_are_read(hall: Map, folder: Path) -> None:
+    """What is deleted meanwhile is no damage, and what is reclaimed waits until it is read."""
+    log = folder / "map.sqlite-wal"
+    told: list[int] = []
+
+    def write(done: int, total: int) -> None:
+        opened = hall._opened
+        assert opened is not None
+        if not told:
+            hall.forget("p9")
+            hall.enrol([frame("late")])
+            for i in range(4):
+                hall.forget(f"p{i}")
+            opened.database.settle()
+            assert log.stat().st_size == 0
+        told.append(done)
+
+    report = hall.verify(write)
+    assert (report.problems, report.places, report.rows) == ([], 9, 10)
+    assert told and hall.count_places() == 5
+    hall.edit({"description": "another"})
+    assert not (folder / "descriptors-000001.seg").exists() and hall.verify().ok
+
+
+def test_a_damaged_log_is_kept_as_it_is(directory: Path, tmp_path: Path) -> None:
+    """Verifying must not let SQLite take what is left of it: what was acknowledged would be gone at the next start."""
+    atlas = Atlas(directory, rows_per_segment=4)
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="image"), local_shape=LOCAL_SHAPE)
+    for name in ("a", "b", "c"):
+        lab.enrol([frame(name)])
+    crashed = tmp_path / "crashed"
+    shutil.copytree(directory, crashed)
+    atlas.close()
+    kept = {path.name: path for path in (crashed / "maps" / "lab").iterdir() if not path.name.endswith("-shm")}
+    flip(kept["map.sqlite-wal"], 32 + 24 + 5)
+    before = {name: path.read_bytes() for name, path in kept.items()}
+    for _ in range(2):
+        again = Atlas(crashed)
+        with pytest.raises(MapQuarantined):
+            again.get("lab")
+        report = again.verify("lab")
+        assert not report.ok and any(line.startswith("map.sqlite-wal: frame 1 ") for line in report.problems)
+        again.close()
+        assert {name: path.read_bytes() for name, path in kept.items()} == before
+    flip(kept["map.sqlite-wal"], 32 + 24 + 5)  # as if put back from a backup
+    mended = Atlas(crashed)
+    assert [place.id for place in mended.get("lab").places(None, 9)[0]] == ["a", "b", "c"]
+    mended.close()

@@ -136,12 +136,30 @@ def die_at_refusal(directory: Path) -> None:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+def die_at_refused_change(directory: Path) -> None:
+    """Changes that append nothing, until the disk refuses one, and is killed right then."""
+    lab = Atlas(directory, rows_per_segment=4).get("lab")
+    changes: list[Callable[[], object]] = [
+        lambda: lab.edit({"description": "edited"}),
+        lambda: lab.forget_sequence("monday"),  # a whole segment
+        lambda: lab.patch("p4", {"metadata": {"floor": 2}}),
+        lambda: lab.forget("p5"),
+    ]
+    for number, change in enumerate(changes):
+        try:
+            change()
+            acknowledge(str(number))
+        except PlacerecError:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
 ACTIONS: dict[str, Callable[[Path], None]] = {
     "everything": everything,
     "fill": fill,
     "hold": hold,
     "keep-trying": keep_trying,
     "die-at-refusal": die_at_refusal,
+    "die-at-refused-change": die_at_refused_change,
 }
 
 if __name__ == "__main__":

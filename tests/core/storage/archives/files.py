@@ -79,6 +79,19 @@ def line_changed(content: bytes, part: str, number: int, **values: Any) -> bytes
     return changed(content, change)
 
 
+def grown(work: Callable[[], object]) -> int:
+    """By how many bytes this process grew, at most, while it did some work."""
+    Path("/proc/self/clear_refs").write_text("5")  # the peak is what there is now
+    before = _peak()
+    work()
+    return _peak() - before
+
+
+def _peak() -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
+
+
 def imported(atlas: Atlas, path: Path, map_id: str, rows_per_segment: int = 4) -> Map:
     """The map of a file, listed."""
     with Archive(path) as archive, atlas.building(map_id) as folder:

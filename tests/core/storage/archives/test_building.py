@@ -13,9 +13,10 @@ import pytest
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
 from core.storage import Atlas, descriptors
 from core.storage.archives import building
-from core.storage.archives.building import build
+from core.storage.archives.building import build, layout_of
+from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive
-from tests.core.storage.archives.files import Parts, changed, imported, line_changed
+from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, frame
 
 Made = Callable[[bytes], bytes]
@@ -100,6 +101,7 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "no camera's name": (place(camera="../x"), "camera"),
     "deep metadata": (place(metadata=deep(70)), "nested"),
     "endless metadata": (raw(PLACES, lambda d: d.replace(b'"i":0', b'"i":1e999')), "JSON"),
+    "long metadata": (place(metadata={"a": "x" * (1 << 20)}), "the metadata has more than"),
     "metadata that is a list": (place(metadata=[1]), "metadata"),
     "half a character": (raw(SEQUENCES, lambda d: d.replace(b"monday", b"\\ud800")), "unicode"),
     "half a character in metadata": (place(metadata={"a": "\ud800"}), "half a character"),
@@ -116,9 +118,12 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a descriptor that is no number": (descriptor(1, np.nan), "none that can be compared"),
     "an infinite descriptor": (descriptor(1, np.inf), "none that can be compared"),
     "a line too few": (raw(PLACES, lambda d: d[: d.rindex(b"\n", 0, -1) + 1]), "lines, not 9|longer"),
-    "a line too many": (raw(PLACES, lambda d: d + d.splitlines(keepends=True)[0].replace(b"p0", b"p99")), "shorter"),
+    "a line too many": (
+        raw(PLACES, lambda d: d + d.splitlines(keepends=True)[0].replace(b"p0", b"p99")),
+        "more lines, not 9",
+    ),
     "no end of line": (raw(PLACES, lambda d: d[:-1]), "end of a line"),
-    "an empty line": (raw(PLACES, lambda d: d + b"\n"), "is not JSON"),
+    "an empty line": (raw(PLACES, lambda d: d.replace(b"\n", b"\n\n", 1)), "is not JSON"),
     "no UTF-8": (raw(PLACES, lambda d: d.replace(b"p0", b"\xff\xfe", 1)), "UTF-8"),
     "no object": (raw(PLACES, lambda d: b"[]\n" + d.split(b"\n", 1)[1]), "line 1"),
     "an endless line": (raw(PLACES, lambda d: b" " * (5 << 20) + d), "a line of more than"),
@@ -126,6 +131,10 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a sequence of nobody": (line(SEQUENCES, 1, name="sunday"), "does not list"),
     "an empty sequence": (counted(SEQUENCES, 0, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "is empty"),
     "sequences miscounted": (raw(SEQUENCES, lambda d: d + b'{"name":"empty","next_ordinal":1}\n'), "lines, not"),
+    "more sequences than places": (
+        counted(SEQUENCES, 0, lambda d: d + b"".join(b'{"name":"s%d","next_ordinal":1}\n' % i for i in range(20))),
+        "no more than 10 sequences",
+    ),
     "a camera twice": (counted(CAMERAS, 1, again), "UNIQUE"),
     "too many cameras": (counted(CAMERAS, 1, many), "at most 256"),
     "a mask of everything": (line(CAMERAS, 0, mask={"polygons": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}), "mask"),
@@ -173,6 +182,63 @@ def test_pictures_can_be_looked_at(content: bytes, shelf: Atlas, tmp_path: Path)
     ):
         build(archive, folder, "lab", check_picture=refuse)
     assert left_behind(shelf._directory) == []
+
+
+def test_large_pictures_are_not_even_read(content: bytes, shelf: Atlas, tmp_path: Path) -> None:
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    with (
+        pytest.raises(InvalidArchive, match=r"cannot be taken: it has .* at most 3"),
+        Archive(path) as archive,
+        shelf.building("lab") as folder,
+    ):
+        build(archive, folder, "lab", most_picture_bytes=3)
+    assert left_behind(shelf._directory) == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"dimension": 1 << 24, "local_cells": 1 << 20, "local_values": 1 << 16},
+        {"dimension": 1 << 24, "local_cells": 1 << 15, "local_values": (1 << 16) - 1},  # numpy counts it below zero
+        {"encoder": "ü" * 1000},
+        {"local_cells": 1, "local_values": 0},
+    ],
+)
+@pytest.mark.parametrize("precision", ["full", "half", "compressed"])
+def test_places_that_nothing_could_hold(content: bytes, values: dict[str, Any], precision: str) -> None:
+    manifest = parts_of(content)[0]
+    manifest["map"] |= {**values, "precision": precision}
+    with pytest.raises(InvalidArchive, match="what cannot be"):
+        layout_of(Manifest.model_validate(manifest))
+
+
+def test_it_can_be_broken_off_among_the_sequences(
+    content: bytes, shelf: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def advance(done: int, total: int) -> None:
+        raise KeyboardInterrupt(f"{done} of {total}")
+
+    monkeypatch.setattr(building, "LINES_BETWEEN", 2)
+    path = tmp_path / "sent.tar"
+    path.write_bytes(content)
+    with pytest.raises(KeyboardInterrupt, match="0 of 9"), Archive(path) as archive, shelf.building("lab") as folder:
+        build(archive, folder, "lab", advance=advance)
+    assert left_behind(shelf._directory) == []
+
+
+def test_few_long_lines_are_held_at_a_time(
+    content: bytes, shelf: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(building, "TEXT_BYTES", 4500)
+    path, seen = tmp_path / "sent.tar", []
+    for number in (2, 5):
+        content = line_changed(content, PLACES, number, metadata={"a": "x" * 4400})
+    path.write_bytes(content)
+    with Archive(path) as archive, shelf.building("long") as folder:
+        build(archive, folder, "long", advance=lambda done, _: seen.append(done))
+    assert seen == [3, 6, 9] and shelf.get("long").verify().ok
+    shelf.delete("long")
 
 
 def test_the_id_is_taken_while_it_is_built(content: bytes, shelf: Atlas, tmp_path: Path) -> None:

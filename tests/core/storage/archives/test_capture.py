@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import sqlite3
 import threading
 from pathlib import Path
 
@@ -210,3 +211,22 @@ def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, a
     assert exported(found, tmp_path / "kept") and isinstance(found.capturing, Capturing)
     again.close()
     shutil.rmtree(directory)
+
+
+def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite ends some transactions by itself, when the disk fails."""
+
+    def ended(connection: sqlite3.Connection) -> None:
+        connection.execute("ROLLBACK")
+        raise RuntimeError("the first of it")
+
+    monkeypatch.setattr(capture, "read_layout", ended)
+    with pytest.raises(RuntimeError, match="the first of it"):
+        full.capturing.into(tmp_path / "kept")
+
+
+def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture, "MOST_MANIFEST_BYTES", 500)
+    with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
+        full.capturing.into(tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()

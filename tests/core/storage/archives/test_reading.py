@@ -15,9 +15,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from core.errors import ArchiveTooNew, InvalidArchive
+from core.storage.archives.lines import CameraLine, PlaceLine, read_line
+from core.storage.archives.manifest import MOST_MANIFEST_BYTES, group_names, read_manifest
 from core.storage.archives.reading import Archive, check
 from core.storage.archives.tape import BLOCK, header
-from tests.core.storage.archives.files import Parts, named, parts_of, sealed, taped
+from tests.core.storage.archives.files import Parts, grown, named, parts_of, sealed, taped
 
 Made = Callable[[bytes], bytes]
 PLACES = "places-000001.jsonl"
@@ -145,7 +147,8 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "no UTF-8": (text(b'{"format": "\xff"}'), "is not JSON in UTF-8"),
     "not a number": (text(b'{"format": "placerec map", "version": NaN}'), "is no number of JSON"),
     "a name twice": (text(b'{"format": 1, "format": "placerec map"}'), "stands twice"),
-    "deep": (text(b"[" * 200_000), "nested too deeply"),
+    "deep": (text(b"[" * 8_000), "nested too deeply"),
+    "deeper": (text(b"[" * 200_000), "lists more than"),
     "another format": (manifest_with(format="tar"), "not that of a map"),
     "version as text": (manifest_with(version="1"), "names no version"),
     "version yes": (manifest_with(version=True), "names no version"),
@@ -180,6 +183,58 @@ def test_hostile_files_are_refused(content: bytes, tmp_path: Path, case: str) ->
     path.write_bytes(make(content))
     with pytest.raises(InvalidArchive, match=complaint), Archive(path) as archive:
         check(archive)
+
+
+def _manifest(**values: Any) -> bytes:
+    return json.dumps({"format": "placerec map", "version": 1, **values}, separators=(",", ":")).encode()
+
+
+def _names(count: int, digits: int = 1) -> dict[str, int]:
+    return {f"{i:0{digits}}": 0 for i in range(count)}
+
+
+GREEDY: dict[str, Callable[[], bytes]] = {
+    "parts without anything": lambda: _manifest(parts=[{}] * (2 << 20)),
+    "parts without anything, not too many": lambda: _manifest(parts=[{}] * 4000),
+    "parts that are text": lambda: _manifest(parts=["x" * 60] * 60_000),
+    "names of a part": lambda: _manifest(parts=[_names(100_000, 25)]),
+    "names": lambda: _manifest(**_names(100_000, 25)),
+    "names of a curve": lambda: _manifest(map={"calibration": {"curve": _names(100_000, 25)}}),
+}
+GREEDY_LINES: dict[str, Any] = {
+    "names in a line": _names(80_000),
+    "names of a pose": {"pose": _names(80_000)},
+    "polygons": {"mask": {"polygons": [1] * 400_000}},
+    "corners": {"mask": {"polygons": [[1] * 400_000]}},
+}
+
+
+@pytest.mark.parametrize("case", [*GREEDY, *GREEDY_LINES])
+def test_what_is_refused_takes_little_memory(case: str) -> None:
+    """To name all that is wrong with each of these took hundreds of times the room of its text."""
+    manifest = case in GREEDY
+    text = GREEDY[case]() if manifest else json.dumps(GREEDY_LINES[case], separators=(",", ":")).encode()
+    kind = CameraLine if "mask" in GREEDY_LINES.get(case, ()) else PlaceLine
+
+    def work() -> None:
+        with pytest.raises(InvalidArchive) as refused:
+            if manifest:
+                read_manifest(text)
+            else:
+                read_line(text, kind, "here")
+        assert len(str(refused.value)) < 600
+
+    assert grown(work) < 48 << 20
+
+
+def test_a_manifest_as_long_as_they_come(content: bytes) -> None:
+    """Of two million places: an eighth of what may be, and far from having more values than it may."""
+    manifest, _ = parts_of(content)
+    names = ["sequences.jsonl", "cameras.jsonl", *(name for group in range(2048) for name in group_names(group))]
+    parts = [{"name": name, "rows": 1024, "bytes": 1 << 25, "sha256": "0" * 64} for name in names]
+    written = json.dumps({**manifest, "places": 1024 * 2048, "parts": parts}, indent=1).encode()
+    assert len(written) <= MOST_MANIFEST_BYTES // 8
+    assert read_manifest(written).groups == 2048
 
 
 def test_a_later_version_is_told_from_damage(content: bytes, tmp_path: Path) -> None:
