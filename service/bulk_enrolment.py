@@ -15,7 +15,7 @@ from starlette.requests import Request
 from core.storage import Map
 from service.background import run_behind
 from service.batches import candidate_of, check_batch, check_own, given_id
-from service.blocking import in_thread
+from service.blocking import to_its_end
 from service.bodies import intake_of, parse_json
 from service.enrolment import Candidate, Enrolled, enrol
 from service.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
@@ -65,11 +65,15 @@ async def receive(engine: Engine, map_: Map, request: Request) -> Job:
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
     name = await engine.staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
+    return await to_its_end(lambda: _submit(engine, map_, name))
+
+
+def _submit(engine: Engine, map_: Map, name: str) -> Job:
+    """Let a job wait for a form, which is removed if there comes none."""
     try:
-        count = await in_thread(lambda: len(_entries(engine, engine.staging.open(name))[0]))
-        arguments = {"form": name, "places": count}
+        count = len(_entries(engine, engine.staging.open(name))[0])
         maps = {map_.record.id: born(map_)}
-        return await in_thread(engine.jobs.submit, KIND, map_.record.id, arguments=arguments, maps=maps)
+        return engine.jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
     except BaseException:
         engine.staging.remove(name)
         raise

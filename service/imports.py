@@ -14,23 +14,26 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+import threading
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from anyio import CapacityLimiter, to_thread
+from anyio import CapacityLimiter
 
-from core.errors import InvalidArchive, StorageFailure, StorageFull, UnknownMap, WrongEncoder
-from core.images import read_header
+from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
+from core.images import Limits, read_header
 from core.places import check_map_id
 from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tape import BLOCK
 from core.storage.disk import Damage, refusals, sync_folder, write_at
-from service.faults import DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
+from service.blocking import to_its_end
+from service.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
 from service.job_context import JobContext
 from service.job_records import Job
 
@@ -41,6 +44,9 @@ KIND = "import"
 FOLDER = "imports"
 AT_ONCE = 1 << 20
 """Bytes that are gathered before they are written."""
+
+THUMBNAIL_BYTES, THUMBNAIL_PIXELS = 4 << 20, 2048 * 2048
+"""Of what a service keeps as a thumbnail, at most, however small the frames are that another one takes."""
 
 _DIGEST = re.compile(r"\s*([a-z0-9*_.-]+)\s*=\s*:([A-Za-z0-9+/=]*):\s*")
 
@@ -88,7 +94,8 @@ class Imports:
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._folder = engine.settings.data_dir / FOLDER
-        self._arriving = 0
+        self._held: set[str] = set()
+        """The files that are there, or are arriving."""
         self._building = CapacityLimiter(1)  # each writes as fast as the disk takes it
         engine.jobs.register(KIND, self.run, self._discard)
 
@@ -100,21 +107,10 @@ class Imports:
                 if path.name not in waited_for:
                     with suppress(OSError):
                         path.unlink()
+                else:
+                    self._held.add(path.name)
 
     # Arriving
-
-    @contextmanager
-    def _place(self) -> Iterator[None]:
-        waiting = 0
-        if self._folder.is_dir():
-            waiting = sum(not path.name.startswith(".") for path in self._folder.iterdir())
-        if self._arriving + waiting >= self._engine.settings.max_imports:
-            raise TooManyImports("Too many maps are being imported; send this one again in a while.")
-        self._arriving += 1
-        try:
-            yield
-        finally:
-            self._arriving -= 1
 
     async def receive(
         self, chunks: AsyncIterator[bytes], announced: int, digests: list[bytes], accept: Accept
@@ -129,26 +125,24 @@ class Imports:
             TooManyImports, InvalidArchive, ArchiveTooNew, DigestMismatch, StorageFull, StorageFailure.
             Others: what ``accept`` and ``chunks`` raise.  Nothing of the file is left.
         """
-        with self._place():
-            name = secrets.token_hex(8)
-            path = self._folder / f".{name}"
-            try:
-                arriving = await to_thread.run_sync(lambda: _Arriving(path, announced, accept))
-                try:
-                    gathered = bytearray()
-                    async for chunk in chunks:
-                        gathered += chunk
-                        if len(gathered) >= AT_ONCE:
-                            await to_thread.run_sync(arriving.add, bytes(gathered))
-                            gathered.clear()
-                    await to_thread.run_sync(arriving.add, bytes(gathered))
-                    await to_thread.run_sync(arriving.finish, digests, self._folder / name)
-                finally:
-                    arriving.close()
-            except BaseException:
-                for left in (path, self._folder / name):
-                    left.unlink(missing_ok=True)
-                raise
+        if len(self._held) >= self._engine.settings.max_imports:
+            raise TooManyImports("Too many maps are being imported; send this one again in a while.")
+        name = secrets.token_hex(8)
+        self._held.add(name)
+        arriving = _Arriving(self._folder / f".{name}", announced, accept)
+        try:
+            await to_its_end(arriving.open)
+            gathered = bytearray()
+            async for chunk in chunks:
+                gathered += chunk
+                if len(gathered) >= AT_ONCE:
+                    await to_its_end(partial(arriving.add, bytes(gathered)))
+                    gathered.clear()
+            await to_its_end(partial(arriving.add, bytes(gathered)))
+            await to_its_end(lambda: arriving.finish(digests, self._folder / name))
+        except BaseException:
+            await to_its_end(lambda: self._give_up(arriving, name))
+            raise
         manifest, tag, map_id = arriving.found
         return Arrived(name, map_id, manifest, tag, arriving.size)
 
@@ -186,11 +180,20 @@ class Imports:
         Raises:
             InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
         """
+        given_up = threading.Event()
+
+        def advance(_done: int, _all: int) -> None:
+            if given_up.is_set():
+                raise ClientGone("Nobody waits for the map any more.")
+
+        def work() -> None:
+            self._make(arrived.name, arrived.map_id, advance)
+
         try:
-            work = lambda: self._make(arrived.name, arrived.map_id, lambda _done, _all: None)  # noqa: E731
-            await to_thread.run_sync(work, limiter=self._building)
+            async with self._building:
+                await to_its_end(work, CapacityLimiter(1), given_up.set)  # in no thread of the pool
         finally:
-            await to_thread.run_sync(self._remove, arrived.name)
+            await to_its_end(lambda: self._remove(arrived.name))
 
     def _make(
         self,
@@ -205,7 +208,16 @@ class Imports:
             self.check_encoder(archive.manifest)
             try:
                 with self._engine.atlas.building(map_id) as folder:
-                    build(archive, folder, map_id, advance=advance, check_picture=_check_picture)
+                    largest = self._largest_picture()
+                    check = partial(_check_picture, limits=largest)
+                    build(
+                        archive,
+                        folder,
+                        map_id,
+                        advance=advance,
+                        check_picture=check,
+                        most_picture_bytes=largest.max_bytes,
+                    )
                     before_listing(archive)
             except Damage as damage:
                 raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
@@ -216,9 +228,20 @@ class Imports:
         if all(one.identity != manifest.map.encoder for one in self._engine.catalogue.describe()):
             raise WrongEncoder(f"The file's map is bound to {manifest.map.encoder[:140]}, which is not installed here.")
 
+    def _largest_picture(self) -> Limits:
+        """What a frame may have here, and a thumbnail."""
+        settings = self._engine.settings
+        most_bytes = max(settings.max_image_bytes, THUMBNAIL_BYTES)
+        return Limits(most_bytes, max(settings.max_image_pixels, THUMBNAIL_PIXELS), min_side=1)
+
     def _remove(self, name: str) -> None:
         with suppress(OSError):
-            (self._folder / name).unlink()
+            (self._folder / name).unlink(missing_ok=True)
+            self._held.discard(name)
+
+    def _give_up(self, arriving: _Arriving, name: str) -> None:
+        arriving.discard()
+        self._remove(name)
 
     # As a job
 
@@ -279,6 +302,10 @@ class _Arriving:
         self._hash = hashlib.sha256()
         self._found: tuple[Manifest, str, str] | None = None
         self.size = 0
+        self._file = -1
+
+    def open(self) -> None:
+        path, announced = self._path, self._announced
         with refusals("take in a map"):
             path.parent.mkdir(exist_ok=True)
             # As a file and as a map it is there twice for a moment.
@@ -318,10 +345,21 @@ class _Arriving:
             os.rename(self._path, there)
             sync_folder(there.parent)
             sync_folder(there.parent.parent)
+        self._close()
 
-    def close(self) -> None:
-        os.close(self._file)
+    def discard(self) -> None:
+        """Remove what there is of it, unless it has its name already."""
+        self._close()
+        with suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        file, self._file = self._file, -1
+        if file >= 0:
+            os.close(file)
 
 
-def _check_picture(content: bytes) -> None:
-    read_header(content)
+def _check_picture(content: bytes, limits: Limits) -> None:
+    header = read_header(content)
+    if header.width * header.height > limits.max_pixels:
+        raise TooManyPixels(f"it has {header.width}x{header.height} pixels of at most {limits.max_pixels}")

@@ -13,21 +13,24 @@ import os
 import secrets
 import shutil
 import threading
-from collections.abc import AsyncIterator, Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
-from anyio import to_thread
-
-from core.errors import StorageFailure
+from core.errors import StorageFailure, StorageFull
 from core.storage.disk import refusals, sync_folder, write_at, write_file
+from service.blocking import to_its_end
 from service.faults import StagingFull
 from service.multipart import FormReader, Part
 
 FOLDER = "staging"
 AT_ONCE = 1 << 20
 """Bytes that are gathered before they are parsed and written."""
+
+RESERVE = 256 << 20
+"""Bytes of the disk that forms leave free, for what the maps have to write meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -110,12 +113,16 @@ class Staging:
     Args:
         directory: that of the data.
         capacity: bytes that all of it may take.
+        reserve: bytes of the disk that it leaves to the maps.
     """
 
-    def __init__(self, directory: Path, capacity: int) -> None:
-        self._folder, self.capacity = directory / FOLDER, capacity
+    def __init__(self, directory: Path, capacity: int, reserve: int = RESERVE) -> None:
+        self._folder, self.capacity, self._reserve = directory / FOLDER, capacity, reserve
         self._lock = threading.Lock()
-        self._claimed = 0
+        self._sizes: dict[str, int] = {}
+        """Bytes of each form; of one that is still arriving those that are announced."""
+        self._coming: dict[str, int] = {}
+        """Of those that are still arriving: bytes that are not there yet."""
 
     def open(self, name: str) -> StagedForm:
         """A form that arrived whole.
@@ -134,6 +141,8 @@ class Staging:
         with refusals(f"remove {self._folder / name}"):
             if (self._folder / name).exists():
                 shutil.rmtree(self._folder / name)
+        with self._lock:
+            self._sizes.pop(name, None)
 
     def clean(self, waited_for: Collection[str]) -> None:
         """Remove all but what is waited for, as a crash left it; call it before anything arrives."""
@@ -141,26 +150,27 @@ class Staging:
             for found in self._folder.iterdir():
                 if found.name not in waited_for:
                     shutil.rmtree(found, ignore_errors=True)
+                else:
+                    with suppress(OSError):  # the job will say what it lacks
+                        self._sizes[found.name] = (found / "form").stat().st_size
 
     def size(self) -> int:
-        """Bytes that lie there now."""
-        if not self._folder.is_dir():
-            return 0
-        with refusals(f"look at {self._folder}"):
-            forms = [path for path in self._folder.glob("*/form") if not path.parent.name.startswith(".")]
-            return sum(path.stat().st_size for path in forms)
-
-    @contextmanager
-    def _room(self, size: int) -> Iterator[None]:
+        """Bytes that lie there now, or are announced."""
         with self._lock:
-            if self.size() + self._claimed + size > self.capacity:
+            return sum(self._sizes.values())
+
+    def _claim(self, name: str, size: int) -> None:
+        with self._lock:
+            if sum(self._sizes.values()) + size > self.capacity:
                 raise StagingFull("Too much waits to be enrolled already; send this again later.")
-            self._claimed += size
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._claimed -= size
+            self._sizes[name] = self._coming[name] = size
+
+    def _expect_room(self) -> None:
+        """See that the disk has room for all that is still to come, and the reserve besides."""
+        with self._lock:
+            coming = sum(self._coming.values())
+        if shutil.disk_usage(self._folder).free < coming + self._reserve:
+            raise StorageFull(f"The disk has no room for {coming} bytes of frames that are to wait, and for the maps.")
 
     async def receive(
         self,
@@ -182,45 +192,70 @@ class Staging:
             StorageFull, StorageFailure: nothing of it is left.
             Others: what ``chunks`` raises; nothing of it is left either.
         """
-        with self._room(announced):
-            name = secrets.token_hex(8)
-            arriving = self._folder / f".{name}"
-            try:
-                file = await to_thread.run_sync(lambda: _made(arriving))
-                try:
-                    writer = _Writer(content_type, max_parts, max_part_bytes, file)
-                    gathered = bytearray()
-                    async for chunk in chunks:
-                        gathered += chunk
-                        if len(gathered) >= AT_ONCE:
-                            await to_thread.run_sync(lambda data=bytes(gathered): _fed(writer, data))  # type: ignore[misc]
-                            gathered.clear()
-                    await to_thread.run_sync(lambda: _fed(writer, bytes(gathered)))
-                    writer.close()
-                    await to_thread.run_sync(lambda: _finished(writer, file, arriving, self._folder / name))
-                finally:
-                    os.close(file)
-            except BaseException:
-                shutil.rmtree(arriving, ignore_errors=True)
-                raise
+        name = secrets.token_hex(8)
+        self._claim(name, announced)
+        form = _Arriving(self._folder / f".{name}", self._folder / name)
+        try:
+            await to_its_end(lambda: form.open(self._expect_room))
+            writer = _Writer(content_type, max_parts, max_part_bytes, form.file)
+            gathered = bytearray()
+            async for chunk in chunks:
+                gathered += chunk
+                if len(gathered) >= AT_ONCE:
+                    await to_its_end(partial(_feed, writer, bytes(gathered)))
+                    self._coming[name] = max(0, self._coming[name] - len(gathered))
+                    gathered.clear()
+            await to_its_end(partial(_feed, writer, bytes(gathered)))
+            writer.close()
+            size = await to_its_end(lambda: form.finish(writer.staged))
+        except BaseException:
+            await to_its_end(form.discard)
+            with self._lock:
+                del self._sizes[name], self._coming[name]
+            raise
+        with self._lock:
+            del self._coming[name]
+            self._sizes[name] = size
         return name
 
 
-def _made(folder: Path) -> int:
-    with refusals(f"write {folder}"):
-        folder.mkdir(parents=True)
-        return os.open(folder / "form", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+class _Arriving:
+    """The folder of a form that is being written; from one thread at a time."""
+
+    def __init__(self, folder: Path, there: Path) -> None:
+        self._folder, self._there = folder, there
+        self.file = -1
+
+    def open(self, expect_room: Callable[[], None]) -> None:
+        with refusals(f"write {self._folder}"):
+            self._folder.mkdir(parents=True)
+            expect_room()
+            self.file = os.open(self._folder / "form", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+
+    def finish(self, staged: Sequence[StagedPart]) -> int:
+        """Sync it and give it its name; its size."""
+        with refusals(f"write {self._there}"):
+            os.fsync(self.file)
+            size = os.fstat(self.file).st_size
+            write_file(self._folder / "parts", json.dumps([asdict(part) for part in staged]).encode())
+            os.rename(self._folder, self._there)
+            sync_folder(self._there.parent)
+            sync_folder(self._there.parent.parent)
+        self._close()
+        return size
+
+    def discard(self) -> None:
+        """Remove what there is of it, under either name."""
+        self._close()
+        for folder in (self._folder, self._there):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _close(self) -> None:
+        file, self.file = self.file, -1
+        if file >= 0:
+            os.close(file)
 
 
-def _fed(writer: _Writer, data: bytes) -> None:
+def _feed(writer: _Writer, data: bytes) -> None:
     with refusals("write down what arrives"):
         writer.feed(data)
-
-
-def _finished(writer: _Writer, file: int, arriving: Path, there: Path) -> None:
-    with refusals(f"write {there}"):
-        os.fsync(file)
-        write_file(arriving / "parts", json.dumps([asdict(part) for part in writer.staged]).encode())
-        os.rename(arriving, there)
-        sync_folder(there.parent)
-        sync_folder(there.parent.parent)

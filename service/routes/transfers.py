@@ -10,9 +10,9 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.places import check_map_id
+from service.blocking import in_thread, to_its_end
 from service.bodies import StrictRoute, intake_of
 from service.dependencies import EngineDep, MapId, PrincipalDep, entity_tag, single_values
-from service.engine import in_thread
 from service.exports import MEDIA_TYPE, ExportResponse
 from service.faults import (
     BodyTooLarge,
@@ -187,7 +187,7 @@ async def import_map(
     request.state.noted = {"map": arrived.map_id, "manifest": arrived.tag}
     root = engine.settings.root_path
     if options.background:
-        job = await in_thread(engine.imports.submit, arrived)
+        job = await to_its_end(lambda: engine.imports.submit(arrived))
         shown = JobView.of(job).model_dump(mode="json")
         return JSONResponse(shown, 202, {"Location": f"{root}{jobs.prefix}/{job.id}"})
     await engine.imports.build(arrived)

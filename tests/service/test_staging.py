@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import shutil
+import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from core.errors import StorageFailure, StorageFull
+from core.storage.disk import write_at
+from service import staging as module
 from service.faults import BodyTooLarge, ClientGone, MalformedBody, StagingFull
 from service.staging import Staging
 
@@ -94,3 +100,51 @@ async def test_damage_is_found_and_a_start_clears_away_what_nobody_waits_for(tmp
         staging.open("none")
     staging.clean({second})
     assert left(tmp_path) == [second]
+    restarted = Staging(tmp_path, 6)
+    restarted.clean({second})
+    assert restarted.size() == 5
+    with pytest.raises(StagingFull):
+        await received(restarted, body(one=b"1"), announced=2)
+    restarted.remove(second)
+    assert restarted.size() == 0
+    await received(restarted, body(one=b"1"), announced=2)
+
+
+@pytest.mark.anyio
+async def test_a_task_that_is_cancelled_writes_into_no_other_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the server does when it stops; the thread goes on, and its file's number must not become another's."""
+    staging, reached, opened = Staging(tmp_path, 1 << 20), threading.Event(), threading.Event()
+
+    def late(*arguments: Any) -> None:
+        reached.set()
+        assert opened.wait(10)
+        write_at(*arguments)
+
+    monkeypatch.setattr(module, "write_at", late)
+    task = asyncio.create_task(received(staging, body(one=b"1" * 900), announced=900))
+    async with asyncio.timeout(10):
+        while not reached.is_set():
+            await asyncio.sleep(0.001)
+    task.cancel()
+    await asyncio.sleep(0.01)
+    assert not task.done() and staging.size() == 900
+    with (tmp_path / "another").open("xb"):
+        opened.set()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    assert (tmp_path / "another").read_bytes() == b""
+    assert left(tmp_path) == [] and staging.size() == 0
+
+
+@pytest.mark.anyio
+async def test_forms_leave_room_for_the_maps(tmp_path: Path) -> None:
+    free = shutil.disk_usage(tmp_path).free
+    with pytest.raises(StorageFull, match="and for the maps"):
+        await received(Staging(tmp_path, 2 * free, reserve=free + (1 << 30)), body(one=b"1"))
+    roomy = Staging(tmp_path, 2 * free, reserve=0)
+    with pytest.raises(StorageFull, match="no room for"):
+        await received(roomy, body(one=b"1"), announced=free + (1 << 30))
+    assert left(tmp_path) == [] and roomy.size() == 0
+    await received(roomy, body(one=b"1"), announced=1000)

@@ -162,6 +162,17 @@ def _no_picture(manifest: dict[str, Any], parts: Parts) -> None:
     parts["pictures-000001.bin"] = data + parts["pictures-000001.bin"][len(data) :]
 
 
+def _endless_picture(manifest: dict[str, Any], parts: Parts) -> None:
+    """A PNG of 900 megapixels, by its header."""
+    (line, *rest) = parts["places-000001.jsonl"].splitlines(keepends=True)
+    value = json.loads(line)
+    old = value["picture"]["bytes"]
+    data = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + (30_000).to_bytes(4, "big") * 2 + bytes(9)
+    value["picture"] |= {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    parts["places-000001.jsonl"] = json.dumps(value).encode() + b"\n" + b"".join(rest)
+    parts["pictures-000001.bin"] = data + parts["pictures-000001.bin"][old:]
+
+
 def test_hostile_files(server: Server, content: bytes) -> None:
     """A few of each kind; ``tests/core/storage/archives`` has them all."""
     manifest, parts = parts_of(content)
@@ -173,6 +184,7 @@ def test_hostile_files(server: Server, content: bytes) -> None:
         (content[:-5000] + b"x" + content[-4999:], "invalid-archive"),
         (line_changed(content, "places-000001.jsonl", 1, id="../p"), "invalid-archive"),
         (changed(content, _no_picture), "invalid-archive"),
+        (changed(content, _endless_picture), "invalid-archive"),
         (named(json.dumps({**manifest, "version": 9}).encode(), parts), "archive-too-new"),
     ):
         name = new_id()
