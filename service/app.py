@@ -12,6 +12,7 @@ from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
 
 from service.access import Access, Gate, tell_exposure, ways_of
 from service.audit import kept_in
@@ -95,6 +96,15 @@ async def _tell_methods(request: Request, _error: Exception) -> Response:
     return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
 
 
+async def _tell_unknown(scope: Scope, receive: Receive, send: Send) -> None:
+    """404 for a path without a route; the framework would answer a WebSocket with an empty 403."""
+    error = HTTPException(404)
+    if scope["type"] != "websocket":
+        raise error
+    answer = problem_response(Request({**scope, "type": "http", "method": "GET"}), error)
+    await WebSocket(scope, receive, send).send_denial_response(answer)
+
+
 def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> FastAPI:
     """The service; nothing is opened or loaded before it starts.
 
@@ -144,6 +154,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     app.add_exception_handler(405, _tell_methods)
     for router in ROUTERS:
         app.include_router(router)
+    app.router.default = _tell_unknown
     app.state.gate = gate
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)

@@ -182,6 +182,12 @@ class MalformedHead(Fault):
     """The head of the request is not HTTP."""
 
 
+class HandshakeRefused(MalformedHead):
+    """The request asks for a WebSocket, and not as one is asked for."""
+
+    headers: ClassVar[dict[str, str]] = {"Sec-WebSocket-Version": "13"}
+
+
 class HeadTooSlow(Fault):
     """The head of the request did not come in time."""
 

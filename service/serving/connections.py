@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import fcntl
 import socket
+import struct
+import sys
+import termios
 from collections import Counter, OrderedDict
 from collections.abc import Iterable
 from typing import Protocol
@@ -158,3 +163,15 @@ def patient(listener: socket.socket, settings: Settings) -> None:
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, seconds))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, max(1, seconds // 3))
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+
+
+def untaken(transport: asyncio.Transport) -> int:
+    """Bytes that were written and that the other end has not taken: those that wait here, and in the system's buffer.
+
+    The latter goes down bit by bit where the former does in pieces of up to megabytes.
+    """
+    size = transport.get_write_buffer_size()
+    if sys.platform.startswith("linux"):
+        descriptor = transport.get_extra_info("socket").fileno()
+        size += struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))[0]
+    return size

@@ -13,8 +13,8 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from service.faults import Fault, HeadTooLarge, HeadTooSlow, MalformedHead, TooManyConnections, UrlTooLong
 from service.problems import MEDIA_TYPE, RETRY_LATER, declared, problem_of, retry_after
-from service.serving.connections import LEAST_PROGRESS, Connections
-from service.serving.streams import StreamConnection
+from service.serving.connections import LEAST_PROGRESS, Connections, untaken
+from service.serving.streams import StreamConnection, handshake_fault
 
 LINGER_SECONDS = 2.0
 """So long what a refused caller still sends is read and thrown away: a connection that is closed before might take the
@@ -50,6 +50,7 @@ class HttpConnection(HttpToolsProtocol):
         self._last = False  # the next answer is the last one
         self._surplus = False
         self._in_head = self._in_message = False
+        self._began = False  # a head did, in the bytes that came last
         self._url_size = self._fields_size = self._fields = self._partial = 0
         self._head_timer: asyncio.TimerHandle | None = None
         self._write_timer: asyncio.TimerHandle | None = None
@@ -91,48 +92,51 @@ class HttpConnection(HttpToolsProtocol):
             self._end_timer = self.loop.call_later(LAST_SECONDS, self._end, "stopping")
 
     def timeout_keep_alive_handler(self) -> None:
-        """The caller had no request for too long."""
-        self._end("idle")
+        """The caller had no request for too long; what the system has yet to send it is being read."""
+        if untaken(self.transport):
+            self._await_request()
+        else:
+            self._end("idle")
 
     def _is_working(self) -> bool:
         """Whether a request is under way that waits for its answer."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _end(self, reason: str) -> None:
-        """Close; what was written has ``write_timeout`` to be taken."""
         if self.transport is None or self.transport.is_closing():
             return
         self._connections.ended(reason)
-        self.transport.close()
-        self._abort_later()
+        self._close()
 
-    def _abort_later(self) -> None:
-        if self._end_timer is not None:
-            self._end_timer.cancel()
-        self._end_timer = self.loop.call_later(self._settings.write_timeout, self.transport.abort)
+    def _close(self) -> None:
+        """Close; what was written may still be taken, as slowly as any answer."""
+        self.transport.close()
+        self._watch_rest()
 
     # What arrives
 
     def data_received(self, data: bytes) -> None:
         if self._deaf:
             return
-        began = self._in_head
+        self._began = False
         super().data_received(data)
         if self._deaf or self.transport.is_closing() or self.transport.get_protocol() is not self:
             return
-        if began and self._in_head:
-            # Only whole chunks of a head that goes on are counted, so that a body before it is not.
+        if self._in_head and not self._began:
+            # Only whole chunks of a head that goes on are counted, so that what came before it is not.
             self._partial += len(data)
             if self._partial > self._settings.max_url_bytes + self._settings.max_header_bytes:
                 self._refusal = HeadTooLarge("The head of the request has no end.")
                 self.send_400_response("")
                 return
-        if self._head_timer is None and (self._in_head or not (self._in_message or self._is_working())):
+        timed = self._in_message or self._is_working() or self.flow.write_paused or self.timeout_keep_alive_task
+        if self._head_timer is None and (self._in_head or not timed):
             self._head_timer = self.loop.call_later(self._settings.head_timeout, self._head_too_slow)
 
     def on_message_begin(self) -> None:
         super().on_message_begin()
-        self._in_head = self._in_message = True
+        self._unset_keepalive_if_required()
+        self._in_head = self._in_message = self._began = True
         self._url_size = self._fields_size = self._fields = self._partial = 0
 
     def on_url(self, url: bytes) -> None:
@@ -168,6 +172,8 @@ class HttpConnection(HttpToolsProtocol):
             self._connections.ended("pipelining")
             self._stop_listening()
             raise _Refused
+        if self.parser.should_upgrade() and self._should_upgrade():
+            self._check_handshake()
         super().on_headers_complete()
         if self._is_working():
             self._connections.work(self)
@@ -177,24 +183,49 @@ class HttpConnection(HttpToolsProtocol):
     def on_message_complete(self) -> None:
         self._in_message = False
         super().on_message_complete()
+        if self._head_timer is not None:  # that of the rest of a refused body, which has come
+            self._head_timer.cancel()
+            self._head_timer = None
+            self._await_request()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
         if self.transport.is_closing():
-            self._abort_later()
+            self._watch_rest()
         elif not self._is_working() and not self.pipeline:
-            self._connections.wait(self)
-            if self._in_message and self._head_timer is None:
-                # The rest of a refused body: it is thrown away, but not for ever.
-                self._unset_keepalive_if_required()
-                self._head_timer = self.loop.call_later(self._settings.read_timeout, self._head_too_slow)
+            self._unset_keepalive_if_required()
+            self._watch_rest()
+            if not self.flow.write_paused:
+                self._await_request()
+
+    def _await_request(self) -> None:
+        """All is answered, and the answers are taken: it is the caller's turn."""
+        self._connections.wait(self)
+        if not self._in_message:
+            seconds, idle = self.timeout_keep_alive, self.timeout_keep_alive_handler
+            self.timeout_keep_alive_task = self.loop.call_later(seconds, idle)
+        elif self._head_timer is None:
+            # The rest of a refused body: it is thrown away, but not for ever.
+            self._head_timer = self.loop.call_later(self._settings.read_timeout, self._head_too_slow)
+
+    def _check_handshake(self) -> None:
+        start = b"%b %b HTTP/%b" % (self.parser.get_method(), self.url, self.parser.get_http_version().encode())
+        fields = [name + b": " + value for name, value in self.headers]
+        fault = handshake_fault(b"\r\n".join([start, *fields, b"", b""]))
+        if fault is not None:
+            self._refuse(fault)
 
     def handle_websocket_upgrade(self) -> None:
         self._connections.work(self)
         super().handle_websocket_upgrade()
+        if self._write_timer is not None:
+            self._write_timer.cancel()
         protocol: object = self.transport.get_protocol()
         if isinstance(protocol, StreamConnection):
             protocol.came_from(self)
+            if self.flow.write_paused:  # by the answer before
+                self.transport.set_write_buffer_limits()
+                protocol.pause_writing()
 
     # Refusals
 
@@ -240,18 +271,21 @@ class HttpConnection(HttpToolsProtocol):
         elif working:  # its answer comes first, and is the last one
             return
         body = problem.model_dump_json(exclude_none=True).encode()
-        retry = f"Retry-After: {retry_after(fault)}\r\n" if isinstance(fault, RETRY_LATER) else ""
+        fields: dict[str, str] = dict(getattr(fault, "headers", {}))
+        if isinstance(fault, RETRY_LATER):
+            fields["Retry-After"] = retry_after(fault)
+        more = "".join(f"{name}: {value}\r\n" for name, value in fields.items())
         head = (
             f"HTTP/1.1 {problem.status} {http.HTTPStatus(problem.status).phrase}\r\n"
             f"Content-Type: {MEDIA_TYPE}\r\nContent-Length: {len(body)}\r\nX-Request-Id: {problem.request_id}\r\n"
-            f"{retry}Connection: close\r\n\r\n"
+            f"{more}Connection: close\r\n\r\n"
         )
         self.transport.write(head.encode() + body)
         if self.transport.can_write_eof():
             self.transport.write_eof()
         if self._end_timer is not None:
             self._end_timer.cancel()
-        self._end_timer = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
+        self._end_timer = self.loop.call_later(LINGER_SECONDS, self._close)
 
     def _stop_listening(self) -> None:
         """Read nothing more; the last of the answers that are still to come ends the connection."""
@@ -264,9 +298,14 @@ class HttpConnection(HttpToolsProtocol):
 
     # What is written
 
+    def _watch_rest(self) -> None:
+        """Have ``pause_writing`` called now if anything is still to be taken, and ``resume_writing`` when all is."""
+        if self.transport.get_write_buffer_size():
+            self.transport.set_write_buffer_limits(high=0)
+
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._unwritten = self.transport.get_write_buffer_size()
+        self._unwritten = untaken(self.transport)
         self._write_timer = self.loop.call_later(self._settings.write_timeout, self._check_progress)
 
     def resume_writing(self) -> None:
@@ -274,9 +313,12 @@ class HttpConnection(HttpToolsProtocol):
         if self._write_timer is not None:
             self._write_timer.cancel()
             self._write_timer = None
+        self.transport.set_write_buffer_limits()
+        if not (self._deaf or self.transport.is_closing() or self._is_working() or self.pipeline):
+            self._await_request()
 
     def _check_progress(self) -> None:
-        left = self.transport.get_write_buffer_size()
+        left = untaken(self.transport)
         if self._unwritten - left < LEAST_PROGRESS:
             self._connections.ended("write-timeout")
             self.transport.abort()

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem, typed
-from tests.service.serving.wire import eventually, opened, post, rest
+from tests.service.serving.wire import eventually, get, opened, post, rest
 
 FRAMES = [jpeg(seed) for seed in range(8)]
 
@@ -127,9 +127,12 @@ def test_what_was_acknowledged_is_there_after_a_restart(
 
 def test_what_does_not_end_in_time_is_given_up_and_told_so(tmp_path: Path) -> None:
     server = Server(tmp_path, settings={"shutdown_timeout": 0.5, "read_timeout": 300, "request_timeout": 300})
-    with opened(server.wait("/livez")) as slow:
+    with opened(server.wait("/livez")) as slow, opened(server) as refused:
         slow.sendall(post("/v1/encode", FRAMES[0][:100], length=50_000))
+        # Of a WebSocket that is refused while it opens, the stop must not hear.
+        refused.sendall(get("/?" + "x" * 9000, "Connection: Upgrade", "Upgrade: websocket"))
         assert server.client.get("/livez").status_code == 200
         assert server.stop() == 0
         found = rest(slow)
+    assert not [line for line in server.lines() if "exception" in line]
     assert b"HTTP/1.1 503" in found and b"urn:placerec:problem:stopping" in found and b"retry-after" in found.lower()
