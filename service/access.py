@@ -24,7 +24,7 @@ from service.faults import Fault, KeyRefused, MapForbidden, RoleTooLow
 from service.keyring import Keyring
 from service.metrics import Metrics
 from service.origins import check_host, check_page
-from service.principals import ANONYMOUS, ASKER, NOBODY, OWNER, Principal
+from service.principals import ANONYMOUS, ASKER, NOBODY, OWNER, Asker, Principal
 from service.problems import KINDS, problem_response
 from service.rates import Rates, network_of
 from service.roles import FORGOTTEN, OPERATIONS, Rule, covers
@@ -143,8 +143,10 @@ class Access:
         except Fault as error:
             await self._refuse(scope, receive, send, error, way, path)
             return
+        asker = asker_of(state["principal"], way.operation if way else "unknown", state, address_of(scope))
+        ASKER.set(asker)  # for jobs, too, that change nothing
         if way is not None and way.rule.changes:
-            await self._change(scope, receive, send, way, path)
+            await self._change(scope, receive, send, asker, path)
         else:
             await self.app(scope, receive, send)
 
@@ -182,11 +184,9 @@ class Access:
         if "map" in path:
             principal.require(path["map"])
 
-    async def _change(self, scope: Scope, receive: Receive, send: Send, way: Way, path: Mapping[str, str]) -> None:
+    async def _change(self, scope: Scope, receive: Receive, send: Send, asker: Asker, path: Mapping[str, str]) -> None:
         """Pass on a request that changes a map, and tell of it when it is answered."""
         state = scope["state"]
-        asker = asker_of(state["principal"], way.operation, state, address_of(scope))
-        ASKER.set(asker)
         status = 0
 
         async def sending(message: Message) -> None:
@@ -200,6 +200,9 @@ class Access:
 
         try:
             await self.app(scope, receive, sending)
+        except asyncio.CancelledError:  # the service stops, and says so
+            status = status or 503
+            raise
         except BaseException:
             status = status or 500
             raise

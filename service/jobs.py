@@ -68,7 +68,7 @@ class Jobs:
         self._records = JobRecords(directory)
         self._kinds: dict[str, Work] = {}
         self._discards: dict[str, Discard] = {}
-        self._numbers = itertools.count()
+        self._numbers = itertools.count(1)
         self._gaveway: dict[str, tuple[int, int]] = {}  # behind whom a job waits that has given way
         self._works: dict[str, Work] = {}
         self._jobs = {job.id: job for job in self._records.read()}
@@ -206,7 +206,7 @@ class Jobs:
             job = self.get(job_id)
             if job.state in ("succeeded", "failed"):
                 raise JobEnded(f"The job {job_id} has {job.state} already.")
-            if ended := job.state == "queued" and not job.attempt:
+            if ended := job.state == "queued" and (not job.attempt or job_id in self._gaveway):
                 job = self._end(job_id, "cancelled")
             elif job.state != "cancelled" and not job.cancelling:
                 changed = replace(job, cancelling=True, change=job.change + 1)
@@ -238,7 +238,8 @@ class Jobs:
 
     def _work(self) -> None:
         while (job := self._take()) is not None:
-            note_job(job, "running")
+            if job.id not in self._gaveway:  # else that it began was told
+                note_job(job, "running")
             try:
                 self._do(job)
             except Exception:  # a defect of ours: the job is told as failed, and the worker goes on

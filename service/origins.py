@@ -35,11 +35,16 @@ def check_page(headers: Headers) -> None:
             host = value
     if site is not None and site not in OWN_SITES:
         raise ForeignPage("A page of another site sends this; without keys that is refused.")
-    if (
-        origin is not None
-        and urlsplit(origin.decode("latin-1")).netloc.lower().encode("latin-1") != (host or b"").lower()
-    ):
+    if origin is not None and _host_of(origin) != (host or b"").lower():
         raise ForeignPage("A page of another origin sends this; without keys that is refused.")
+
+
+def _host_of(origin: bytes) -> bytes | None:
+    """The host that an Origin header names, with its port; None where it is no origin."""
+    try:
+        return urlsplit(origin.decode("latin-1")).netloc.lower().encode("latin-1")
+    except ValueError:
+        return None
 
 
 def check_host(headers: Headers) -> None:

@@ -39,6 +39,9 @@ REMEMBERED = 10_000
 GRAPH_SHARE = 20.0
 """A map that is written to is looked at anew when so many times as long went by as that took the last time."""
 
+CLOCKS_DIFFER = 1.0
+"""Seconds by which two clocks part without one having been set: what is told of a session stays the same."""
+
 EXPIRED = "No frame came for too long."
 MAP_GONE = "Its map was deleted; the one of that name now is another."
 STATE_LOST = "What it had come to believe was damaged on disk."
@@ -80,8 +83,9 @@ class Session:
 
     @property
     def expires(self) -> float:
-        """When it ends unless a frame comes, seconds since 1970."""
-        return time.time() + self.expires_after - (time.monotonic() - self.idle_since)
+        """When it ends unless a frame comes, seconds since 1970, by the clock as it is set now."""
+        used = time.time() - (time.monotonic() - self.idle_since)
+        return self.expires_after + (self.used if abs(used - self.used) < CLOCKS_DIFFER else used)
 
     def touch(self) -> None:
         """A frame came, now."""

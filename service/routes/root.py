@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import platform
+from functools import lru_cache
 
 import faiss
 import torch
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, FastAPI, Request
 from prometheus_client import CONTENT_TYPE_LATEST
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import HTMLResponse, Response
 
 from service import openapi
 from service.dependencies import EngineDep, PrincipalDep
@@ -65,10 +67,20 @@ async def read_version(request: Request, engine: EngineDep) -> Version:
 @router.get("/openapi.json", include_in_schema=False)
 async def read_openapi(request: Request) -> Response:
     """This interface, described for machines."""
-    return JSONResponse(openapi.document(request.app))
+    return Response(_written(request.app), media_type="application/json")
 
 
 @router.get("/docs", include_in_schema=False)
 async def read_documentation(request: Request) -> Response:
     """This interface, described for people; the page needs nothing from elsewhere."""
-    return HTMLResponse(page(openapi.document(request.app)), headers={"Content-Security-Policy": SECURITY_POLICY})
+    return HTMLResponse(_shown(request.app), headers={"Content-Security-Policy": SECURITY_POLICY})
+
+
+@lru_cache(1)  # everybody may ask, and making it anew takes as long as a query
+def _written(app: FastAPI) -> bytes:
+    return json.dumps(openapi.document(app), ensure_ascii=False, separators=(",", ":")).encode()
+
+
+@lru_cache(1)
+def _shown(app: FastAPI) -> bytes:
+    return page(openapi.document(app)).encode()

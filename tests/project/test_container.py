@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import re
 import subprocess
@@ -114,6 +115,9 @@ def test_no_more_is_let_in_from_elsewhere_than_keys_let_in() -> None:
 def test_only_the_proxy_is_believed() -> None:
     services = compose_tls()["services"]
     address = services["tls"]["networks"]["front"]["ipv4_address"]
+    (network,) = compose_tls()["networks"]["front"]["ipam"]["config"]
+    assert ipaddress.ip_address(address) in ipaddress.ip_network(network["subnet"])
+    assert ipaddress.ip_address(address) not in ipaddress.ip_network(network["ip_range"]), "it may be given to another"
     assert services["placerec"]["environment"]["FORWARDED_ALLOW_IPS"] == address
     assert "proxy_set_header X-Forwarded-For $remote_addr;" in (DOCKER / "tls.conf").read_text()
 

@@ -132,8 +132,11 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
     forged = {"Authorization": headers["Authorization"], "X-Forwarded-For": "6.6.6.6"}
     with httpx.Client(transport=transport, base_url=f"https://localhost:{proxied.port}", headers=forged) as elsewhere:
         assert elsewhere.delete("/v1/maps/lab/places/p1").status_code == 204
-    trail = [json.loads(line) for line in proxied.server.log_file.read_text().splitlines() if "forget_place" in line]
-    assert [line["client"] for line in trail if line["logger"] == "placerec.audit"] == ["127.0.0.9"]
+    until = time.monotonic() + 10  # the line is written when the answer is on its way
+    while not (trail := proxied.server.lines(logger="placerec.audit", operation="forget_place")):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert [line["client"] for line in trail] == ["127.0.0.9"]
 
     logged = proxied.log.read_text()
     assert '"POST /v1/maps/lab/query" 200' in logged

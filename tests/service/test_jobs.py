@@ -352,27 +352,6 @@ def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
     assert sorted(discarded) == sorted([first.id, second.id, third.id])
 
 
-def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.job_context.SLICE_SECONDS", 0.0)
-    order, ready = list[str](), threading.Event()
-
-    def stepping(context: JobContext) -> dict[str, Any]:
-        assert ready.wait(5)
-        while (step := context.notes.get("step", 0)) < 3:
-            order.append(f"{context.map_id}{context.arguments['name']}{step}")
-            context.remember(step=step + 1)
-            context.give_way()
-        return {}
-
-    with running(tmp_path, {"step": stepping}) as jobs:
-        maps = ["x", "y", "x"]
-        made = [jobs.submit("step", name, arguments={"name": "ab"[i // 2]}) for i, name in enumerate(maps)]
-        ready.set()
-        assert [end_of(jobs, job).state for job in made] == ["succeeded"] * 3
-    assert [step for step in order if step.startswith("x")] == ["xa0", "xa1", "xa2", "xb0", "xb1", "xb2"]
-    assert order.index("ya0") < order.index("xa2") and order.index("xa1") < order.index("ya2"), order
-
-
 def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None:
     from core.storage import Atlas
     from service.job_context import born
