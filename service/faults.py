@@ -179,13 +179,15 @@ class RateExceeded(Fault):
 
 
 class MalformedHead(Fault):
-    """The head of the request is not HTTP."""
+    """The head of the request is not HTTP, or asks for a WebSocket and not as one is asked for.
 
+    Args:
+        headers: of the answer.
+    """
 
-class HandshakeRefused(MalformedHead):
-    """The request asks for a WebSocket, and not as one is asked for."""
-
-    headers: ClassVar[dict[str, str]] = {"Sec-WebSocket-Version": "13"}
+    def __init__(self, detail: str, headers: dict[str, str] | None = None) -> None:
+        super().__init__(detail)
+        self.headers = headers or {}
 
 
 class HeadTooSlow(Fault):

@@ -16,7 +16,7 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
-from service.faults import Fault, HandshakeRefused, HeadTooLarge, MemoryFull
+from service.faults import Fault, HeadTooLarge, MalformedHead, MemoryFull
 from service.serving.connections import Connections
 
 if TYPE_CHECKING:
@@ -39,9 +39,10 @@ def handshake_fault(head: bytes) -> Fault | None:
         return None
     if isinstance(judge.handshake_exc, SecurityError):
         return HeadTooLarge("The request for a WebSocket has too many headers, or a line of more than 8 KiB.")
-    return HandshakeRefused(
+    return MalformedHead(
         "This is no request for a WebSocket: that is a GET of HTTP/1.1 without a body, with Sec-WebSocket-Version: 13 "
-        "and 16 bytes in base64 as Sec-WebSocket-Key."
+        "and 16 bytes in base64 as Sec-WebSocket-Key.",
+        {"Sec-WebSocket-Version": "13"},
     )
 
 

@@ -278,8 +278,8 @@ def test_memory_does_not_grow_with_the_folder(tmp_path: Path, server: Server) ->
 def test_the_data_of_a_running_service_is_left_alone(
     placerec: Placerec, monday: Path, server: Server, client: httpx.Client
 ) -> None:
-    refused = placerec("enroll", monday, "--map", "lab", "--create", "--data-dir", server.data_dir, status=1)
+    refused = placerec("enroll", monday, "--map", "left-alone", "--create", "--data-dir", server.data_dir, status=1)
     assert refused.stderr.startswith("Error: ")
     assert "Traceback" not in refused.stderr
     assert "--url" in refused.stderr
-    assert client.get("/v1/maps/lab").status_code == 404
+    assert client.get("/v1/maps/left-alone").status_code == 404
