@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 from fastapi.routing import APIRoute
@@ -16,6 +16,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
 from service.settings import Settings
+
+PIECE_BYTES = 1 << 20
+"""Of a body that is written to disk as it arrives."""
 
 
 class UploadMemory:
@@ -140,6 +143,17 @@ class BodyLimit:
         finally:
             state["bytes_in"] = intake.size
             self.memory.release(intake.held)
+
+
+async def in_pieces(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Chunks of a body put together, each piece worth a thread's while; the last has the rest, or nothing."""
+    gathered = bytearray()
+    async for chunk in chunks:
+        gathered += chunk
+        if len(gathered) >= PIECE_BYTES:
+            yield bytes(gathered)
+            gathered.clear()
+    yield bytes(gathered)
 
 
 def intake_of(request: Request) -> Intake:

@@ -33,6 +33,7 @@ from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tape import BLOCK
 from core.storage.disk import Damage, refusals, sync_folder, write_at
 from service.blocking import to_its_end
+from service.bodies import in_pieces
 from service.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
 from service.job_context import JobContext
 from service.job_records import Job
@@ -42,9 +43,6 @@ if TYPE_CHECKING:
 
 KIND = "import"
 FOLDER = "imports"
-AT_ONCE = 1 << 20
-"""Bytes that are gathered before they are written."""
-
 THUMBNAIL_BYTES, THUMBNAIL_PIXELS = 4 << 20, 2048 * 2048
 """Of what a service keeps as a thumbnail, at most, however small the frames are that another one takes."""
 
@@ -132,13 +130,8 @@ class Imports:
         arriving = _Arriving(self._folder / f".{name}", announced, accept)
         try:
             await to_its_end(arriving.open)
-            gathered = bytearray()
-            async for chunk in chunks:
-                gathered += chunk
-                if len(gathered) >= AT_ONCE:
-                    await to_its_end(partial(arriving.add, bytes(gathered)))
-                    gathered.clear()
-            await to_its_end(partial(arriving.add, bytes(gathered)))
+            async for piece in in_pieces(chunks):
+                await to_its_end(partial(arriving.add, piece))
             await to_its_end(lambda: arriving.finish(digests, self._folder / name))
         except BaseException:
             await to_its_end(lambda: self._give_up(arriving, name))

@@ -22,12 +22,11 @@ from pathlib import Path
 from core.errors import StorageFailure, StorageFull
 from core.storage.disk import refusals, sync_folder, write_at, write_file
 from service.blocking import to_its_end
+from service.bodies import in_pieces
 from service.faults import StagingFull
 from service.multipart import FormReader, Part
 
 FOLDER = "staging"
-AT_ONCE = 1 << 20
-"""Bytes that are gathered before they are parsed and written."""
 
 RESERVE = 256 << 20
 """Bytes of the disk that forms leave free, for what the maps have to write meanwhile."""
@@ -198,14 +197,9 @@ class Staging:
         try:
             await to_its_end(lambda: form.open(self._expect_room))
             writer = _Writer(content_type, max_parts, max_part_bytes, form.file)
-            gathered = bytearray()
-            async for chunk in chunks:
-                gathered += chunk
-                if len(gathered) >= AT_ONCE:
-                    await to_its_end(partial(_feed, writer, bytes(gathered)))
-                    self._coming[name] = max(0, self._coming[name] - len(gathered))
-                    gathered.clear()
-            await to_its_end(partial(_feed, writer, bytes(gathered)))
+            async for piece in in_pieces(chunks):
+                await to_its_end(partial(_feed, writer, piece))
+                self._coming[name] = max(0, self._coming[name] - len(piece))
             writer.close()
             size = await to_its_end(lambda: form.finish(writer.staged))
         except BaseException:

@@ -24,7 +24,7 @@ from core.storage.disk import Damage
 from core.storage.index_files import IndexFiles
 from core.storage.named import NamedSegment
 from core.storage.parallel import threads
-from core.storage.rebuilding import fitted_coder, remade
+from core.storage.rebuilding import codes_of, fitted_coder, remade
 from core.storage.recall import measured
 from core.storage.segment import Held, flat_index, vectors
 from core.storage.snapshot import Snapshot
@@ -276,10 +276,7 @@ class Indexer:
                 return newest
         stop = min(start + _ROWS_AT_ONCE, newest.rows, (start // per_segment + 1) * per_segment)
         number = start // per_segment
-        if newest.segments[number].removed:
-            codes = coder.nothing(stop - start)
-        else:
-            codes = coder.encode(newest.descriptors_at(np.arange(start, stop)))
+        codes = codes_of(coder, newest, start, stop)
         newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None:
             newest = self._publish(lambda now: now.holding(number, None))

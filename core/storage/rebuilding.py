@@ -66,12 +66,12 @@ def _extended(table: CodeTable, snapshot: Snapshot, stop: int) -> CodeTable:
     while (start := len(table)) < stop:
         number = start // snapshot.rows_per_segment
         end = min(stop, (number + 1) * snapshot.rows_per_segment)
-        table = table.appended(_codes(table.coder, snapshot, start, end))
+        table = table.appended(codes_of(table.coder, snapshot, start, end))
     return table
 
 
-def _codes(coder: Coder, snapshot: Snapshot, start: int, stop: int) -> Codes:
-    """Of rows of one segment."""
+def codes_of(coder: Coder, snapshot: Snapshot, start: int, stop: int) -> Codes:
+    """The codes of rows of one segment."""
     if snapshot.segments[start // snapshot.rows_per_segment].removed:
         return coder.nothing(stop - start)
     return coder.encode(snapshot.descriptors_at(np.arange(start, stop)))

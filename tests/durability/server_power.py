@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import copy
 import re
-import shutil
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import httpx
@@ -17,12 +15,12 @@ import httpx
 from service.job_records import JobRecords
 from service.session_store import SessionStore
 from tests.durability import server_operations
-from tests.durability.lives import Dead, Lives
+from tests.durability.lives import Lives
 from tests.durability.model import Lost, World
 from tests.durability.server_kills import PATIENCE, SETTINGS, Client
 from tests.durability.servers import Servers
-from tests.durability.storage_power import PowerTally, check
-from tests.durability.traced_disk import VARIANTS, Disk, arguments
+from tests.durability.storage_power import PowerTally, check, cut
+from tests.durability.traced_disk import Disk, arguments
 from tests.service.encoders import install_coarse_encoder
 
 
@@ -85,26 +83,13 @@ def power(servers: Servers, lives: Lives, folder: Path, seed: object, operations
         Lost: something that was answered is not there, or something is half there.
     """
     trace, moments = record(servers, folder, seed, operations)
-    count = sum(1 for _ in answered(Disk(folder / "data"), trace))
-    random = Random(f"{seed}/power")
-    chosen = set(random.sample(range(count), min(count, disks)))
-    disk, tally = Disk(folder / "data"), PowerTally(operations)
-    for number, answers in enumerate(answered(disk, trace)):
-        if number not in chosen:
-            continue
-        variant = VARIANTS[0] if random.random() < 0.4 else random.choice(VARIANTS[1:])
-        image = folder / "disk"
-        shutil.rmtree(image, ignore_errors=True)
-        disk.image(image, variant, Random(f"{seed}/disk/{number}"))
-        try:
-            _check(lives, image, moments[answers : answers + 2])
-        except (Dead, Lost) as lost:
-            why = str(lost) or "the directory does not open"
-            raise Lost(f"seed {seed}, power cut at change {number}, {variant}: {why}") from lost
-        tally.moments, tally.disks = tally.moments + 1, tally.disks + 1
+
+    def look(image: Path, answers: int) -> None:
+        _check(lives, image, moments[answers : answers + 2])
+
+    tally = cut(folder, seed, PowerTally(operations), disks, lambda disk: answered(disk, trace), look)
     if max(answered(Disk(folder / "data"), trace), default=0) != operations:
         raise Lost("the trace does not show every answer")
-    tally.writes, tally.syncs = disk.writes, disk.syncs
     return tally
 
 

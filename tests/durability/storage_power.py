@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from random import Random
@@ -89,20 +89,43 @@ def power(lives: Lives, folder: Path, seed: object, operations: int, disks: int)
         Lost: something that was acknowledged is not there, or something is half there.
     """
     trace, worlds = record(lives, folder, seed, operations)
-    count = sum(1 for _ in moments(Disk(folder / "data"), trace))
+
+    def look(image: Path, acknowledged: int) -> None:
+        check(lives, image, worlds[acknowledged : acknowledged + 2])
+
+    return cut(folder, seed, PowerTally(operations), disks, lambda disk: moments(disk, trace), look)
+
+
+def cut(
+    folder: Path,
+    seed: object,
+    tally: PowerTally,
+    disks: int,
+    moments: Callable[[Disk], Iterator[int]],
+    look: Callable[[Path, int], None],
+) -> PowerTally:
+    """Cut the power at so many moments of a trace, and look at the disk that each leaves.
+
+    Args:
+        moments: replays the trace on a disk; after each change, how many operations were acknowledged.
+        look: compares a disk with what so many acknowledged operations allow; raises Lost or Dead.
+
+    Raises:
+        Lost: something that was acknowledged is not there, or something is half there.
+    """
+    count = sum(1 for _ in moments(Disk(folder / "data")))
     random = Random(f"{seed}/power")
-    chosen = sorted(random.sample(range(count), min(count, disks)))
-    disk, tally = Disk(folder / "data"), PowerTally(operations)
-    for number, acknowledged in enumerate(moments(disk, trace)):
-        if not chosen or number < chosen[0]:
+    chosen = set(random.sample(range(count), min(count, disks)))
+    disk, image = Disk(folder / "data"), folder / "disk"
+    for number, acknowledged in enumerate(moments(disk)):
+        if number not in chosen:
             continue
-        chosen.pop(0)
         tally.moments += 1
         variant = VARIANTS[0] if random.random() < 0.4 else random.choice(VARIANTS[1:])
-        shutil.rmtree(folder / "disk", ignore_errors=True)
-        disk.image(folder / "disk", variant, Random(f"{seed}/disk/{number}"))
+        shutil.rmtree(image, ignore_errors=True)
+        disk.image(image, variant, Random(f"{seed}/disk/{number}"))
         try:
-            check(lives, folder / "disk", worlds[acknowledged : acknowledged + 2])
+            look(image, acknowledged)
         except (Dead, Lost) as lost:
             why = str(lost) or "the directory does not open"
             raise Lost(f"seed {seed}, power cut at change {number}, {variant}: {why}") from lost

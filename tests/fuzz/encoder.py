@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 
-from core.encoder import Encoder, EncoderDefinition
-from core.encoders import NETWORK_SUFFIX, save_encoder
+from core.encoder import EncoderDefinition
+from core.encoders import NETWORK_SUFFIX
 from core.features import FeatureExtractor
 from core.network import Convolution, NetworkDefinition, Relu, load_network, save_network
 from core.preprocessing import InputDefinition
-from core.verdict import Calibration
-from core.vocabulary import train_vocabulary
-from tests.service.scenes import scene
+from tests.service.encoders import install
 
 SMALL = "small"
 
@@ -38,9 +35,6 @@ DEFINITION = EncoderDefinition(
     gamma=0.5,
     normalization="global",
 )
-CALIBRATION = Calibration(
-    source="encoder-default", threshold=1.0, margin=0.01, background_mean=0.3, background_deviation=0.1
-)
 
 
 def install_small_encoder(folder: Path) -> str:
@@ -49,11 +43,7 @@ def install_small_encoder(folder: Path) -> str:
     file = folder / f"{SMALL}{NETWORK_SUFFIX}"
     save_network(file, NETWORK, _weights())
     extractor = FeatureExtractor(load_network(file, DEFINITION.outputs), DEFINITION)
-    features = [extractor.regions(extractor.activations([scene(seed)])[0]).features for seed in range(6)]
-    vocabulary = train_vocabulary(np.concatenate(features), DEFINITION.words, 0, extractor.origin)
-    encoder = Encoder(SMALL, extractor, DEFINITION, vocabulary, CALIBRATION)
-    save_encoder(folder, encoder, vocabulary, SMALL, {"images": 6})
-    return encoder.identity
+    return install(folder, SMALL, extractor, DEFINITION, SMALL)
 
 
 def _weights() -> dict[str, torch.Tensor]:

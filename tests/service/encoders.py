@@ -38,14 +38,15 @@ SECOND_STAGE = AgreementDefinition(
 
 def install_coarse_encoder(folder: Path) -> str:
     """Put the encoder into a models directory; returns its identity."""
-    return _install(folder, COARSE, FeatureExtractor(_packaged_backbone(LAYERS), COARSE_DEFINITION), COARSE_DEFINITION)
+    extractor = FeatureExtractor(_packaged_backbone(LAYERS), COARSE_DEFINITION)
+    return install(folder, COARSE, extractor, COARSE_DEFINITION, _packaged_network())
 
 
 def install_two_stage_encoder(folder: Path) -> str:
     """The same with a second stage that examines the best three places; returns its identity."""
     definition = COARSE_DEFINITION.model_copy(update={"agreement": SECOND_STAGE})
     extractor = FeatureExtractor(_packaged_backbone(definition.outputs), definition, _projections())
-    return _install(folder, TWO_STAGES, extractor, definition)
+    return install(folder, TWO_STAGES, extractor, definition, _packaged_network())
 
 
 def _packaged_network() -> str:
@@ -73,7 +74,8 @@ def _projections() -> dict[str, Projection]:
     return projections
 
 
-def _install(folder: Path, name: str, extractor: FeatureExtractor, definition: EncoderDefinition) -> str:
+def install(folder: Path, name: str, extractor: FeatureExtractor, definition: EncoderDefinition, network: str) -> str:
+    """Put an encoder with words of six scenes into a models directory; its identity."""
     folder.mkdir(parents=True, exist_ok=True)
     features = [extractor.regions(extractor.activations([scene(seed)])[0]).features for seed in range(6)]
     vocabulary = train_vocabulary(np.concatenate(features), definition.words, 0, extractor.origin)
@@ -81,5 +83,5 @@ def _install(folder: Path, name: str, extractor: FeatureExtractor, definition: E
         source="encoder-default", threshold=1.0, margin=0.01, background_mean=0.3, background_deviation=0.1
     )
     encoder = Encoder(name, extractor, definition, vocabulary, calibration)
-    save_encoder(folder, encoder, vocabulary, _packaged_network(), {"images": 6})
+    save_encoder(folder, encoder, vocabulary, network, {"images": 6})
     return encoder.identity

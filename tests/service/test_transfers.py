@@ -361,6 +361,7 @@ def _limits(server: Server) -> None:
     assert export(server, "a", if_match=tag).status_code == 200
     assert server.enrol("a", "p", jpeg(1)).status_code == 201
     assert export(server, "b").status_code == 200, "the moment of a makes room: nobody reads it"
+    _until(lambda: export(server, "a", if_match=tag).status_code != 503)  # that of b is being let go of
     assert_problem(export(server, "a", if_match=tag), 412, "export-gone")
     _until(lambda: not any(server.data_dir.glob("exports/*")))
     for name in ("a", "b"):
