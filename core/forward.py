@@ -2,23 +2,25 @@
 
 torch's own pass puts the weights into the order that the processor's kernel wants at every call, and walks over
 each map once more to rectify it.  Here both are done once and for all, or within the convolution (oneDNN), and a
-max-pooling walks over channels-last maps without keeping where each maximum came from.  The sums are those of
-torch's own channels-last pass, in the same order.
+max-pooling walks over channels-last maps without keeping where each maximum came from.  Kernels of 3 x 3 and 5 x 5
+are done with half the multiplications (``winograd.py``), which rounds otherwise than torch's own sums.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numba
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from core.convolution import LAST, FusedConvolution
 from core.errors import InvalidModel
 from core.network import Convolution, Pooling, Relu, ShallowNetwork
+from core.winograd import fast_convolution
 
 Precision = Literal["float32", "bfloat16"]
 Device = Literal["cpu", "cuda"]
@@ -26,8 +28,6 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 AGREEMENT = 1e-4
 """How far a fused float32 pass may be from torch's own, as a share of the largest activation."""
-
-LAST = torch.channels_last
 
 
 class FusedPass:
@@ -50,7 +50,8 @@ class FusedPass:
             module = network.stages[layer.name]
             if isinstance(layer, Convolution):
                 rectified = isinstance(following, Relu) and following.negative_slope == 0
-                self._steps.append((layer.name, FusedConvolution(module, rectified, self._dtype)))
+                fast = fast_convolution(module, rectified) if precision == "float32" else None
+                self._steps.append((layer.name, fast or FusedConvolution.of(module, rectified, self._dtype)))
                 if isinstance(following, Relu) and not rectified:
                     self._steps.append((layer.name, network.stages[following.name]))
             elif isinstance(layer, Pooling):
@@ -68,26 +69,6 @@ class FusedPass:
             if name in self.outputs:
                 found[name] = x
         return tuple(found[name].float().contiguous(memory_format=LAST) for name in self.outputs)
-
-
-class FusedConvolution:
-    """A convolution and its rectifier in one oneDNN primitive, its weights in the order that this wants."""
-
-    def __init__(self, module: nn.Module, rectified: bool, dtype: torch.dtype) -> None:
-        assert isinstance(module, nn.Conv2d)
-        self._weight = module.weight.detach().to(dtype, copy=True).contiguous(memory_format=LAST)
-        self._bias = None if module.bias is None else module.bias.detach().to(dtype, copy=True)
-        self._shape = (module.padding, module.stride, module.dilation, module.groups)
-        self._then = "relu" if rectified else "none"
-        self._ordered = False
-
-    def __call__(self, x: Tensor) -> Tensor:
-        if not self._ordered:  # now that the input's size is known; the order is the same for any number of frames
-            self._weight = torch.ops.mkldnn._reorder_convolution_weight(self._weight, *self._shape, list(x.shape))
-            self._ordered = True
-        run: Any = torch.ops.mkldnn._convolution_pointwise
-        made: Tensor = run(x, self._weight, self._bias, *self._shape, self._then, [], "")
-        return made
 
 
 class MaxPooling:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import cv2
@@ -54,9 +55,15 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
         pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
     if out is None:
         out = np.empty((height, width, 3), np.float32)
-    mean, scale = (np.array(values, np.float32) for values in (definition.mean, definition.scale))
-    _scaled(np.ascontiguousarray(pixels), np.tile(mean, width), np.tile(scale, width), out.reshape(height, -1))
+    mean, scale = _of_a_row(definition.mean, width), _of_a_row(definition.scale, width)
+    _scaled(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
     return out
+
+
+@lru_cache(maxsize=32)
+def _of_a_row(values: tuple[float, float, float], width: int) -> NDArray[np.float32]:
+    """What each channel has, for a row of pixels; float32 [3 W]."""
+    return np.tile(np.array(values, np.float32), width)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import re
 
+import numba
 import numpy as np
 
 from core.containers import Structure
@@ -42,17 +43,25 @@ def may_be_filled(structure: Structure, pixels: Pixels) -> bool:
     """
     if not structure.plain or min(pixels.shape[:2]) < _BLOCK:  # a block that is cut by two edges has few pixels
         return True
+    return bool(_has_filler(pixels))
+
+
+@numba.njit(cache=True, nogil=True)
+def _has_filler(pixels):  # type: ignore[no-untyped-def]
+    """Whether all probes of a block are filler; uint8 [H, W, 3]."""
+    height, width = pixels.shape[:2]
     # The last block may be cut by the edge of the picture: its last pixels are looked at by themselves.
     if (pixels[-1, -2:] == _FILLER).all():
         return True
-    # Few pixels of one colour first: in most pictures that is all the work.
-    (down, right), (height, width) = _PROBES[0], pixels.shape[:2]
-    probed = pixels[down : height - _BLOCK + down + 1 : _BLOCK, right : width - _BLOCK + right + 1 : _BLOCK, 0]
-    rows, columns = np.nonzero(probed == _FILLER)
-    for down, right in _PROBES:
-        grey = (pixels[rows * _BLOCK + down, columns * _BLOCK + right] == _FILLER).all(axis=1)
-        rows, columns = rows[grey], columns[grey]
-    return bool(len(rows))
+    for top in range(0, height - _BLOCK + 1, _BLOCK):
+        for left in range(0, width - _BLOCK + 1, _BLOCK):
+            for down, right in _PROBES:
+                pixel = pixels[top + down, left + right]
+                if pixel[0] != _FILLER or pixel[1] != _FILLER or pixel[2] != _FILLER:
+                    break  # of nearly all blocks the first
+            else:
+                return True
+    return False
 
 
 def with_other_endings(data: bytes, structure: Structure) -> bytes:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-import core.forward
+import core.convolution
 from core.encoders import PACKAGED
 from core.errors import InvalidModel
 from core.forward import CudaPass, FusedPass, MaxPooling, fused_pass
@@ -104,8 +104,8 @@ def test_bfloat16_comes_near_and_gives_float32() -> None:
 def test_other_values_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     network = network_of(Convolution(name="a", channels=8, kernel=3), Relu(name="r"), outputs=("a",))
     assert fused_pass(network) is not None
-    run = core.forward.FusedConvolution.__call__
-    monkeypatch.setattr(core.forward.FusedConvolution, "__call__", lambda self, x: run(self, x) * 1.01)
+    run = core.convolution.FusedConvolution.__call__
+    monkeypatch.setattr(core.convolution.FusedConvolution, "__call__", lambda self, x: run(self, x) * 1.01)
     assert fused_pass(network) is None
 
 
@@ -113,7 +113,7 @@ def test_without_the_operator_there_is_no_fused_pass(monkeypatch: pytest.MonkeyP
     def missing(self: object, x: torch.Tensor) -> torch.Tensor:
         raise AttributeError("no such operator")
 
-    monkeypatch.setattr(core.forward.FusedConvolution, "__call__", missing)
+    monkeypatch.setattr(core.convolution.FusedConvolution, "__call__", missing)
     network = network_of(Convolution(name="a", channels=8, kernel=3), outputs=("a",))
     assert fused_pass(network) is None and fused_pass(network, "bfloat16") is None
 
