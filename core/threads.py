@@ -91,12 +91,11 @@ def in_turns(
     parts: Iterable[Item],
     executor: Executor | None,
     helpers: int,
-    calling_too: bool = True,
 ) -> None:
-    """Run every part once, in so many threads of the executor and, unless told otherwise, in the calling one.
+    """Run every part once, in so many threads of the executor and in the calling one.
 
     Each thread takes the next part when it has done one, so that a core that is busy elsewhere delays nothing but
-    the part it is at; where the caller works too, a helper that has not begun by the end is not waited for.
+    the part it is at; a helper that has not begun by the end is not waited for.
     """
     waiting = deque(parts)
 
@@ -109,10 +108,9 @@ def in_turns(
             run(part)
 
     begun = [] if executor is None else [executor.submit(work) for _ in range(helpers)]
-    if calling_too:
-        work()
+    work()
     for helper in begun:
-        if not (calling_too and helper.cancel()):
+        if not helper.cancel():
             helper.result()
 
 

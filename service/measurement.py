@@ -106,7 +106,7 @@ def search_run(encoder: Encoder, places: int) -> Callable[[], object]:
     random, middle = np.random.default_rng(0), places // 2
     known = random.standard_normal((places, encoder.dimension), np.float32)
     local = random.integers(-127, 128, (places, *encoder.local_shape), np.int8)
-    empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape)
+    empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape, halves=True)
     snapshot = empty.appended(list(known), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
     return lambda: examine(encoder, snapshot, local[middle], snapshot.search(known[middle]))
 

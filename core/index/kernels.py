@@ -39,14 +39,14 @@ def _generate_sum(typing_context: Any, code: Any, planes: Any, groups: Any, next
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: tuple[Any, ...]) -> ir.Value:
         code, planes, next_code = (builder.inttoptr(arguments[number], _GROUP.as_pointer()) for number in (0, 1, 3))
-        prefetch = _prefetch(builder)
+        fetch = prefetch(builder)
         ones = _vector_function(builder, "llvm.ctpop.v8i64", _GROUP)
         nothing = ir.Constant(_GROUP, [0] * GROUP_WORDS)
         total = cgutils.alloca_once_value(builder, nothing)  # type: ignore[no-untyped-call]
         with cgutils.for_range(builder, arguments[2]) as loop:
             word = builder.load(builder.gep(code, [loop.index]), align=8)
             line = builder.bitcast(builder.gep(next_code, [loop.index]), _BYTE.as_pointer())
-            builder.call(prefetch, [line, _INT(0), _INT(3), _INT(1)])  # to read, into every cache, data
+            builder.call(fetch, [line, _INT(0), _INT(3), _INT(1)])  # to read, into every cache, data
             first = builder.mul(loop.index, ir.Constant(loop.index.type, PLANES))
             added = builder.load(total)
             for number in range(PLANES):
@@ -70,7 +70,7 @@ def _vector_function(builder: ir.IRBuilder, name: str, result: ir.Type) -> ir.Fu
     return cgutils.get_or_insert_function(builder.module, kind, name)  # type: ignore[no-untyped-call]
 
 
-def _prefetch(builder: ir.IRBuilder) -> ir.Function:
+def prefetch(builder: ir.IRBuilder) -> ir.Function:
     """LLVM's hint that memory will be read."""
     kind = ir.FunctionType(ir.VoidType(), [_BYTE.as_pointer(), _INT, _INT, _INT])
     return cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")  # type: ignore[no-untyped-call]

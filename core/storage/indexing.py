@@ -371,7 +371,8 @@ class Indexer:
             first, count = now.segments[number].first_row, len(now.segments[number])
             done = 0 if before is None else before.index.ntotal
             rows = np.arange(first + done, first + count)
-            index, local = flat_index(count, now.dimension), np.zeros((count, *now.local_shape), np.int8)
+            index = flat_index(count, now.dimension, now.halves)
+            local = np.zeros((count, *now.local_shape), np.int8)
             if before is not None:
                 vectors(index)[:done], local[:done] = vectors(before.index), before.local
             vectors(index)[done:], local[done:] = now.descriptors_at(rows), now.locals_at(rows)

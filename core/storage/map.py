@@ -28,6 +28,7 @@ from core.storage.database import DatabaseClosed
 from core.storage.disk import Damage, refusals
 from core.storage.doubts import Doubts
 from core.storage.indexing import IndexedMap, Indexer, Stopped
+from core.storage.memo import Memo
 from core.storage.named import NamedSegment, named_segments
 from core.storage.opening import OpenMap, open_map
 from core.storage.patches import patched_fields, patched_record
@@ -64,6 +65,7 @@ class Map:
         self._damage: str | None = None
         self._end: PlacerecError | None = None
         self._doubts = Doubts(folder)
+        self._memo = Memo()
         self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
@@ -354,9 +356,14 @@ class Map:
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         """The places of rows that a search returned; None for one deleted or given another frame since."""
-        with self._reading() as connection:
-            found = ledger.places_of_rows(connection, [int(row) for row in rows])
-        return [found.get(int(row)) for row in rows]
+        state, wanted = self._expect_open().database.state, [int(row) for row in rows]
+        found = self._memo.places(state, wanted)
+        if missing := [row for row in wanted if row not in found]:
+            with self._reading() as connection:
+                read = ledger.places_of_rows(connection, missing)
+            self._memo.keep(state, read)
+            found.update(read)
+        return [found.get(row) for row in wanted]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""

@@ -31,6 +31,7 @@ from core.storage.named import NamedSegment, named_segments
 from core.storage.patches import complaint
 from core.storage.reclaiming import Remains, clear_folder
 from core.storage.records import MapRecord
+from core.storage.resting import HALF
 from core.storage.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
 from core.storage.segment import Held, Segment, flat_index, vectors
 from core.storage.shelf import Shelf
@@ -139,7 +140,7 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
 
 def _load_segment(folder: Path, layout: Layout, named: NamedSegment, checksums: NDArray[np.uint32]) -> Held:
     """The descriptors of a segment, every one of them checked; ``checksums`` are what SQLite names of its rows."""
-    index = flat_index(named.rows, layout.dimension)
+    index = flat_index(named.rows, layout.dimension, layout.precision == HALF)
     local = np.zeros((named.rows, *layout.local_shape), dtype=np.int8)
     target, filled = vectors(index), 0
     for records in descriptors.read_checked(folder, layout, named.number, named.rows, named.checksum):
@@ -249,6 +250,7 @@ def read_snapshot(
         None if holds else table,
         lists,
         holds,
+        layout.precision == HALF,
     )
 
 

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from core.index.exact import compare
 from core.index.packed import packed_products
 
 Descriptor = NDArray[np.float32]
@@ -149,16 +149,4 @@ def inner_products(queries: NDArray[np.float32], kept: NDArray[Any], precision: 
         scales, uppers, lowers = _parts_of(kept, dimension)
         made = [packed_products(query, scales, uppers, lowers) for query in _whole_blocks(queries)]
         return np.array(made, np.float32).reshape(len(queries), rows)
-    if not rows:
-        return np.empty((len(queries), 0), np.float32)
-    halves = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
-    halves.is_trained = True
-    index = faiss.IndexFlatIP(dimension) if precision == FULL else halves
-    content = np.ascontiguousarray(kept).view(np.uint8).reshape(-1)
-    index.codes.resize(content.size)
-    faiss.memcpy(index.codes.data(), faiss.swig_ptr(content), content.size)
-    index.ntotal = rows
-    found, labels = index.search(queries, rows)
-    products = np.empty((len(queries), rows), np.float32)
-    np.put_along_axis(products, labels, found, axis=1)
-    return products
+    return compare(queries, kept, np.arange(rows))

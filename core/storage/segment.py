@@ -10,6 +10,7 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from core.index.exact import Rows, compare
 from core.storage.resting import Descriptor, Local
 from core.storage.spots import Spot, joined, memory_of, whereabouts_of
 from core.verdict import Whereabouts
@@ -17,19 +18,27 @@ from core.verdict import Whereabouts
 _SMALLEST_TAIL = 8
 
 
-def flat_index(capacity: int, dimension: int) -> faiss.IndexFlatIP:
-    """An inner-product index with room for ``capacity`` rows, all zero, to be filled through :func:`vectors`."""
-    index = faiss.IndexFlatIP(dimension)
-    index.codes.resize(capacity * dimension * 4)
+def flat_index(capacity: int, dimension: int, halves: bool = False) -> faiss.IndexFlatCodes:
+    """An inner-product index with room for ``capacity`` rows, all zero, to be filled through :func:`vectors`.
+
+    Args:
+        halves: the rows are kept in half precision; their values have to be such that nothing is lost by it.
+    """
+    index: faiss.IndexFlatCodes = faiss.IndexFlatIP(dimension)
+    if halves:
+        index = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
+        index.is_trained = True  # there is nothing to learn
+    index.codes.resize(capacity * index.code_size)
     index.ntotal = capacity
     return index
 
 
-def vectors(index: faiss.IndexFlatIP) -> NDArray[np.float32]:
-    """The rows of an index itself, not a copy: float32 [capacity, D], valid as long as the index is."""
-    size = index.ntotal * index.d
-    flat: NDArray[np.float32] = faiss.rev_swig_ptr(index.get_xb(), size) if size else np.empty(0, np.float32)
-    return flat.reshape(index.ntotal, index.d)
+def vectors(index: faiss.IndexFlatCodes) -> Rows:
+    """The rows of an index itself, not a copy: float32 or float16 [capacity, D], valid as long as the index is."""
+    size = index.ntotal * index.code_size
+    flat = faiss.rev_swig_ptr(index.codes.data(), size) if size else np.empty(0, np.uint8)
+    rows: Rows = flat.view(np.float16) if index.code_size == 2 * index.d else flat.view(np.float32)
+    return rows.reshape(index.ntotal, index.d)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,13 +49,18 @@ class Held:
     local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room behind them.
     """
 
-    index: faiss.IndexFlatIP
+    index: faiss.IndexFlatCodes
     local: Local
 
+    @cached_property
+    def rows(self) -> Rows:
+        """The descriptors in the index itself."""
+        return vectors(self.index)
+
     @classmethod
-    def nothing(cls, dimension: int, local_shape: tuple[int, int]) -> Held:
+    def nothing(cls, dimension: int, local_shape: tuple[int, int], halves: bool = False) -> Held:
         """Of a segment without rows."""
-        return cls(flat_index(0, dimension), np.empty((0, *local_shape), np.int8))
+        return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
 
     def appended(self, n: int, descriptors: Sequence[Descriptor], local: Sequence[Local], largest: int) -> Held:
         """With more rows behind the first ``n``, in memory that is shared where it suffices."""
@@ -54,8 +68,9 @@ class Held:
         if end > index.ntotal:
             # Doubling: over a segment's life each row is copied about once.
             capacity = min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL))
-            index, cells = flat_index(capacity, self.index.d), np.zeros((capacity, *cells.shape[1:]), np.int8)
-            vectors(index)[:n], cells[:n] = vectors(self.index)[:n], self.local[:n]
+            index = flat_index(capacity, self.index.d, self.rows.dtype == np.float16)
+            cells = np.zeros((capacity, *cells.shape[1:]), np.int8)
+            vectors(index)[:n], cells[:n] = self.rows[:n], self.local[:n]
         rows = vectors(index)
         for offset, descriptor in enumerate(descriptors, start=n):
             rows[offset] = descriptor
@@ -92,7 +107,7 @@ class Segment:
         return len(self.alive)
 
     @property
-    def index(self) -> faiss.IndexFlatIP:
+    def index(self) -> faiss.IndexFlatCodes:
         """Of a segment that holds its descriptors."""
         assert self.held is not None
         return self.held.index
@@ -106,7 +121,7 @@ class Segment:
     @property
     def memory(self) -> int:
         """Bytes that the segment takes."""
-        held = 0 if self.held is None else self.index.ntotal * self.index.d * 4 + self.local.nbytes
+        held = 0 if self.held is None else vectors(self.index).nbytes + self.local.nbytes
         return held + memory_of(self.whereabouts) + self.alive.nbytes + self.checksums.nbytes
 
     def appended(
@@ -158,28 +173,7 @@ class Segment:
         """Removed: without descriptors, and without a hold on its file."""
         return replace(self, held=None, reading=Reading(), removed=True)
 
-    def search(
-        self,
-        queries: NDArray[np.float32],
-        start: int,
-        stop: int,
-        products: NDArray[np.float32],
-        allowed: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Put the inner products of ``queries`` [B, D] with rows start … stop into ``products`` [B, stop - start].
-
-        Args:
-            allowed: bool [stop - start]; the others are not read, and their products not touched.
-        """
-        count = stop - start if allowed is None else int(allowed.sum())
-        if not count:
-            return
-        if allowed is None or count == stop - start:
-            selected: faiss.IDSelector = faiss.IDSelectorRange(start, stop)
-        else:
-            bits = np.packbits(np.concatenate([np.zeros(start, np.bool_), allowed]), bitorder="little")
-            selected = faiss.IDSelectorBitmap(len(bits), faiss.swig_ptr(bits))
-        parameters = faiss.SearchParameters()
-        parameters.sel = selected
-        found, labels = self.index.search(queries, count, params=parameters)
-        np.put_along_axis(products, labels - start, found, axis=1)
+    def search(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The inner products of ``queries`` [B, D] with some of the map's rows [k] that are held: float32 [B, k]."""
+        assert self.held is not None
+        return compare(queries, self.held.rows, rows - self.first_row)

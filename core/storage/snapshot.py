@@ -22,8 +22,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from core.cells import ScatteredCells
 from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
+from core.index.ranking import ranked
 from core.storage.descriptors import NO_LOCAL
 from core.storage.parallel import threads, together
 from core.storage.resting import Descriptor, Local
@@ -41,16 +43,17 @@ SHORTLIST = 100
 """Places of a coded map whose descriptors are compared exactly; its rankings are of these."""
 
 _PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
+_SHARE = 2  # one of two cores takes nearly all of the memory's speed, and the other has frames to encode
 _PART_ROWS = 32  # of rows that one thread reads from the shelf at a time
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Rows start … stop of a segment."""
+    """Rows of a segment, and where among all that are compared they stand."""
 
     segment: Segment
-    start: int
-    stop: int
+    rows: NDArray[np.int64]
+    at: slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,7 @@ class Snapshot:
     table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
     lists: the same rows by nearest centre; None in all but the largest maps.
     holds: whether new rows are held in memory.
+    halves: their descriptors are held in half precision, which says all of what is stored.
     guard: entered around everything that reads from the shelf; names what the disk refuses.
     """
 
@@ -72,6 +76,7 @@ class Snapshot:
     table: CodeTable | None = None
     lists: InvertedLists | None = None
     holds: bool = True
+    halves: bool = False
     guard: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def __len__(self) -> int:
@@ -130,14 +135,23 @@ class Snapshot:
         return sum(segment.memory for segment in self.segments) + codes + lists
 
     @cached_property
+    def _in_memory(self) -> NDArray[np.int64]:
+        """The rows that are compared where they are held: the living ones, ascending."""
+        return np.flatnonzero(self.alive & self._held)
+
+    @cached_property
     def _parts(self) -> list[_Part]:
-        """The rows to compare with, in parts of equal size within a segment; segments of the dead are left out."""
-        parts = []
-        for segment in self.segments:
-            if segment.held is not None and segment.has_life:
-                count = -(-len(segment) * self.dimension * 4 // _PART_BYTES)
-                ends = [len(segment) * i // count for i in range(count + 1)]
-                parts += [_Part(segment, start, stop) for start, stop in pairwise(ends) if stop > start]
+        """All of them, in parts."""
+        return self._parts_of(self._in_memory)
+
+    def _parts_of(self, rows: NDArray[np.int64]) -> list[_Part]:
+        """Rows in memory, in parts of about equal size within a segment; segments without any are left out."""
+        parts, most = [], max(1, _PART_BYTES // (self.dimension * (2 if self.halves else 4)))
+        bounds = np.searchsorted(rows, np.arange(len(self.segments) + 1) * self.rows_per_segment).tolist()
+        for segment, (first, end) in zip(self.segments, pairwise(bounds), strict=True):
+            count = -(-(end - first) // most)
+            ends = [first + (end - first) * i // count for i in range(count + 1)] if count else []
+            parts += [_Part(segment, rows[start:stop], slice(start, stop)) for start, stop in pairwise(ends)]
         return parts
 
     def search(self, descriptor: Descriptor, allowed: NDArray[np.bool_] | None = None) -> Ranking:
@@ -156,20 +170,16 @@ class Snapshot:
     def search_batch(self, descriptors: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> list[Ranking]:
         """The same for each of ``descriptors``, float32 [B, D].
 
-        Places in memory are read once for all of them, not B times.  Inner products may differ in
-        their last bits from those of :meth:`search`.
+        Places in memory are read once for all of them, not B times.
         """
         queries = np.ascontiguousarray(descriptors, dtype=np.float32)
         if queries.ndim != 2 or queries.shape[1] != self.dimension or not np.isfinite(queries).all():
             raise ValueError(f"a query is {self.dimension} finite values")
         if allowed is not None and allowed.shape != (self.rows,):
             raise ValueError(f"the map has {self.rows} rows to allow")
-        if len(self._parts) and len(queries):
-            rows, products = self._compare_held(queries, allowed)
-        else:
-            rows, products = np.empty(0, np.int64), np.empty((len(queries), 0), np.float32)
+        rows, products = self._compare_held(queries, allowed)
         if self.shelf is None or self._held.all():
-            return [_ranked(rows, found) for found in products]
+            return [ranked(rows, found) for found in products]
         with self.guard():
             return self._with_shelf(queries, allowed, rows, products)
 
@@ -177,19 +187,16 @@ class Snapshot:
         self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """The rows that are in memory, alive and allowed, ascending, and their inner products float32 [B, n]."""
-        products = np.empty((len(queries), self.rows), dtype=np.float32)
+        rows, parts = self._in_memory, self._parts
+        if allowed is not None:
+            parts = self._parts_of(rows := rows[allowed[rows]])
+        products = np.empty((len(queries), len(rows)), dtype=np.float32)
 
         def compare(part: _Part) -> None:
-            rows = slice(part.segment.first_row + part.start, part.segment.first_row + part.stop)
-            chosen = None if allowed is None else allowed[rows]
-            part.segment.search(queries, part.start, part.stop, products[:, rows], chosen)
+            products[:, part.at] = part.segment.search(queries, part.rows)
 
-        # With many queries FAISS would start threads of its own in a thread that is not one of ours.
-        together(compare, self._parts, calling_too=len(queries) == 1)
-        chosen = self.alive & self._held
-        if allowed is not None:
-            chosen &= allowed
-        return (rows := np.flatnonzero(chosen)), products if len(rows) == self.rows else products[:, rows]
+        together(compare, parts, _SHARE)
+        return rows, products
 
     def _with_shelf(
         self,
@@ -214,7 +221,7 @@ class Snapshot:
                 short = self._shortlist(query, by_code)
                 rows = np.concatenate([rows, short])
                 found = np.concatenate([found, self._compared(query[np.newaxis], short)[0]])
-            rankings.append(_ranked(rows, found))
+            rankings.append(ranked(rows, found))
         return rankings
 
     def _shortlist(self, query: NDArray[np.float32], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -235,7 +242,7 @@ class Snapshot:
 
         parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
         if parts:
-            together(compare, parts, calling_too=True)
+            together(compare, parts)
         return products
 
     def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
@@ -246,7 +253,7 @@ class Snapshot:
     def _check_rows(self, rows: NDArray[np.int64]) -> None:
         if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
             raise IndexError(f"the map has rows 0 to {self.rows - 1}")
-        for number in np.unique(rows // self.rows_per_segment).tolist():
+        for number in set((rows // self.rows_per_segment).tolist()):
             if self.segments[number].removed:
                 raise UnknownPlace("A place was deleted while it was looked at.")
 
@@ -257,18 +264,28 @@ class Snapshot:
             IndexError: there is no such row.
             UnknownPlace: it is of a place that was deleted, and its segment was removed.
         """
+        return self.locals_in_place(rows).together()
+
+    def locals_in_place(self, rows: NDArray[np.int64]) -> ScatteredCells:
+        """The same where they are held, as nobody will change them; those on the shelf are read."""
         self._check_rows(rows)
-        found = np.empty((len(rows), *self.local_shape), np.int8)
-        held = self._held[rows]
-        for position in np.flatnonzero(held).tolist():
-            segment = self.segments[int(rows[position]) // self.rows_per_segment]
-            found[position] = segment.local[int(rows[position]) - segment.first_row]
-        if not held.all():
-            assert self.shelf is not None
-            wanted = rows[~held]
-            with self.guard():
-                found[~held] = self.shelf.locals(wanted, self._checksums(wanted))
-        return found
+        numbers, offsets = np.divmod(rows, self.rows_per_segment)
+        used = sorted(set(numbers.tolist()))
+        held = [number for number in used if self.segments[number].held is not None]
+        blocks = [self.segments[number].local for number in held]
+        block = np.searchsorted(held, numbers)
+        if len(held) < len(used) or not used:
+            on_shelf = np.flatnonzero(~np.isin(numbers, held))
+            blocks.append(self._locals_on_shelf(rows[on_shelf]))
+            block[on_shelf], offsets[on_shelf] = len(held), np.arange(len(on_shelf))
+        return ScatteredCells(tuple(blocks), block, offsets)
+
+    def _locals_on_shelf(self, rows: NDArray[np.int64]) -> Local:
+        if not len(rows):
+            return np.empty((0, *self.local_shape), np.int8)
+        assert self.shelf is not None
+        with self.guard():
+            return self.shelf.locals(rows, self._checksums(rows))
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D], a copy.
@@ -312,7 +329,7 @@ class Snapshot:
             if not segments or len(segments[-1]) == self.rows_per_segment:
                 row = sum(len(segment) for segment in segments)
                 nobody, nothing = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
-                held = Held.nothing(self.dimension, self.local_shape) if self.holds else None
+                held = Held.nothing(self.dimension, self.local_shape, self.halves) if self.holds else None
                 segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
@@ -364,12 +381,3 @@ def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) ->
         return rows, products
     chosen = np.sort(np.argpartition(-products, count)[:count])
     return rows[chosen], products[chosen]
-
-
-def _ranked(rows: NDArray[np.int64], products: NDArray[np.float32]) -> Ranking:
-    """Best first; equal ones by row."""
-    if np.any(rows[1:] < rows[:-1]):
-        order = np.argsort(rows)
-        rows, products = rows[order], products[order]
-    order = np.argsort(-products, kind="stable")
-    return rows[order], products[order]

@@ -15,7 +15,7 @@ Tier = Literal["exact", "compact", "inverted"]
 TierSetting = Literal["auto", "exact", "compact", "inverted"]
 
 COMPACT_FROM = 4096
-"""Places from which on codes pay: 400 MB of the default encoder's descriptors would be held in memory otherwise."""
+"""Places from which on codes pay: 270 MB of the default encoder's descriptors would be held in memory otherwise."""
 
 INVERTED_FROM = 250_000
 """Places from which on reading every code takes longer than lists are worth."""

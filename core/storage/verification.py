@@ -240,7 +240,7 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
         named = segment.checksums[rows]
         return [int(offset) for offset in np.flatnonzero((named != 0) & (named != records["checksum"]))]
     stored = zip(layout.descriptors_of(records), layout.locals_of(records), strict=True)
-    held = zip(vectors(segment.index)[rows], segment.local[rows], strict=True)
+    held = zip(vectors(segment.index)[rows].astype(np.float32, copy=False), segment.local[rows], strict=True)
     return [
         offset
         for offset, (there, here) in enumerate(zip(stored, held, strict=True))

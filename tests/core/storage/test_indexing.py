@@ -92,7 +92,7 @@ def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> No
     assert (status.recall.queries, status.recall.places) == (16, PLACES)
     assert status.recall.at_1 > 0.9
     assert nothing_held(lab.snapshot())
-    held = DIMENSION * 4 + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
+    held = DIMENSION * 2 + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
     assert status.bytes_in_memory <= before.bytes_in_memory - PLACES * held + PLACES * (DIMENSION // 8 + 128)
     for (rows, products), (all_rows, all_products) in zip(lab.snapshot().search_batch(queries), exact, strict=True):
         assert len(rows) == SHORTLIST

@@ -151,6 +151,13 @@ def test_local_descriptors_come_in_the_order_of_the_rows_and_are_a_copy() -> Non
     assert snapshot.locals_at(np.empty(0, np.int64)).shape == (0, *SHAPE)
 
 
+def test_local_descriptors_in_memory_are_not_copied_to_be_looked_at() -> None:
+    snapshot, rows = snapshot_of(11), np.array([10, 0, 4, 0])
+    lying = snapshot.locals_in_place(rows)
+    np.testing.assert_array_equal(lying.together(), snapshot.locals_at(rows))
+    assert all(any(block is segment.local for segment in snapshot.segments) for block in lying.blocks)
+
+
 @pytest.mark.parametrize("row", [-1, 6, 7, 8])
 def test_room_that_later_snapshots_use_is_nobodys(row: int) -> None:
     """Row 6 and 7 are there already, in memory that is shared with the later snapshot."""
@@ -192,15 +199,44 @@ def test_many_queries_are_answered_as_each_alone(queries: int) -> None:
     for query, (rows, products) in zip(batch, answers, strict=True):
         alone, alone_products = snapshot.search(query)
         assert rows.tolist() == alone.tolist()
-        np.testing.assert_allclose(products, alone_products, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(products, alone_products)
+
+
+def test_halves_are_held_as_they_are_and_ranked_as_floats_are() -> None:
+    kept = [row.astype(np.float16).astype(np.float32) for row in descriptors(23)]
+    spots = [spot(row) for row in range(23)]
+    floats = Snapshot(DIMENSION, 10).appended(kept, spots).without([4])
+    halves = (
+        Snapshot(DIMENSION, 10, halves=True).appended(kept[:7], spots[:7]).appended(kept[7:], spots[7:]).without([4])
+    )
+    rows, products = halves.search(QUERY)
+    np.testing.assert_array_equal(halves.descriptors_at(np.arange(23)), kept)
+    assert rows.tolist() == floats.search(QUERY)[0].tolist()
+    np.testing.assert_allclose(products, np.array(kept)[rows] @ QUERY, rtol=1e-5, atol=1e-6)
+    held = [
+        (half.index.codes.size(), full.index.codes.size())
+        for half, full in zip(halves.segments, floats.segments, strict=True)
+    ]
+    assert all(2 * half == full for half, full in held)
+
+
+@pytest.mark.parametrize("halves", [False, True])
+def test_the_index_of_a_segment_is_one_of_faiss(halves: bool) -> None:
+    """It finds by itself what the snapshot finds in it."""
+    snapshot = Snapshot(DIMENSION, 32, halves=halves).appended(descriptors(32), [spot(row) for row in range(32)])
+    products, rows = snapshot.segments[0].index.search(QUERY[np.newaxis], 32)
+    ranked, found = snapshot.search(QUERY)
+    assert rows[0].tolist() == ranked.tolist()
+    np.testing.assert_allclose(products[0], found, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("queries", [1, 5])
 def test_parts_on_several_threads_cover_every_row_once(queries: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_PART_BYTES", 3 * DIMENSION * 4)
+    monkeypatch.setattr(module, "_SHARE", 1)  # a thread for each core
     snapshot = Snapshot(DIMENSION, 10).appended(descriptors(37), [spot(row) for row in range(37)])
-    covered = [part.segment.first_row + row for part in snapshot._parts for row in range(part.start, part.stop)]
-    assert covered == list(range(37))
+    assert [row for part in snapshot._parts for row in part.rows.tolist()] == list(range(37))
+    assert [row for part in snapshot._parts for row in range(part.at.start, part.at.stop)] == list(range(37))
     assert len(snapshot._parts) == 15
     for rows, _ in snapshot.search_batch(np.repeat(QUERY[np.newaxis], queries, axis=0)):
         assert rows.tolist() == expected(list(range(37)))
@@ -208,6 +244,7 @@ def test_parts_on_several_threads_cover_every_row_once(queries: int, monkeypatch
 
 def test_an_error_in_a_thread_is_the_callers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_PART_BYTES", DIMENSION * 4)
+    monkeypatch.setattr(module, "_SHARE", 1)
 
     def fail(*_: object) -> None:
         raise MemoryError
