@@ -8,29 +8,24 @@ thesis's Figure 3.1 shows by eye), and each such pair adds the square of its cos
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
 import numba
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.cells import Cells as Cells
+from core.cells import ScatteredCells, in_one_block
+from core.correspondence import WHOLE_WORDS, squared_sums
+
 Array = NDArray[np.float32]
-Cells = NDArray[np.int8]
 
 RESOLUTION = 254.0
 """Quantisation of local descriptors: values of half a unit and more, which hardly occur, become 127."""
 
 _COSINE = np.float32(1 / RESOLUTION**2)
 """What the inner product of two cells' values is multiplied by to be their cosine."""
-
-TOGETHER = 32
-"""Candidates compared at a time, so that memory stays bounded."""
 
 
 class AgreementDefinition(BaseModel):
@@ -116,80 +111,37 @@ def _best_within(cosines, columns, rows_apart, columns_apart, best):  # type: ig
         best[cell] = found
 
 
-@numba.njit(cache=True, nogil=True)
-def _squared_sums(products, columns, rows_apart, columns_apart):  # type: ignore[no-untyped-def]
-    """Σ cos² over the mutual best matches of each of k candidates; inner products float32 or int32 [k, C, C]."""
-    count, cells = len(products), products.shape[1]
-    sums = np.zeros(count, np.float32)
-    there, back = np.empty(cells, np.int64), np.empty(cells, np.int64)
-    for k in range(count):
-        _best_within(products[k], columns, rows_apart, columns_apart, there)
-        _best_within(products[k].T, columns, rows_apart, columns_apart, back)
-        for cell in range(cells):
-            match = there[cell]
-            value = np.float32(products[k, cell, match]) * _COSINE
-            if back[match] == cell and value > 0:
-                sums[k] += value * value
-    return sums
-
-
-def _float_products(candidates: Cells, query: Cells) -> NDArray[Any]:
-    """Inner products of cells, float32 [n, C]: exact, as the sums of L products stay under 2^24 for L up to 1 040."""
-    return np.asarray(candidates.astype(np.float32) @ query.astype(np.float32).T)
-
-
-def _integer_products(candidates: Cells, query: Cells) -> NDArray[Any]:
-    """The same in int32, where the processor multiplies bytes."""
-    product: torch.Tensor = torch._int_mm(torch.from_numpy(candidates), torch.from_numpy(query.T))
-    return np.asarray(product.numpy())
-
-
-@cache
-def _products() -> Callable[[Cells, Cells], NDArray[Any]]:
-    """The faster of the two on this machine, which make no difference to the result."""
-    random = np.random.default_rng(0)
-    candidates, query = (random.integers(-127, 128, (count, 192)).astype(np.int8) for count in (2028, 169))
-    best: dict[Callable[[Cells, Cells], NDArray[Any]], float] = {}
-    for make in (_float_products, _integer_products) * 4:
-        began = time.perf_counter()
-        try:
-            make(candidates, query)
-        except (AttributeError, RuntimeError, NotImplementedError):  # not in this build of torch
-            continue
-        best[make] = min(best.get(make, np.inf), time.perf_counter() - began)
-    return min(best, key=best.__getitem__)
-
-
-def _inner_products(query: Cells, candidates: Cells) -> NDArray[Any]:
-    """float32 or int32 [k, C, C]: cells of each candidate down, those of the query across."""
-    k, cells, length = candidates.shape
-    rows = np.ascontiguousarray(candidates).reshape(k * cells, length)
-    return _products()(rows, np.ascontiguousarray(query)).reshape(k, cells, cells)
-
-
-def agreement(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> Array:
+def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, definition: AgreementDefinition) -> Array:
     """What each candidate gains: ``share`` times the mean over cells of its mutual matches' squared cosines.
 
     Args:
         query: int8 [C, L].
-        candidates: int8 [k, C, L].
+        candidates: int8 [k, C, L], in one array or where they lie.
         columns: of the grid; C is a multiple of it.
 
     Returns:
         float32 [k], at least 0, at most ``share`` but for rounding.
+
+    Raises:
+        ValueError: the cells of the query and of the candidates are not alike, or not of such a grid.
     """
-    if len(candidates) == 0:
-        return np.zeros(0, np.float32)
-    sums = [
-        _squared_sums(_inner_products(query, candidates[start : start + TOGETHER]), columns, *definition.reach)
-        for start in range(0, len(candidates), TOGETHER)
-    ]
-    return np.asarray(np.concatenate(sums) * np.float32(definition.share / len(query)), np.float32)
+    if query.shape != candidates.shape[1:] or len(query) % columns:
+        shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
+        raise ValueError(f"cells of {shapes} in {columns} columns cannot be held against each other")
+    if missing := -query.shape[1] % WHOLE_WORDS:
+        if isinstance(candidates, ScatteredCells):
+            candidates = candidates.together()
+        candidates = np.pad(candidates, [(0, 0), (0, 0), (0, missing)])
+        query = np.pad(query, [(0, 0), (0, missing)])
+    lying = candidates if isinstance(candidates, ScatteredCells) else in_one_block(candidates)
+    asked = np.require(query, np.int8, ["C", "W"])  # numba would compile anew for what cannot be written
+    sums: Array = squared_sums(asked, lying.addresses(), columns, *definition.reach, _COSINE)
+    return sums * np.float32(definition.share / len(query))
 
 
 def correspondences(query: Cells, reference: Cells, columns: int, definition: AgreementDefinition) -> Correspondences:
     """Which cell of the query answers to which of the reference; both int8 [C, L]."""
-    cosines = _float_products(reference, query) * _COSINE  # reference x query
+    cosines = (reference.astype(np.float32) @ query.astype(np.float32).T) * _COSINE  # reference x query
     there, back = np.empty(len(query), np.int64), np.empty(len(query), np.int64)
     _best_within(cosines.T, columns, *definition.reach, there)
     _best_within(cosines, columns, *definition.reach, back)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from core.agreement import AgreementDefinition, Cells, agreement, local_descriptors
+from core.cells import ScatteredCells
 from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.features import FeatureDefinition, FeatureExtractor, content_of
 from core.forward import Device, Precision, has_bfloat16
@@ -141,7 +142,7 @@ class Encoder:
         stage = self.definition.agreement
         return 0 if stage is None else stage.candidates
 
-    def agreement(self, query: Cells, candidates: Cells) -> Array:
+    def agreement(self, query: Cells, candidates: Cells | ScatteredCells) -> Array:
         """What the second stage adds to the candidates' scores, at least 0; int8 [C, L], [k, C, L] to float32 [k]."""
         stage = self.definition.agreement
         if stage is None:

@@ -131,11 +131,13 @@ class Whereabouts:
         Two poses of one kind are compared by distance; otherwise the places must be of one
         sequence, at most so many frames apart.
         """
-        same_kind = (self.kind == self.kind[row]) & (self.kind != NO_POSE)
-        distance = np.sqrt(np.square(self.position - self.position[row]).sum(axis=1))
-        frames_apart = np.abs(self.ordinal - self.ordinal[row])
-        neighbours = (self.sequence == self.sequence[row]) & (frames_apart <= neighborhood.frames)
-        near = np.where(same_kind, distance <= neighborhood.radius, neighbours)
+        near = self.sequence == self.sequence[row]
+        near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
+        kind = self.kind[row]
+        if kind != NO_POSE:
+            x, y, z = (self.position - self.position[row]).T
+            distance = np.sqrt(x * x + y * y + z * z)
+            near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
         near[row] = True
         return near
 

@@ -187,7 +187,7 @@ def second_stage(
         rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]
 
     def gains(positions: NDArray[np.int64]) -> NDArray[np.float32]:
-        return encoder.agreement(local, snapshot.locals_at(rows[positions]))
+        return encoder.agreement(local, snapshot.locals_in_place(rows[positions]))
 
     for length in (len(rows) if by_all else HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])
@@ -226,7 +226,7 @@ def examine(encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking
     """
     rows, inner_products = ranking
     scores = encoder.scores_from_inner_products(inner_products)
-    order, raised = reranked(scores, encoder.agreement(local, snapshot.locals_at(rows[: encoder.candidates])))
+    order, raised = reranked(scores, encoder.agreement(local, snapshot.locals_in_place(rows[: encoder.candidates])))
     return rows[order], raised
 
 
