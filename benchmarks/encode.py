@@ -19,6 +19,7 @@ from core.images import decode
 from core.preprocessing import contrast, prepare
 from core.threads import cores, share_cores
 from core.vlad import Words, aggregate
+from service.heap import settle_heap
 from service.measurement import better_forward, encoding_runs, jpeg, medians, sample_picture
 
 LIMIT = 1.4
@@ -60,6 +61,7 @@ def main(
     threads: Annotated[int, typer.Option(min=0, help="0: every core.")] = 0,
 ) -> None:
     """Medians of interleaved runs."""
+    settle_heap()  # as the service does
     share_cores(threads or cores())
     data = jpeg(sample_picture()) if image is None else image.read_bytes()
     chosen = EncoderCatalogue().get(encoder)

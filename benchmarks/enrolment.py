@@ -26,6 +26,7 @@ from benchmarks.report import report, verdict
 from benchmarks.service import BATCH, SETTLE, encode_in_batches
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import share_cores
+from service.heap import settle_heap
 
 LIMIT = 0.7
 
@@ -61,6 +62,7 @@ def main(
     again: list[float] = []
     starts: list[float] = []
     memory: dict[str, float] = {}
+    settle_heap()  # as the service does
     share_cores(torch.get_num_threads())
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)

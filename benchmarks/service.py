@@ -30,6 +30,7 @@ from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.images import decode
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
+from service.heap import settle_heap
 from service.load import measure
 from service.localization import locate
 from service.measurement import encode_batch
@@ -93,6 +94,7 @@ def main(
     threads: Annotated[int, typer.Option(min=0, help="Of a forward pass, there and here; 0: torch's choice.")] = 0,
 ) -> None:
     """Take turns and compare."""
+    settle_heap()  # as the service does
     share_cores(threads or torch.get_num_threads())
     chosen = EncoderCatalogue().get(encoder)
     frames, content = camera_frames(64)

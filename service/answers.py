@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from core.position import PoseEstimate
 from core.storage import Map
 from service.dependencies import rounded
 from service.engine import Engine
 from service.inference import Encoded
-from service.localization import Located, calibration_of
+from service.localization import Located, calibration_of, locate
 from service.schemas.places import PlaceView
 from service.schemas.queries import EstimatedPose, Match, QueryAnswer
 from service.selection import Selection
+
+MOST_AHEAD = 4000
+"""Places of a map that is searched in the encoder's thread, in some milliseconds."""
 
 
 async def answer_queries(
@@ -24,8 +27,11 @@ async def answer_queries(
         StorageFailure: the map's files cannot be read.
     """
     seen = [one for one in encoded if len(one.encoding.regions)]
-    encodings = [one.encoding for one in seen]
-    located = await engine.searches.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+    if len(seen) == 1 and seen[0].followed is not None:
+        located: list[Located] = seen[0].followed
+    else:
+        encodings = [one.encoding for one in seen]
+        located = await engine.searches.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
     remaining = iter(located)
     answers = []
     for one in encoded:
@@ -33,6 +39,18 @@ async def answer_queries(
         count_answer(engine, map_, answer)
         answers.append(answer)
     return answers
+
+
+def search_ahead(map_: Map, k: int, selection: Selection | None) -> Callable[[Encoded], list[Located] | None] | None:
+    """The search for a frame, to be done where it was encoded; None where other frames might wait long for it."""
+    if selection is not None or map_.count_places() > MOST_AHEAD:
+        return None
+
+    def search(encoded: Encoded) -> list[Located] | None:
+        encoding = encoded.encoding
+        return locate(map_, encoded.encoder, [encoding], k) if len(encoding.regions) else None
+
+    return search
 
 
 def count_answer(engine: Engine, map_: Map, answer: QueryAnswer) -> None:

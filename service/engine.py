@@ -6,7 +6,7 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import AsyncGenerator, Iterator, Sequence
+from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 
 from anyio import to_thread
@@ -209,7 +209,14 @@ class Engine:
         found = self.atlas.opened(map_id)
         return found if found is not None else await in_thread(self.atlas.get, map_id)
 
-    async def encode_for(self, map_: Map, data: bytes, patience: Patience, mask: Mask | None = None) -> Encoded:
+    async def encode_for(
+        self,
+        map_: Map,
+        data: bytes,
+        patience: Patience,
+        mask: Mask | None = None,
+        then: Callable[[Encoded], object] | None = None,
+    ) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``inference.place_in_queue``.
 
         Raises:
@@ -217,7 +224,7 @@ class Engine:
             Others: as for ``Inference.encode``.
         """
         try:
-            return await self.inference.encode(map_.record.encoder, data, patience, mask)
+            return await self.inference.encode(map_.record.encoder, data, patience, mask, then)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 

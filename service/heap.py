@@ -1,5 +1,5 @@
 """How the C library keeps memory that was given back: so that a service which has seen everything stays as small as
-one that has seen little.
+one that has seen little, and no frame waits for pages that the frame before has just given to the system.
 
 By default each thread gets a heap of its own, and each heap keeps what its largest picture took: after some ten
 thousand damaged pictures of all sizes the process holds a quarter more than it needs.

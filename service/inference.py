@@ -119,8 +119,18 @@ class Inference:
             self._loaded[identity] = encoder
         return self._loaded[identity]
 
-    async def encode(self, identity: str, data: bytes, patience: Patience, mask: Mask | None = None) -> Encoded:
+    async def encode(
+        self,
+        identity: str,
+        data: bytes,
+        patience: Patience,
+        mask: Mask | None = None,
+        then: Callable[[Encoded], object] | None = None,
+    ) -> Encoded:
         """Decode and encode one frame when its turn comes; call it within ``place_in_queue``.
+
+        Args:
+            then: as :attr:`Turn.then`.
 
         Raises:
             DeadlineExceeded, ClientGone: before its turn came; it was not encoded.
@@ -129,7 +139,7 @@ class Inference:
         """
         if patience.left() <= 0:
             raise late()
-        turn = Turn(identity, data, mask, patience.deadline)
+        turn = Turn(identity, data, mask, patience.deadline, then=then)
         self._batches.put([turn])
         result = asyncio.wrap_future(turn.result)
         gone: asyncio.Future[Any] | None = None

@@ -47,6 +47,8 @@ class Metrics:
         self.registry = CollectorRegistry(auto_describe=False)
         self._requests: dict[tuple[str, str, int], Histogram] = {}
         self._stages: dict[str, Histogram] = {}
+        self._verdicts: dict[tuple[str, str], Counter] = {}
+        self._scores: dict[str, Histogram] = {}
         ProcessCollector(registry=self.registry)
         self.requests = Histogram(
             "placerec_request_seconds",
@@ -116,15 +118,22 @@ class Metrics:
 
     def observe_answer(self, map_id: str, verdict: str, score: float | None) -> None:
         """Count the answer to one query."""
-        self.verdicts.labels(map_id, verdict).inc()
+        key = (map_id, verdict)
+        if key not in self._verdicts:
+            self._verdicts[key] = self.verdicts.labels(map_id, verdict)
+        self._verdicts[key].inc()
         if score is not None:
-            self.scores.labels(map_id).observe(score)
+            if map_id not in self._scores:
+                self._scores[map_id] = self.scores.labels(map_id)
+            self._scores[map_id].observe(score)
 
     def forget_map(self, map_id: str) -> None:
         """Drop the series of a deleted map."""
+        self._scores.pop(map_id, None)
         with suppress(KeyError):
             self.scores.remove(map_id)
         for verdict in get_args(Verdict):
+            self._verdicts.pop((map_id, verdict), None)
             with suppress(KeyError):
                 self.verdicts.remove(map_id, verdict)
 

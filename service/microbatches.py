@@ -50,12 +50,14 @@ class Encoded:
 
     pixels: H x W x 3 uint8, BGR.
     milliseconds: of ``wait`` (in the queue), ``decode``, ``forward`` (its share), ``regions``, ``vlad``.
+    followed: what the turn's ``then`` gave; None where it was not called, or failed.
     """
 
     pixels: Pixels
     encoding: Encoding
     encoder: Encoder
     milliseconds: dict[str, float]
+    followed: Any = None
 
     def without_pixels(self) -> Encoded:
         """The same with 0 x 0 pixels: for frames that are kept for a while."""
@@ -68,6 +70,8 @@ class Turn:
 
     deadline: ``time.monotonic`` after which it is not begun any more.
     bulk: it is one of many of its request, and may wait longer than a robot's one frame.
+    then: may be called with the encoded frame in the encoder's thread, where nobody waits for that: it spares who
+        asks alone the way through two more threads.  It is to take milliseconds.
     """
 
     identity: str
@@ -75,6 +79,7 @@ class Turn:
     mask: Mask | None
     deadline: float
     bulk: bool = False
+    then: Callable[[Encoded], object] | None = None
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
 
@@ -233,7 +238,17 @@ class MicroBatches:
                 turn.result.set_exception(outcome)
                 continue
             times = {"wait": 1e3 * (began - turn.queued), "decode": spent, **outcome.milliseconds}
-            turn.result.set_result(Encoded(pixels, outcome, encoder, times))
+            encoded = Encoded(pixels, outcome, encoder, times)
+            turn.result.set_result(self._follow(turn, encoded) if len(batch) == 1 else encoded)
+
+    def _follow(self, turn: Turn, encoded: Encoded) -> Encoded:
+        """Go on with what is to come next, unless someone waits for the encoder."""
+        if turn.then is None or self._robots or self._bulk or self._errands:
+            return encoded
+        try:
+            return replace(encoded, followed=turn.then(encoded))
+        except Exception:  # it is done once more in its own place, and told there
+            return encoded
 
     def _decode(self, turn: Turn) -> tuple[Pixels | Exception, float]:
         """The pixels of a frame or why there are none, and milliseconds."""

@@ -5,10 +5,12 @@ commands that need them, so that ``placerec --help`` answers at once.
 """
 
 from service.commands.application import application
+from service.heap import settle_heap
 
 
 def main() -> None:
     """Run the command line of this process; the entry point ``placerec``."""
+    settle_heap()
     application(prog_name="placerec")
 
 

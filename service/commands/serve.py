@@ -39,10 +39,8 @@ def serve(
 
 
 def _serve(settings: Settings) -> None:
-    from service.serving.heap import settle_heap
     from service.serving.native import logged_stderr
 
-    settle_heap()
     with logged_stderr():
         _serve_logged(settings)
 

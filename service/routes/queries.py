@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
-from service.answers import answer_queries
+from service.answers import answer_queries, search_ahead
 from service.batches import item_problem
 from service.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
 from service.engine import camera_mask, in_thread
@@ -59,7 +59,8 @@ async def query(
     engine.assert_encoder(map_, options.encoder)
     mask = await camera_mask(map_, options.camera)
     with engine.inference.place_in_queue():
-        encoded = await engine.encode_for(map_, frame.data, patience, mask)
+        ahead = search_ahead(map_, options.k, selection)
+        encoded = await engine.encode_for(map_, frame.data, patience, mask, ahead)
     (answer,) = await answer_queries(engine, map_, [encoded], options.k, selection)
     if options.explain and answer.matches:
         encoded = await in_thread(as_drawn, encoded)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-LOOK = "from service.serving.heap import settle_heap; print(settle_heap())"
+LOOK = "from service.heap import settle_heap; print(settle_heap())"
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mallopt is of the GNU C library")
