@@ -178,15 +178,26 @@ class Encoder:
     def _encode(self, frames: Sequence[Pixels], masks: Sequence[Mask | None]) -> list[Encoding]:
         """Encode frames with one forward pass; ``forward`` is each frame's share of it."""
         started = time.perf_counter()
-        activations = self.extractor.activations(frames, masks)
+        maps = self.extractor.maps(frames, masks)
+        products = self.extractor.products(maps)
         forward = 1e3 * (time.perf_counter() - started) / len(frames)
-        return [self.describe(layers, forward) for layers in activations]
+        return [
+            self.describe([layer[i] for layer in maps], forward, {name: layer[i] for name, layer in products.items()})
+            for i in range(len(frames))
+        ]
 
-    def describe(self, activations: Sequence[Array], forward: float = 0.0) -> Encoding:
-        """Encode a frame whose activations are known, as ``extractor.activations`` gives them; ``forward`` in ms."""
+    def describe(
+        self, activations: Sequence[Array], forward: float = 0.0, products: Mapping[str, Array] | None = None
+    ) -> Encoding:
+        """Encode a frame whose activations are known, as ``extractor.activations`` gives them.
+
+        Args:
+            forward: milliseconds that they and the products took.
+            products: as ``extractor.products`` gives them, if they are known.
+        """
         definition = self.definition
         began = time.perf_counter()
-        products = self.extractor.products(activations)
+        products = self.extractor.products(activations) if products is None else products
         regions = self.extractor.regions(activations, products)
         between = time.perf_counter()
         descriptor = aggregate(regions.features, self._words, definition.gamma, definition.normalization)

@@ -20,7 +20,7 @@ from core.masks import Mask
 from core.network import ShallowNetwork
 from core.preprocessing import Pixels, contrast, prepare
 from core.projection import Projection
-from core.regions import Regions, box_sums, extract_regions, find_regions, unit_length
+from core.regions import Regions, extract_regions, find_regions, projected_box_sums, unit_length
 from core.threads import keep_numpy_single_threaded
 
 Array = NDArray[np.float32]
@@ -113,7 +113,12 @@ class FeatureExtractor:
             raise InvalidModel("a plugged network runs on the CPU in float32, unless it takes itself elsewhere.")
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
-        """For each frame the rectified maps of each output, float32 [X, Y, K]; zeros for a blank frame.
+        """For each frame the rectified maps of each output, float32 [X, Y, K], as :meth:`maps` gives them for all."""
+        maps = self.maps(frames, masks)
+        return [[layer[index] for layer in maps] for index in range(len(frames))]
+
+    def maps(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[Array]:
+        """Of each output the rectified maps of all frames, float32 [B, X, Y, K]; zeros for a blank frame.
 
         Args:
             masks: of each frame what not to see: the network is shown its mean colour there, and cells that
@@ -136,13 +141,21 @@ class FeatureExtractor:
                     layer[index] = 0
                 elif mask is not None:
                     layer[index][mask.covered(*layer.shape[1:3])] = 0
-        return [[layer[index] for layer in maps] for index in range(len(frames))]
+        return maps
 
     def products(self, activations: Sequence[Array]) -> dict[str, Array]:
-        """Of each projected layer what its projection makes of its cells; float32 [C, d] by layer."""
+        """Of each projected layer what its projection makes of its cells; float32 [..., X, Y, d] by layer.
+
+        Args:
+            activations: of each output, of one frame or of several, float32 [..., X, Y, K].
+        """
         maps = zip(self.definition.outputs, activations, strict=True)
         used = self.definition.projected()
-        return {name: self.projections[name].products(_cells(layer)) for name, layer in maps if name in used}
+        return {
+            name: self.projections[name].products(_cells(layer)).reshape(*layer.shape[:-1], -1)
+            for name, layer in maps
+            if name in used
+        }
 
     def regions(self, activations: Sequence[Array], products: Mapping[str, Array] | None = None) -> Regions:
         """The regions of all layers of one frame, fused (eqs. 4.4, 4.5).
@@ -160,13 +173,12 @@ class FeatureExtractor:
         return replace(found, features=unit_length(found.features)) if definition.unit_features else found
 
     def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
-        """The regional features projected, float32 [T, values]: a projection of sums is a sum of projections."""
+        """The regional features projected, float32 [T, values]."""
         features = np.empty((len(found), values), np.float32)
         parts = found.parts(len(fused))
         for name, layer, part in zip(self.definition.layers, fused, parts, strict=True):
-            boxes = found.boxes[part]
-            grid = products[name].reshape(*layer.shape[:2], -1)
-            features[part] = self.projections[name].finish(box_sums(grid, boxes), box_sums(layer, boxes), values)
+            projection = self.projections[name]
+            projected_box_sums(layer, products[name], found.boxes[part], projection.shift, features[part])
         return features
 
     def projected_cells(
@@ -174,11 +186,7 @@ class FeatureExtractor:
     ) -> list[Array]:
         """The projected local descriptors D^L of some layers of one frame, float32 [C, values] each."""
         maps = dict(zip(self.definition.outputs, activations, strict=True))
-        made = []
-        for name in layers:
-            cells = _cells(maps[name])
-            made.append(self.projections[name].finish(products[name], cells, values))
-        return made
+        return [self.projections[name].finish(_cells(products[name]), _cells(maps[name]), values) for name in layers]
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
         """Cells (rows, columns) of each layer's maps at the network's input size."""
@@ -189,8 +197,8 @@ class FeatureExtractor:
 
 
 def _cells(layer: Array) -> Array:
-    """Maps, float32 [X, Y, K], as C local descriptors, [C, K]."""
-    return layer.reshape(-1, layer.shape[2])
+    """Maps, float32 [..., X, Y, K], as local descriptors, [n, K]."""
+    return layer.reshape(-1, layer.shape[-1])
 
 
 def content_of(definition: BaseModel, fields: set[str] | None = None) -> dict[str, Any]:

@@ -46,11 +46,11 @@ class Projection:
         return ConstantMatrix(self.matrix)
 
     @cached_property
-    def _shift(self) -> Array:
+    def shift(self) -> Array:
         """m W, float32 [d]."""
         return np.asarray(self.mean @ self.matrix, np.float32)
 
-    def finish(self, products: Array, features: Array, values: int) -> Array:
+    def finish(self, products: Array, features: Array, values: int, out: Array | None = None) -> Array:
         """Unit-length projections of n features whose products are known; float32 [n, values].
 
         (f/|f| - m) W = f W / |f| - m W.
@@ -58,29 +58,41 @@ class Projection:
         Args:
             products: float32 [n, d].
             features: float32 [n, K].
+            out: where to put it, float32 [n, values]; None: a new array.
         """
-        projected = np.empty((len(features), values), np.float32)
-        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self._shift, projected)
+        projected = np.empty((len(features), values), np.float32) if out is None else out
+        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
         return projected
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def squared_length(feature):  # type: ignore[no-untyped-def]
+    """|f|²; float32 [K]."""
+    square = np.float32(0)
+    for k in range(len(feature)):
+        square += feature[k] * feature[k]
+    return square
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def finish_row(products, square, shift, projected):  # type: ignore[no-untyped-def]
+    """One row of :meth:`Projection.finish`; float32 [d], |f|² and float32 [d] to float32 [values]."""
+    inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
+    square = np.float32(0)
+    for d in range(len(projected)):
+        value = products[d] * inverse - shift[d]
+        projected[d] = value
+        square += value * value
+    again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
+    for d in range(len(projected)):
+        projected[d] *= again
+
+
+@numba.njit(cache=True, nogil=True)
 def _finish(products, features, shift, projected):  # type: ignore[no-untyped-def]
     """Row by row, as :meth:`Projection.finish`, into ``projected``, float32 [n, values]."""
-    values = projected.shape[1]
     for i in range(len(features)):
-        square = np.float32(0)
-        for k in range(features.shape[1]):
-            square += features[i, k] * features[i, k]
-        inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
-        square = np.float32(0)
-        for d in range(values):
-            value = products[i, d] * inverse - shift[d]
-            projected[i, d] = value
-            square += value * value
-        again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
-        for d in range(values):
-            projected[i, d] *= again
+        finish_row(products[i], squared_length(features[i]), shift, projected[i])
 
 
 def fit_projection(clear: Array, changed: Array, values: int) -> Projection:

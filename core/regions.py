@@ -16,19 +16,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from core.boxes import projected_within, sums_within
 from core.components import DOUBLES, INTEGERS, SINGLES, bits_shape, strongest
 
 Activations = NDArray[np.float32]
 
 SHAPES = 8
 """Shapes of layers for which a thread keeps room to work in."""
-
-FEW = 16
-"""Cells of a box that are summed as they are; the rounding of so few is far under that of a feature's length."""
 
 
 @dataclass(frozen=True)
@@ -55,80 +52,6 @@ class Regions:
         """Where the regions of each of so many layers stand."""
         ends = np.searchsorted(self.layers, np.arange(layers + 1)).tolist()
         return [slice(start, stop) for start, stop in pairwise(ends)]
-
-
-@numba.njit(cache=True, nogil=True)
-def _fill(activations, table):  # type: ignore[no-untyped-def]
-    """The summed-area table: sums over all cells above and to the left; its first row and column stay zero."""
-    height, width, channels = activations.shape
-    row = np.empty(channels, np.float64)
-    for y in range(height):
-        row[:] = 0
-        for x in range(width):
-            for k in range(channels):
-                row[k] += activations[y, x, k]
-                table[y + 1, x + 1, k] = table[y, x + 1, k] + row[k]
-
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _add_few(cells, top, left, bottom, right, width, total):  # type: ignore[no-untyped-def]
-    """The sum over a small box, two cells at a time; float32 [X·Y, K] to [K]."""
-    for y in range(top, bottom):
-        at, stop = y * width + left, y * width + right
-        if y == top and stop - at == 1:
-            one = cells[at]
-            for k in range(len(total)):
-                total[k] = one[k]
-            at += 1
-        elif y == top:
-            one, two = cells[at], cells[at + 1]
-            for k in range(len(total)):
-                total[k] = one[k] + two[k]
-            at += 2
-        while at + 1 < stop:
-            one, two = cells[at], cells[at + 1]
-            for k in range(len(total)):
-                total[k] += one[k] + two[k]
-            at += 2
-        if at < stop:
-            one = cells[at]
-            for k in range(len(total)):
-                total[k] += one[k]
-
-
-@numba.njit(cache=True, nogil=True)
-def _box_sums(activations, boxes, table, sums):  # type: ignore[no-untyped-def]
-    """Put the sum of the local descriptors in each box into ``sums``, float32 [T, K].
-
-    Most boxes are small and summed directly.  When the others hold more cells together than a summed-area table
-    has, ``table``, float64 [X + 1, Y + 1, K], is filled.
-    """
-    height, width, channels = activations.shape
-    cells = activations.reshape(height * width, channels)
-    many = 0
-    for t in range(len(boxes)):
-        area = (boxes[t, 2] - boxes[t, 0]) * (boxes[t, 3] - boxes[t, 1])
-        many += area if area > FEW else 0
-    tabled = many > 2 * height * width
-    if tabled:
-        _fill(activations, table)
-    exact = np.empty(channels, np.float64)
-    for t in range(len(boxes)):
-        top, left, bottom, right = boxes[t, 0], boxes[t, 1], boxes[t, 2], boxes[t, 3]
-        total = sums[t]
-        if (bottom - top) * (right - left) <= FEW:
-            _add_few(cells, top, left, bottom, right, width, total)
-        elif tabled:
-            for k in range(channels):
-                total[k] = table[bottom, right, k] - table[top, right, k] - table[bottom, left, k] + table[top, left, k]
-        else:
-            exact[:] = 0
-            for y in range(top, bottom):
-                for at in range(y * width + left, y * width + right):
-                    for k in range(channels):
-                        exact[k] += cells[at, k]
-            for k in range(channels):
-                total[k] = exact[k]
 
 
 @dataclass(frozen=True)
@@ -231,8 +154,24 @@ def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | Non
     """
     if out is None:
         out = np.empty((len(boxes), grid.shape[2]), np.float32)
-    _box_sums(np.ascontiguousarray(grid, np.float32), boxes, _workspace.room(grid.shape).table, out)
+    sums_within(np.ascontiguousarray(grid, np.float32), boxes, _workspace.room(grid.shape).table, out)
     return out
+
+
+def projected_box_sums(
+    layer: Activations, products: Activations, boxes: NDArray[np.int32], shift: NDArray[np.float32], out: Activations
+) -> None:
+    """Put unit-length projections of the sums of :func:`box_sums` into ``out``, float32 [T, values].
+
+    A projection of sums is a sum of projections, so that only the length is needed of the sums themselves.
+
+    Args:
+        layer: float32 [X, Y, K].
+        products: of its cells with a projection's matrix, float32 [X, Y, d].
+        shift: of the mean, float32 [d].
+    """
+    tables = _workspace.room(layer.shape).table, _workspace.room(products.shape).table
+    projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, *tables, shift, out)
 
 
 def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -128,6 +128,14 @@ def _finish(vectors, gamma, intra):  # type: ignore[no-untyped-def]
                 vectors[u, k] *= inverse
 
 
+@numba.njit(cache=True, nogil=True)
+def _aggregated(features, centers, closeness, gamma, intra):  # type: ignore[no-untyped-def]
+    """Both steps; float32 [V, K]."""
+    vectors = _summed(features, centers, closeness)
+    _finish(vectors, gamma, intra)
+    return vectors
+
+
 def aggregate(features: Array, centers: Array | Words, gamma: float, normalization: Normalization) -> Array:
     """The VLAD of one frame, flattened.
 
@@ -138,6 +146,8 @@ def aggregate(features: Array, centers: Array | Words, gamma: float, normalizati
     Returns:
         float32 [V·K].
     """
-    vectors = residuals(features, centers)
-    _finish(vectors, np.float32(gamma), normalization == "intra")
-    return vectors.reshape(-1)
+    words = ready(centers)
+    vectors = _aggregated(
+        features, words.centers, words.closeness(features), np.float32(gamma), normalization == "intra"
+    )
+    return np.asarray(vectors, np.float32).reshape(-1)

@@ -145,11 +145,10 @@ class SquareTiles(_Fast):
         rows, columns = -(-shape[0] // 2), -(-shape[1] // 2)
         if 16 * rows * columns > (1 - FEWEST_SAVED) * 9 * shape[0] * shape[1]:
             return self._direct(x)
+        transformed = np.empty((count, rows, columns, 16, channels), np.float32)
+        _square_inputs(maps, self._pad, transformed)
         made = np.empty((count, *shape, self._channels), np.float32)
-        for one, out in zip(maps, made, strict=True):  # one at a time: what is between stays in the cache
-            transformed = np.empty((1, rows, columns, 16, channels), np.float32)
-            _square_inputs(one, self._pad, transformed[0])
-            _square_outputs(self._summed(self._products, transformed)[0], self._bias, self._least, out)
+        _square_outputs(self._summed(self._products, transformed), self._bias, self._least, made)
         return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 
@@ -169,11 +168,10 @@ class Strips(_Fast):
         strips = -(-shape[1] // 3)
         if 7 * strips > (1 - FEWEST_SAVED) * 5 * shape[1]:
             return self._direct(x)
+        transformed = np.empty((count, height + 2 * self._pad, strips, 7, channels), np.float32)
+        _strip_inputs(maps, self._bt, self._pad, transformed)
         made = np.empty((count, *shape, self._channels), np.float32)
-        for one, out in zip(maps, made, strict=True):
-            transformed = np.empty((1, height + 2 * self._pad, strips, 7, channels), np.float32)
-            _strip_inputs(one, self._bt, self._pad, transformed[0])
-            _strip_outputs(self._summed(self._products, transformed)[0], self._at, self._bias, self._least, out)
+        _strip_outputs(self._summed(self._products, transformed), self._at, self._bias, self._least, made)
         return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 
@@ -192,21 +190,22 @@ def _two_of_three(d0, d1, d2, d3, t0, t1, t2, t3):  # type: ignore[no-untyped-de
 
 @numba.njit(cache=True, nogil=True)
 def _square_inputs(maps, pad, transformed):  # type: ignore[no-untyped-def]
-    """Bᵀ d B of each tile; float32 [H, W, C] to [rows, columns, 16, C]."""
-    height, width, channels = maps.shape
-    rows, nothing = maps.reshape(height, width * channels), np.zeros(width * channels, np.float32)
+    """Bᵀ d B of each tile; float32 [B, H, W, C] to [B, rows, columns, 16, C]."""
+    count, height, width, channels = maps.shape
+    all_rows, nothing = maps.reshape(count, height, width * channels), np.zeros(width * channels, np.float32)
     # A row of tiles down at first, with what stands to the left and to the right of the map, which is zero.
-    down = np.zeros((4, (2 * transformed.shape[1] + 2) * channels), np.float32)
+    down = np.zeros((4, (2 * transformed.shape[2] + 2) * channels), np.float32)
     within = down[:, pad * channels : (pad + width) * channels]
-    for row in range(transformed.shape[0]):
-        top = 2 * row - pad
+    for number in range(count * transformed.shape[1]):
+        image, row = number // transformed.shape[1], number % transformed.shape[1]
+        rows, top = all_rows[image], 2 * row - pad
         d0 = rows[top] if 0 <= top < height else nothing
         d1 = rows[top + 1] if 0 <= top + 1 < height else nothing
         d2 = rows[top + 2] if 0 <= top + 2 < height else nothing
         d3 = rows[top + 3] if 0 <= top + 3 < height else nothing
         _two_of_three(d0, d1, d2, d3, within[0], within[1], within[2], within[3])
-        for column in range(transformed.shape[1]):
-            out, x = transformed[row, column], 2 * column * channels
+        for column in range(transformed.shape[2]):
+            out, x = transformed[image, row, column], 2 * column * channels
             for i in range(4):
                 d0, d1 = down[i, x : x + channels], down[i, x + channels : x + 2 * channels]
                 d2, d3 = down[i, x + 2 * channels : x + 3 * channels], down[i, x + 3 * channels : x + 4 * channels]
@@ -215,12 +214,13 @@ def _square_inputs(maps, pad, transformed):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
 def _square_outputs(summed, bias, least, maps):  # type: ignore[no-untyped-def]
-    """Aᵀ y A of each tile, with bias and rectifier; float32 [rows, columns, 16, O] to [X, Y, O]."""
-    height, width, channels = maps.shape
+    """Aᵀ y A of each tile, with bias and rectifier; float32 [B, rows, columns, 16, O] to [B, X, Y, O]."""
+    count, height, width, channels = maps.shape
     down = np.empty((2, 4, channels), np.float32)
-    for row in range(summed.shape[0]):
-        for column in range(summed.shape[1]):
-            points = summed[row, column]
+    for number in range(count * summed.shape[1]):
+        image, row = number // summed.shape[1], number % summed.shape[1]
+        for column in range(summed.shape[2]):
+            points = summed[image, row, column]
             for j in range(4):
                 p0, p1, p2, p3 = points[j], points[4 + j], points[8 + j], points[12 + j]
                 upper, lower = down[0, j], down[1, j]
@@ -230,26 +230,27 @@ def _square_outputs(summed, bias, least, maps):  # type: ignore[no-untyped-def]
                     lower[k] = p3[k] + (p1[k] - p2[k])
             for i in range(min(2, height - 2 * row)):
                 p0, p1, p2, p3 = down[i, 0], down[i, 1], down[i, 2], down[i, 3]
-                left = maps[2 * row + i, 2 * column]
+                left = maps[image, 2 * row + i, 2 * column]
                 for k in range(channels):
                     left[k] = max(p0[k] + (p1[k] + p2[k]) + bias[k], least)
                 if 2 * column + 1 < width:
-                    right = maps[2 * row + i, 2 * column + 1]
+                    right = maps[image, 2 * row + i, 2 * column + 1]
                     for k in range(channels):
                         right[k] = max(p3[k] + (p1[k] - p2[k]) + bias[k], least)
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract"})
 def _strip_inputs(maps, bt, pad, transformed):  # type: ignore[no-untyped-def]
-    """Bᵀ d of each strip of each row; float32 [H, W, C] to [H + 2 pad, strips, 7, C]."""
-    height, width, channels = maps.shape
+    """Bᵀ d of each strip of each row; float32 [B, H, W, C] to [B, H + 2 pad, strips, 7, C]."""
+    count, height, width, channels = maps.shape
     nothing = np.zeros(channels, np.float32)
-    for y in range(transformed.shape[0]):
+    for number in range(count * transformed.shape[1]):
+        image, y = number // transformed.shape[1], number % transformed.shape[1]
         if not pad <= y < height + pad:
-            transformed[y] = 0
+            transformed[image, y] = 0
             continue
-        row = maps[y - pad]
-        for strip in range(transformed.shape[1]):
+        row = maps[image, y - pad]
+        for strip in range(transformed.shape[2]):
             x = 3 * strip - pad
             d0 = row[x] if 0 <= x < width else nothing
             d1 = row[x + 1] if 0 <= x + 1 < width else nothing
@@ -261,7 +262,7 @@ def _strip_inputs(maps, bt, pad, transformed):  # type: ignore[no-untyped-def]
             for point in range(7):
                 b = bt[point]
                 b0, b1, b2, b3, b4, b5, b6 = b[0], b[1], b[2], b[3], b[4], b[5], b[6]
-                out = transformed[y, strip, point]
+                out = transformed[image, y, strip, point]
                 for k in range(channels):
                     near = b0 * d0[k] + b1 * d1[k] + b2 * d2[k] + b3 * d3[k]
                     out[k] = near + (b4 * d4[k] + b5 * d5[k] + b6 * d6[k])
@@ -269,15 +270,16 @@ def _strip_inputs(maps, bt, pad, transformed):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
 def _strip_outputs(summed, at, bias, least, maps):  # type: ignore[no-untyped-def]
-    """Aᵀ y of each strip, with bias and rectifier; float32 [X, strips, 7, O] to [X, Y, O]."""
-    height, width, channels = maps.shape
-    for y in range(height):
-        for strip in range(summed.shape[1]):
-            points = summed[y, strip]
+    """Aᵀ y of each strip, with bias and rectifier; float32 [B, X, strips, 7, O] to [B, X, Y, O]."""
+    count, height, width, channels = maps.shape
+    for number in range(count * height):
+        image, y = number // height, number % height
+        for strip in range(summed.shape[2]):
+            points = summed[image, y, strip]
             p0, p1, p2, p3, p4, p5, p6 = points[0], points[1], points[2], points[3], points[4], points[5], points[6]
             for i in range(min(3, width - 3 * strip)):
                 a0, a1, a2, a3, a4, a5, a6 = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5], at[i, 6]
-                out = maps[y, 3 * strip + i]
+                out = maps[image, y, 3 * strip + i]
                 for k in range(channels):
                     most = a0 * p0[k] + a1 * p1[k] + a2 * p2[k] + a3 * p3[k]
                     out[k] = max(most + (a4 * p4[k] + a5 * p5[k] + a6 * p6[k]) + bias[k], least)

@@ -29,7 +29,7 @@ AHEAD = 3 * MOST_BULK
 """Frames of one bulk request that wait at a time: enough that the encoder never waits for it."""
 
 
-UNWATCHED = 0.02
+UNWATCHED = 0.25
 """Seconds for which nobody looks whether the caller of one frame is still there: most have their answer by then."""
 
 
