@@ -126,18 +126,18 @@ class FeatureExtractor:
         """
         hidden = [None] * len(frames) if masks is None else masks
         shown = self.backbone.input
-        batch = np.empty((len(frames), shown.height, shown.width, 3), np.float32)
+        batch, blank = np.empty((len(frames), shown.height, shown.width, 3), np.float32), []
         for image, frame, mask in zip(batch, frames, hidden, strict=True):
             prepare(frame, shown, image)
             if mask is not None:
                 image[mask.covered(shown.height, shown.width)] = 0
+            blank.append(contrast(frame, mask) < self.definition.least_contrast)
         with torch.inference_mode():
             outputs = self.forward(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
         maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
-        for index, (frame, mask) in enumerate(zip(frames, hidden, strict=True)):
-            blank = contrast(frame, mask) < self.definition.least_contrast
+        for index, mask in enumerate(hidden):
             for layer in maps:
-                if blank:
+                if blank[index]:
                     layer[index] = 0
                 elif mask is not None:
                     layer[index][mask.covered(*layer.shape[1:3])] = 0

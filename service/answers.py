@@ -47,8 +47,9 @@ def search_ahead(map_: Map, k: int, selection: Selection | None) -> Callable[[En
         return None
 
     def search(encoded: Encoded) -> list[Located] | None:
-        encoding = encoded.encoding
-        return locate(map_, encoded.encoder, [encoding], k) if len(encoding.regions) else None
+        if not map_.snapshot().holds or not len(encoded.encoding.regions):  # what is not in memory comes from the disk
+            return None
+        return locate(map_, encoded.encoder, [encoded.encoding], k)
 
     return search
 

@@ -14,6 +14,7 @@ from anyio import to_thread
 from core.encoders import EncoderCatalogue
 from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
 from core.images import Limits
+from core.index.exact import compile_ahead
 from core.masks import Mask
 from core.storage import Atlas, Map, MapRecord
 from core.verdict import Calibration
@@ -122,6 +123,7 @@ class Engine:
         try:
             identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
             await self.inference.load(identity)
+            await in_thread(compile_ahead)
         except PlacerecError as error:
             self._encoder_state = str(error)
             log.error("the default encoder cannot be used: %s", error)

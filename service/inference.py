@@ -18,14 +18,14 @@ from core.masks import Mask
 from core.threads import share_cores
 from service.faults import ClientGone, QueueFull
 from service.metrics import Metrics
-from service.microbatches import MOST_BULK, Encoded, MicroBatches, Turn, late
+from service.microbatches import MOST_FRAMES, Encoded, MicroBatches, Turn, late
 
 __all__ = ["Encoded", "Inference", "Outcomes", "Patience"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
 """What became of some frames of many, each with its index."""
 
-AHEAD = 3 * MOST_BULK
+AHEAD = 2 * MOST_FRAMES
 """Frames of one bulk request that wait at a time: enough that the encoder never waits for it."""
 
 

@@ -33,7 +33,10 @@ MOST_FRAMES = FRAMES_A_PASS * max(2, cores())
 and keep those who come next waiting for longer."""
 
 MOST_BULK = MOST_FRAMES // 2
-"""The same where all frames are of bulk requests, so that a robot's frame comes in between soon."""
+"""The same where all frames are of bulk requests, so that a robot's frame comes in between soon …"""
+
+QUIET_SECONDS = 5.0
+"""… unless no robot has asked for so long."""
 
 MOST_PIXELS = 40_000_000
 """Pixels of all frames of a batch of more than one: it bounds the memory of what is decoded at one time."""
@@ -115,6 +118,7 @@ class MicroBatches:
         self._robots: deque[Turn] = deque()
         self._bulk: deque[Turn] = deque()
         self._passed_over = 0  # batches since a bulk request's encoder had its turn
+        self._robot_asked = -QUIET_SECONDS  # time.monotonic
         self._closed = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._run, name="encoder", daemon=True)
@@ -138,8 +142,11 @@ class MicroBatches:
             for turn in turns:
                 if self._closed:
                     turn.result.cancel()
+                elif turn.bulk:
+                    self._bulk.append(turn)
                 else:
-                    (self._bulk if turn.bulk else self._robots).append(turn)
+                    self._robots.append(turn)
+                    self._robot_asked = time.monotonic()
             self._changed.notify()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
@@ -195,15 +202,16 @@ class MicroBatches:
     def _first(self) -> tuple[Turn, int]:
         """Whose encoder is next, and how many frames it is to have at most."""
         first = (self._robots or self._bulk)[0]
+        most_bulk = MOST_BULK if time.monotonic() - self._robot_asked < QUIET_SECONDS else MOST_FRAMES
         if not self._bulk or self._bulk[0].identity == first.identity:
             self._passed_over = 0
-            return first, MOST_FRAMES if self._robots else MOST_BULK
+            return first, MOST_FRAMES if self._robots else most_bulk
         # A share of a batch is of no use to who needs another encoder: one batch in so many is theirs.
         self._passed_over += 1
         if self._passed_over < BULK_SHARE:
             return first, MOST_FRAMES
         self._passed_over = 0
-        return self._bulk[0], MOST_BULK
+        return self._bulk[0], most_bulk
 
     def _encode(self, batch: Sequence[Turn]) -> None:
         """Settle each turn of a batch, one way or the other."""

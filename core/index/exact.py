@@ -21,6 +21,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from core.index.kernels import prefetch
+from core.index.ranking import ranked
 
 Rows = NDArray[np.float16] | NDArray[np.float32]
 
@@ -177,3 +178,10 @@ def compare(queries: NDArray[np.float32], rows: Rows, chosen: NDArray[np.int64])
     stride = dimension * read.itemsize
     _compare(kind, read.ctypes.data, stride, chosen, queries.ctypes.data, count, dimension, products)
     return products
+
+
+def compile_ahead() -> None:
+    """Compile now, or read from the cache, what the first search of a small map would wait for."""
+    query, chosen = np.ones((1, 1), np.float32), np.zeros(1, np.int64)
+    for rows in (np.ones((1, 1), np.float16), np.ones((1, 1), np.float32)):
+        ranked(chosen, compare(query, rows, chosen)[0])

@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import pytest
 
 from core.encoder import Encoder
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.images import Limits
-from core.places import PlaceFields
 from core.preprocessing import Pixels
-from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.storage import Atlas, Map, MapSettings
 from service import answers, microbatches
 from service.answers import search_ahead
 from service.inference import Encoded
@@ -21,6 +21,7 @@ from service.microbatches import MicroBatches, Turn
 from service.questions import QueryParameters
 from service.searches import Searches
 from tests.service.scenes import jpeg, scene, seen_again
+from tests.service.test_searches import enrolment
 
 pytestmark = pytest.mark.anyio
 
@@ -34,21 +35,8 @@ def encoder() -> Encoder:
 def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
     atlas = Atlas(tmp_path_factory.mktemp("atlas") / "data")
     made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    for seed, encoding in enumerate(encoder.encode_batch([scene(seed) for seed in range(4)])):
-        made.enrol(
-            [
-                Enrolment(
-                    id=f"p{seed}",
-                    fields=PlaceFields(),
-                    descriptor=encoding.descriptor,
-                    local=encoding.local,
-                    regions=len(encoding.regions),
-                    digest=bytes([seed]) * 32,
-                    thumbnail=None,
-                    image=None,
-                )
-            ]
-        )
+    encodings = encoder.encode_batch([scene(seed) for seed in range(4)])
+    made.enrol([enrolment(seed, encoding) for seed, encoding in enumerate(encodings)])
     yield made
     atlas.close()
 
@@ -72,8 +60,13 @@ async def test_searched_ahead_as_searched_for(map_: Map, encoder: Encoder) -> No
     assert search(encoded(encoder, scene(0) * 0)) is None, "a blank frame is like no place"
 
 
-def test_what_may_take_long_is_not(map_: Map, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_may_take_long_is_not(map_: Map, encoder: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
     assert search_ahead(map_, 3, QueryParameters(sequences="monday").selection()) is None
+    search, now = search_ahead(map_, 3, None), map_.snapshot()
+    assert search is not None
+    with monkeypatch.context() as patched:
+        patched.setattr(map_, "snapshot", lambda: replace(now, holds=False))
+        assert search(encoded(encoder, scene(0))) is None, "what is on the disk may take long"
     monkeypatch.setattr(answers, "MOST_AHEAD", 3)
     assert search_ahead(map_, 3, None) is None
 

@@ -220,13 +220,20 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
     assert order.index("bulk", MOST_FRAMES) > MOST_FRAMES, "the robots that are left come before more bulk"
 
 
-def test_bulk_alone_comes_in_small_batches(watched: Watched) -> None:
-    turns = [watched.turn(0, bulk=True) for _ in range(2 * MOST_BULK)]
+@pytest.mark.parametrize("seconds", [0.0, 3600.0])
+def test_bulk_alone_comes_in_small_batches_while_robots_are_about(
+    watched: Watched, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(microbatches, "QUIET_SECONDS", seconds)
+    robot = watched.turn(0)
+    watched.batches.put([robot])
+    answers([robot])
+    turns = [watched.turn(0, bulk=True) for _ in range(2 * MOST_FRAMES)]
     go = watched.hold()
     watched.batches.put(turns)
     go()
     answers(turns)
-    assert watched.sizes == [MOST_BULK, MOST_BULK]
+    assert watched.sizes[1:] == ([MOST_BULK] * 4 if seconds else [MOST_FRAMES] * 2)
 
 
 def test_what_is_decoded_at_one_time_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:

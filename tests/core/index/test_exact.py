@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from core.index import exact
-from core.index.exact import compare
+from core.index.exact import compare, compile_ahead
 
 
 def plain(queries: np.ndarray, rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -80,3 +80,13 @@ def test_memory_that_is_not_of_the_rows_is_not_read(row: int) -> None:
         compare(np.ones((2, 8), np.float32), np.ones((4, 8), np.float32), np.array([0, row]))
     with pytest.raises(ValueError, match="8 values"):
         compare(np.ones((2, 8), np.float32), np.ones((4, 7), np.float32), np.array([0]))
+
+
+def test_nothing_is_compiled_after_it_was_ahead() -> None:
+    compile_ahead()
+    known = len(exact._compare.signatures)
+    random = np.random.default_rng(0)
+    halves = random.random((9, 40)).astype(np.float16)
+    compare(random.random((3, 40), np.float32), halves, np.arange(9))
+    compare(random.random((2, 40), np.float32), halves.astype(np.float32), np.arange(9))
+    assert len(exact._compare.signatures) == known
