@@ -50,7 +50,7 @@ class Projection:
         """m W, float32 [d]."""
         return np.asarray(self.mean @ self.matrix, np.float32)
 
-    def finish(self, products: Array, features: Array, values: int, out: Array | None = None) -> Array:
+    def finish(self, products: Array, features: Array, values: int) -> Array:
         """Unit-length projections of n features whose products are known; float32 [n, values].
 
         (f/|f| - m) W = f W / |f| - m W.
@@ -58,9 +58,8 @@ class Projection:
         Args:
             products: float32 [n, d].
             features: float32 [n, K].
-            out: where to put it, float32 [n, values]; None: a new array.
         """
-        projected = np.empty((len(features), values), np.float32) if out is None else out
+        projected = np.empty((len(features), values), np.float32)
         _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
         return projected
 

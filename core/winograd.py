@@ -105,22 +105,20 @@ class _Fast:
     Called with B x C x H x W float32, channels last in memory; gives B x O x X x Y, channels last too.
     """
 
-    def __init__(self, module: nn.Conv2d, rectified: bool, points: int) -> None:
+    def __init__(self, module: nn.Conv2d, rectified: bool, weights: Matrix) -> None:
+        """Of a layer, with its weights at all points: float64 [points, O, C / groups, height]."""
         self._direct = FusedConvolution.of(module, rectified)
-        self._pad, self._taps, self._points = int(module.padding[0]), int(module.kernel_size[0]), points
-        self._channels, self._groups = module.out_channels, module.groups
+        self._pad, self._taps, self._points = int(module.padding[0]), int(module.kernel_size[0]), len(weights)
+        self._channels = module.out_channels
         bias = np.zeros(module.out_channels) if module.bias is None else module.bias.detach().numpy()
         self._bias, self._least = bias.astype(np.float32), np.float32(0 if rectified else -np.inf)
-
-    def _product(self, weights: Matrix) -> FusedConvolution:
-        """The sums over channels at all points; [points, O, C / groups, height] to a grouped convolution."""
         kernels = np.ascontiguousarray(weights.reshape(-1, *weights.shape[2:], 1), np.float32)
-        return FusedConvolution(torch.from_numpy(kernels), None, groups=self._points * self._groups)
+        self._products = FusedConvolution(torch.from_numpy(kernels), None, groups=self._points * module.groups)
 
-    def _summed(self, product: FusedConvolution, transformed: NDArray[np.float32]) -> NDArray[np.float32]:
-        """float32 [B, rows, columns, points, C] to [B, rows, columns, points, O]."""
+    def _summed(self, transformed: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The sums over channels at all points; float32 [B, rows, columns, points, C] to [..., points, O]."""
         flat = transformed.reshape(*transformed.shape[:3], -1)
-        made = product(torch.from_numpy(flat).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+        made = self._products(torch.from_numpy(flat).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         return made.numpy().reshape(*made.shape[:3], self._points, self._channels)
 
     def _size(self, cells: int) -> int:
@@ -132,11 +130,10 @@ class SquareTiles(_Fast):
     """3 x 3: two outputs down and two across at a time, F(2 x 2, 3 x 3), 16 multiplications instead of 36."""
 
     def __init__(self, module: nn.Conv2d, rectified: bool) -> None:
-        super().__init__(module, rectified, 16)
         _, g, _ = transforms(2, 3, SQUARE_POINTS)
         kernels = module.weight.detach().double().numpy()
         weights = np.einsum("yr,ocrs,xs->yxoc", g, kernels, g)
-        self._products = self._product(weights.reshape(16, *kernels.shape[:2], 1))
+        super().__init__(module, rectified, weights.reshape(16, *kernels.shape[:2], 1))
 
     def __call__(self, x: Tensor) -> Tensor:
         maps = x.permute(0, 2, 3, 1).contiguous().numpy()
@@ -148,7 +145,7 @@ class SquareTiles(_Fast):
         transformed = np.empty((count, rows, columns, 16, channels), np.float32)
         _square_inputs(maps, self._pad, transformed)
         made = np.empty((count, *shape, self._channels), np.float32)
-        _square_outputs(self._summed(self._products, transformed), self._bias, self._least, made)
+        _square_outputs(self._summed(transformed), self._bias, self._least, made)
         return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 
@@ -156,10 +153,9 @@ class Strips(_Fast):
     """5 x 5: three outputs across at a time, F(3, 5) of each row of the kernel, 7 multiplications instead of 15."""
 
     def __init__(self, module: nn.Conv2d, rectified: bool) -> None:
-        super().__init__(module, rectified, 7)
         at, g, bt = transforms(3, 5, STRIP_POINTS)
         self._at, self._bt = at.astype(np.float32), bt.astype(np.float32)
-        self._products = self._product(np.einsum("xs,ocrs->xocr", g, module.weight.detach().double().numpy()))
+        super().__init__(module, rectified, np.einsum("xs,ocrs->xocr", g, module.weight.detach().double().numpy()))
 
     def __call__(self, x: Tensor) -> Tensor:
         maps = x.permute(0, 2, 3, 1).contiguous().numpy()
@@ -171,7 +167,7 @@ class Strips(_Fast):
         transformed = np.empty((count, height + 2 * self._pad, strips, 7, channels), np.float32)
         _strip_inputs(maps, self._bt, self._pad, transformed)
         made = np.empty((count, *shape, self._channels), np.float32)
-        _strip_outputs(self._summed(self._products, transformed), self._at, self._bias, self._least, made)
+        _strip_outputs(self._summed(transformed), self._at, self._bias, self._least, made)
         return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 

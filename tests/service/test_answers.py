@@ -13,7 +13,7 @@ from core.encoder import Encoder
 from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.images import Limits
 from core.preprocessing import Pixels
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Map
 from service import answers, microbatches
 from service.answers import search_ahead
 from service.inference import Encoded
@@ -21,7 +21,7 @@ from service.microbatches import MicroBatches, Turn
 from service.questions import QueryParameters
 from service.searches import Searches
 from tests.service.scenes import jpeg, scene, seen_again
-from tests.service.test_searches import enrolment
+from tests.service.test_searches import map_of_scenes
 
 pytestmark = pytest.mark.anyio
 
@@ -33,12 +33,8 @@ def encoder() -> Encoder:
 
 @pytest.fixture(scope="module")
 def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
-    atlas = Atlas(tmp_path_factory.mktemp("atlas") / "data")
-    made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    encodings = encoder.encode_batch([scene(seed) for seed in range(4)])
-    made.enrol([enrolment(seed, encoding) for seed, encoding in enumerate(encodings)])
-    yield made
-    atlas.close()
+    with map_of_scenes(encoder, tmp_path_factory.mktemp("atlas"), 4) as made:
+        yield made
 
 
 def encoded(encoder: Encoder, pixels: Pixels) -> Encoded:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,9 +37,16 @@ def queries(encoder: Encoder) -> list[Encoding]:
 
 @pytest.fixture(scope="module")
 def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
-    atlas = Atlas(tmp_path_factory.mktemp("atlas") / "data")
+    with map_of_scenes(encoder, tmp_path_factory.mktemp("atlas"), 6) as made:
+        yield made
+
+
+@contextmanager
+def map_of_scenes(encoder: Encoder, folder: Path, count: int) -> Iterator[Map]:
+    """So many scenes as the places p0, p1, …"""
+    atlas = Atlas(folder / "data")
     made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    encodings = encoder.encode_batch([scene(seed) for seed in range(6)])
+    encodings = encoder.encode_batch([scene(seed) for seed in range(count)])
     made.enrol([enrolment(seed, encoding) for seed, encoding in enumerate(encodings)])
     yield made
     atlas.close()
