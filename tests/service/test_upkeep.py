@@ -15,7 +15,7 @@ import pytest
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
-from tests.service.upkeeping import asked, enrol_frames, enrol_many, finished, places, reaching
+from tests.service.upkeeping import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 
 
 def between(seed: int, share: float) -> bytes:
@@ -312,12 +312,14 @@ def test_a_kill_in_the_middle_of_a_merge(folder: Path) -> None:
     robots = [threading.Thread(target=ask) for _ in range(3)]
     for robot in robots:
         robot.start()
+    wait_until(lambda: answered >= len(robots))  # all of them ask by now
     before = answered
     job = asked(server, "lab", "merge", dry_run=False, sample=0, **{"from": "hall"})
-    going = reaching(server, job, 64)
+    reaching(server, job, 64)
+    wait_until(lambda: answered > before + len(robots))
+    going = server.client.get(f"/v1/jobs/{job['id']}").json()
     server.kill()
-    assert going["state"] == "running" and going["progress"]["done"] < MANY, going
-    assert answered > before, "queries are answered meanwhile"
+    assert going["state"] == "running" and going["progress"]["done"] < MANY, (going, answered - before)
     for robot in robots:
         robot.join(30)
     server = Server(folder).wait()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from tests.service.encoders import COARSE
@@ -30,6 +30,14 @@ def reaching(server: Server, job: Mapping[str, Any], least: int) -> dict[str, An
         if found["progress"]["done"] >= least or found["state"] not in ("queued", "running"):
             return found
         assert time.monotonic() < until, f"no progress: {found}"
+
+
+def wait_until(holds: Callable[[], bool]) -> None:
+    """Wait for what must come to hold."""
+    end = time.monotonic() + 60
+    while not holds():
+        assert time.monotonic() < end, "it never came to hold"
+        time.sleep(0.005)
 
 
 def asked(server: Server, map_id: str, what: str, **body: Any) -> dict[str, Any]:
