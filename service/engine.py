@@ -31,6 +31,7 @@ from service.searches import Searches
 from service.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.staging import Staging
+from service.succession import Succession
 from service.upkeep import Upkeep
 
 DISK_CHECK_SECONDS = 1.0
@@ -81,6 +82,7 @@ class Engine:
             self.atlas.close()
             raise
         self.searches = Searches()
+        self.succession = Succession()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.upkeep = Upkeep(self)
         self.exports, self.imports = Exports(settings), Imports(self)

@@ -16,7 +16,8 @@ from core.places import Place, PlaceFields
 from core.storage import Change, Enrolment, Map, SameFrame
 from service.blocking import in_thread
 from service.faults import FrameNeeded, TooManyPlaces
-from service.inference import Encoded, Patience
+from service.inference import AHEAD, Encoded, Patience
+from service.succession import Sequel, Stage
 
 if TYPE_CHECKING:
     from service.engine import Engine
@@ -66,6 +67,7 @@ async def enrol(
     patience: Patience,
     reject: Callable[[int, Exception], None] = _raise,
     queued: bool = True,
+    sequel: Sequel | None = None,
 ) -> dict[int, Enrolled]:
     """Enrol frames; one that the place holds already is not encoded again.
 
@@ -75,18 +77,21 @@ async def enrol(
         candidates: of different ids.
         reject: is told the index of a frame that cannot be encoded and why; it may raise to end all.
         queued: it takes a place in the queue, as a request does; a job stands back instead.
+        sequel: in line behind another batch, which is to be encoded and stored before.
 
     Returns:
         What was stored, by index; durable, and seen by every later query.
 
     Raises:
-        QueueFull, DeadlineExceeded, ClientGone: nothing was stored.
+        QueueFull, DeadlineExceeded, ClientGone, BatchOutOfOrder: nothing was stored.
         StorageFull, StorageFailure: nothing of the last commit was kept.
     """
     digests = await in_thread(lambda: [frame_digest(candidate) for candidate in candidates])
     stored: dict[int, Enrolled] = {}
     open_ = set(range(len(candidates)))
     known = await in_thread(lambda: {i for i in open_ if map_.digest(candidates[i].id) == digests[i]})
+    if sequel is not None:
+        await sequel.wait_for(Stage.ENCODED)
     while open_:
         enrolments: dict[int, Enrolment] = {}
         times: dict[int, Mapping[str, float]] = {}
@@ -107,6 +112,11 @@ async def enrol(
                                 reject(i, made)
                             else:
                                 enrolments[i], times[i] = made
+                        if sequel is not None and len(sent) - len(enrolments) <= AHEAD:
+                            sequel.reach(Stage.ENCODED)
+        if sequel is not None:
+            sequel.reach(Stage.ENCODED)
+            await sequel.wait_for(Stage.STORED)
         done = await in_thread(
             _commit, engine, map_, enrolments, {i: (candidates[i], digests[i]) for i in sorted(known)}
         )

@@ -74,6 +74,10 @@ class FrameNeeded(Fault):
     """A place was to keep its frame, which was named by a digest, but holds another one or is not there."""
 
 
+class BatchOutOfOrder(Fault):
+    """A batch was to come after another one, which is not stored; nothing of it was."""
+
+
 class UnknownExplanation(Fault):
     """There is no picture of an explanation under this name, or not any more."""
 

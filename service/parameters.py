@@ -128,11 +128,31 @@ class EnrolParameters(PlaceDescription):
         return self.fields(metadata, settings)
 
 
+BatchName = Annotated[str | None, Field(pattern=r"^[A-Za-z0-9._~-]{1,64}$", examples=["monday-17"])]
+
+
 class BatchParameters(Parameters):
     """Beside many frames to enrol."""
 
     encoder: EncoderAssertion = None
     background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
+    batch: BatchName = Field(
+        default=None,
+        description="A name for this batch, a random one for example, by which another can say that it comes after it.",
+    )
+    after: BatchName = Field(
+        default=None,
+        description="The batch of this map after which this one is to be stored. It may be under way still: this one "
+        "is encoded meanwhile. 409 batch-out-of-order if it is not stored in time, and nothing of this one is then.",
+    )
+
+    @model_validator(mode="after")
+    def _can_follow(self) -> BatchParameters:
+        if self.background and (self.batch, self.after) != (None, None):
+            raise ValueError("batch and after are for requests that are answered once all is stored, not in background")
+        if self.batch is not None and self.batch == self.after:
+            raise ValueError("a batch cannot come after itself")
+        return self
 
 
 class BatchItem(PlaceDescription):

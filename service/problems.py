@@ -137,6 +137,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.UnsupportedMediaType: Kind(415, "unsupported-media-type", "The content type is not taken here"),
     faults.BodyTooLarge: Kind(413, "body-too-large", "The body has too many bytes"),
     faults.FrameNeeded: Kind(409, "frame-needed", "The place does not hold this frame"),
+    faults.BatchOutOfOrder: Kind(409, "batch-out-of-order", "The batch before it is not stored"),
     faults.UnknownExplanation: Kind(404, "unknown-explanation", "No such picture, or not any more"),
     # The moment
     faults.QueueFull: Kind(503, "queue-full", "Too many requests wait"),

@@ -117,10 +117,14 @@ class Layout:
         frames = list(zip(descriptors, local, strict=True))
         records = np.zeros(len(frames), dtype=self.record)
         for i, (descriptor, cells) in enumerate(frames):
-            records[i]["descriptor"] = pack_descriptors(descriptor[np.newaxis], self.precision)[0]
-            records[i]["local"] = pack_local(cells[np.newaxis], self.precision)[0]
-            self._seal(records[i], first_row + i)
+            self.pack(records[i], descriptor, cells, first_row + i)
         return records
+
+    def pack(self, record: np.void, descriptor: Descriptor, local: Local, row: int) -> None:
+        """Make a frame, float32 [D] and int8 [C, L], the content of a record of zeros, checksums included."""
+        record["descriptor"] = pack_descriptors(descriptor[np.newaxis], self.precision)[0]
+        record["local"] = pack_local(local[np.newaxis], self.precision)[0]
+        self._seal(record, row)
 
     @cached_property
     def frame(self) -> np.dtype[np.void]:

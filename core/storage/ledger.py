@@ -191,11 +191,12 @@ def picture(connection: sqlite3.Connection, number: int) -> tuple[bytes, bytes] 
 def _sequence_code(connection: sqlite3.Connection, name: str | None) -> int:
     if name is None:
         return NO_SEQUENCE
-    connection.execute(
-        "INSERT INTO sequences (name, next_ordinal) VALUES (?, 0) ON CONFLICT (name) DO NOTHING", (name,)
-    )
-    (code,) = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
-    return int(code)
+    found = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
+    if found is not None:
+        return int(found[0])
+    code = connection.execute("INSERT INTO sequences (name, next_ordinal) VALUES (?, 0)", (name,)).lastrowid
+    assert code is not None
+    return code
 
 
 def _next_ordinal(connection: sqlite3.Connection, code: int) -> int:
@@ -212,17 +213,20 @@ def _drop_if_empty(connection: sqlite3.Connection, code: int) -> None:
     connection.execute(query, (code,))
 
 
-def _keep_picture(connection: sqlite3.Connection, number: int, keep: Keep, item: Enrolment) -> Keep:
-    connection.execute("DELETE FROM pictures WHERE place = ?", (number,))
-    kept: Keep = keep
-    if kept == "image" and item.image is None:
-        kept = "thumbnail"
-    content = {"none": None, "thumbnail": item.thumbnail, "image": item.image}[kept]
-    if content is None:
-        return "none"
-    digest = hashlib.sha256(content).digest()
-    connection.execute("INSERT INTO pictures VALUES (?, ?, ?)", (number, digest, content))
-    return kept
+def _picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
+    """What is kept of a frame, and its bytes."""
+    if keep == "image" and item.image is not None:
+        return keep, item.image
+    if keep != "none" and item.thumbnail is not None:
+        return "thumbnail", item.thumbnail
+    return "none", None
+
+
+def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | None) -> None:
+    """Of a place that has none."""
+    if content is not None:
+        digest = hashlib.sha256(content).digest()
+        connection.execute("INSERT INTO pictures VALUES (?, ?, ?)", (number, digest, content))
 
 
 def insert(
@@ -230,13 +234,14 @@ def insert(
 ) -> StoredPlace:
     """A new place, at the end of its sequence."""
     code = _sequence_code(connection, item.fields.sequence)
+    picture, content = _picture_of(item, keep)
     columns = {
         "id": item.id,
         "row": row,
         "checksum": checksum,
         "digest": item.digest,
         "regions": item.regions,
-        "picture": "none",
+        "picture": picture,
         "sequence": code,
         "ordinal": _next_ordinal(connection, code),
         "created_at": moment_text(now),
@@ -246,7 +251,8 @@ def insert(
     names, marks = ", ".join(columns), ", ".join("?" * len(columns))
     cursor = connection.execute(f"INSERT INTO places ({names}) VALUES ({marks})", tuple(columns.values()))
     assert cursor.lastrowid is not None
-    _set(connection, cursor.lastrowid, picture=_keep_picture(connection, cursor.lastrowid, keep, item))
+    _put_picture(connection, cursor.lastrowid, content)
+    seals.seal(connection, "places", "number = ?", cursor.lastrowid)
     return expect(connection, item.id)
 
 
@@ -265,6 +271,9 @@ def replace_descriptor(
     keep: Keep,
 ) -> None:
     """Another frame for a place: its descriptor is in another row from now on."""
+    picture, content = _picture_of(item, keep)
+    connection.execute("DELETE FROM pictures WHERE place = ?", (stored.number,))
+    _put_picture(connection, stored.number, content)
     _set(
         connection,
         stored.number,
@@ -272,7 +281,7 @@ def replace_descriptor(
         checksum=checksum,
         digest=item.digest,
         regions=item.regions,
-        picture=_keep_picture(connection, stored.number, keep, item),
+        picture=picture,
     )
 
 

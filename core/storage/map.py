@@ -266,6 +266,7 @@ class Map:
         if not items:
             return []
         with self._writing() as write:
+            write.expect(len(items))
             return [write.enrol(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:

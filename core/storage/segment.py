@@ -62,7 +62,9 @@ class Held:
         """Of a segment without rows."""
         return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
 
-    def appended(self, n: int, descriptors: Sequence[Descriptor], local: Sequence[Local], largest: int) -> Held:
+    def appended(
+        self, n: int, descriptors: Sequence[Descriptor] | Rows, local: Sequence[Local] | Local, largest: int
+    ) -> Held:
         """With more rows behind the first ``n``, in memory that is shared where it suffices."""
         index, cells, end = self.index, self.local, n + len(descriptors)
         if end > index.ntotal:
@@ -71,11 +73,10 @@ class Held:
             index = flat_index(capacity, self.index.d, self.rows.dtype == np.float16)
             cells = np.zeros((capacity, *cells.shape[1:]), np.int8)
             vectors(index)[:n], cells[:n] = self.rows[:n], self.local[:n]
-        rows = vectors(index)
-        for offset, descriptor in enumerate(descriptors, start=n):
-            rows[offset] = descriptor
-        for offset, of_frame in enumerate(local, start=n):
-            cells[offset] = of_frame
+        if len(descriptors):
+            vectors(index)[n:end] = descriptors
+        if len(local):
+            cells[n:end] = local
         return Held(index, cells)
 
 
@@ -126,9 +127,9 @@ class Segment:
 
     def appended(
         self,
-        descriptors: Sequence[Descriptor],
+        descriptors: Sequence[Descriptor] | Rows,
         spots: Sequence[Spot],
-        local: Sequence[Local],
+        local: Sequence[Local] | Local,
         checksums: Sequence[int],
         largest: int,
     ) -> Segment:

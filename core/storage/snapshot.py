@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from core.cells import ScatteredCells
 from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
+from core.index.exact import Rows
 from core.index.ranking import ranked
 from core.storage.descriptors import NO_LOCAL
 from core.storage.parallel import threads, together
@@ -309,16 +310,16 @@ class Snapshot:
 
     def appended(
         self,
-        descriptors: Sequence[Descriptor],
+        descriptors: Sequence[Descriptor] | Rows,
         spots: Sequence[Spot],
-        local: Sequence[Local] = (),
+        local: Sequence[Local] | Local = (),
         checksums: Sequence[int] | None = None,
     ) -> Snapshot:
         """With further places.  Only on the newest snapshot, by one thread at a time.
 
         Args:
-            descriptors, spots, local: one of each a place, float32 [D] and int8 [C, L]; ``local`` may be
-                left out where the map has no local descriptors.
+            descriptors, spots, local: one of each a place, float32 [D] (or float16, in a map that holds halves) and
+                int8 [C, L]; ``local`` may be left out where the map has no local descriptors.
             checksums: what SQLite names of the rows; None: nothing.
         """
         if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
@@ -338,7 +339,7 @@ class Snapshot:
             done = min(stop, len(descriptors))
         table = self.table
         if table is not None and len(table) == self.rows and len(descriptors):
-            table = table.appended(table.coder.encode(np.stack(descriptors)))
+            table = table.appended(table.coder.encode(np.asarray(descriptors, np.float32)))
         return replace(self, segments=tuple(segments), table=table)
 
     def moved(self, spots: Mapping[int, Spot]) -> Snapshot:

@@ -120,6 +120,7 @@ class Transfer:
             for item in items:
                 if isinstance(item, Enrolment):
                     check_enrolment(item, write.record.dimension, write.record.local_shape)
+            write.expect(sum(isinstance(item, Enrolment) for item in items))
             return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
@@ -131,6 +132,7 @@ class Transfer:
         """
         if items:
             with self._writing() as write:
+                write.expect(len(items))
                 for item, history in items:
                     write.adopt(item, history)
 

@@ -97,11 +97,19 @@ class Write:
         self._layout = opened.layout
         self._remains = opened.remains
         self._snapshot = snapshot
-        self._born: list[NDArray[np.void]] = []
+        self._records: NDArray[np.void] = np.zeros(0, opened.layout.record)
+        self._born = 0
         self._spots: list[Spot] = []
         self._moved: dict[int, Spot] = {}
         self._dead: list[int] = []
         self._now = datetime.now(UTC)
+
+    def expect(self, frames: int) -> None:
+        """Make room for so many more frames: those that there are would have to be moved for it later."""
+        if (needed := self._born + frames) > len(self._records):
+            records = np.zeros(needed, self._layout.record)
+            records[: self._born] = self._records[: self._born]
+            self._records = records
 
     def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
         """Create a place, replace its frame, or give it other fields if the frame is the same.
@@ -112,9 +120,12 @@ class Write:
         stored = ledger.find(self.connection, item.id)
         if stored is not None and stored.digest == item.digest:
             return self.set_fields(stored, item.fields)
-        row = self._snapshot.rows + len(self._born)
-        record = self._layout.packed([item.descriptor], [item.local], row)
-        checksum = int(record["checksum"][0])
+        row = self._snapshot.rows + self._born
+        if self._born == len(self._records):
+            self.expect(max(1, self._born))
+        record = self._records[self._born]
+        self._layout.pack(record, item.descriptor, item.local, row)
+        checksum = int(record["checksum"])
         keep = self.record.keep if keep is None else keep
         if stored is None:
             now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
@@ -122,7 +133,7 @@ class Write:
             ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
             now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
             self._bury(stored.row)
-        self._born.append(record)
+        self._born += 1
         self._spots.append(_spot(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
 
@@ -182,11 +193,13 @@ class Write:
         before = self._snapshot
         if self._born:
             self.appending = True
-            records = np.concatenate(self._born)
+            records = self._records[: self._born]
             descriptors.append(self._folder, self._layout, before.rows, records)
             self.filled = name_appended(self.connection, self._layout, before.rows, records["checksum"].tolist())
-            vectors, local = self._layout.descriptors_of(records), self._layout.locals_of(records)
-            after = before.appended(list(vectors), self._spots, list(local), records["checksum"].tolist())
+            # In memory as they are at rest, where that is the same.
+            vectors = records["descriptor"] if before.halves else self._layout.descriptors_of(records)
+            local = self._layout.locals_of(records)
+            after = before.appended(vectors, self._spots, local, records["checksum"].tolist())
         else:
             after = before
         after = after.moved(self._moved) if self._moved else after

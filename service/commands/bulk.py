@@ -1,8 +1,8 @@
-"""Many frames to a service: in batches whose size follows the speed, each read from disk while the one before is
-being encoded, and none sent that the service holds already.
+"""Many frames to a service: in batches whose size follows the speed, and none sent that the service holds already.
 
-One batch is under way at a time: their order is that of the places in their sequence, and a verdict looks at a
-place's neighbours there.
+Two batches are under way at a time, so that one is encoded while the other is stored, and the next is read meanwhile.
+Each names the one before, after which it is to be stored: their order is that of the places in their sequence, and a
+verdict looks at a place's neighbours there.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ PATIENCE = 120.0
 OF_THE_FRAME = frozenset({400, 413, 415, 422})
 """Statuses that concern one frame; with any other the rest would most likely fail as well."""
 
+OUT_OF_ORDER = "batch-out-of-order"
+"""The problem of a batch that came before the one that it is to follow."""
+
 TOO_SLOW = frozenset({"deadline-exceeded"})
 """Problems of a batch that it would have again, but smaller ones may not."""
 
-FIRST_BATCH, LARGEST_BATCH = 16, 128
+FIRST_BATCH, LARGEST_BATCH, FASTEST_GROWTH = 16, 128, 8
 BATCH_BYTES = 16 * 1024 * 1024
-"""A batch is closed by the frame that reaches it; one that is sent, its form and the next are in memory at one time."""
+"""A batch is closed by the frame that reaches it; two that are sent, their forms and the next are in memory at once."""
 
 BATCH_SECONDS = 4.0
 """How long a batch should take: long beside what each costs, short beside the time that the service gives it."""
@@ -90,6 +93,16 @@ async def enrol_frames(
     await sender.send_all([frame for frame in frames if frame.id not in known or frame.id in needed])
 
 
+@dataclass(frozen=True)
+class _Sent:
+    """A batch under way: its name, its number of frames, what becomes of them."""
+
+    name: str
+    frames: int
+    task: asyncio.Task[list[Outcome]]
+    began: float = field(default_factory=time.monotonic)
+
+
 class _Sender:
     def __init__(
         self, service: Service, map_id: str, parameters: Mapping[str, str], tell: Callable[[Outcome], None]
@@ -105,60 +118,79 @@ class _Sender:
             if item is not None and item.get("problem", {}).get("type", "").endswith(":frame-needed"):
                 needed.add(one.frame.id)
             else:
-                self._settle(one, item, uploaded=False)
+                self._tell(self._outcome(one, item, uploaded=False))
         return needed
 
     async def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send frames batch by batch; the next is read meanwhile."""
-        position = 0
-        following = asyncio.ensure_future(self._read_batch(frames, position))
+        """Send frames batch by batch: one is encoded while the one before is stored, and the next is read."""
+        position, started = 0, list[_Sent]()
+        following = asyncio.ensure_future(asyncio.to_thread(self._read_batch, frames, position))
         try:
             while batch := await following:
                 position += len(batch)
-                following = asyncio.ensure_future(self._read_batch(frames, position))
-                began = time.monotonic()
-                await self._send(batch)
-                rate = len(batch) / max(time.monotonic() - began, 1e-3)
-                self._batch = max(1, min(self._most, int(rate * BATCH_SECONDS), 2 * self._batch))
+                following = asyncio.ensure_future(asyncio.to_thread(self._read_batch, frames, position))
+                started.append(self._begin(batch, started[-1] if started else None))
+                # The first one alone: it says what the service takes, and how fast it is.
+                if len(started) == 2 or position == len(batch):
+                    await self._end(started.pop(0))
+            for sent in started:
+                await self._end(sent)
         finally:
-            following.cancel()
+            for task in (following, *(sent.task for sent in started)):
+                task.cancel()
+            await asyncio.gather(following, *(sent.task for sent in started), return_exceptions=True)
 
-    async def _read_batch(self, frames: Sequence[Frame], position: int) -> list[_Read]:
+    def _read_batch(self, frames: Sequence[Frame], position: int) -> list[_Read]:
         batch: list[_Read] = []
-        size = 0
-        while position + len(batch) < len(frames) and len(batch) < self._batch and size < BATCH_BYTES:
-            batch.append(await asyncio.to_thread(_read, frames[position + len(batch)]))
+        size, most = 0, self._batch
+        while position + len(batch) < len(frames) and len(batch) < most and size < BATCH_BYTES:
+            batch.append(_read(frames[position + len(batch)]))
             size += len(batch[-1].data)
         return batch
 
-    async def _send(self, batch: Sequence[_Read]) -> None:
-        """Send a batch; in halves if it is more than the service takes at a time."""
+    def _begin(self, batch: Sequence[_Read], before: _Sent | None) -> _Sent:
+        name = secrets.token_hex(8)
+        return _Sent(name, len(batch), asyncio.ensure_future(self._send(batch, name, before)))
+
+    async def _end(self, sent: _Sent) -> None:
+        """Wait for the outcomes of a batch and tell of them; the next to be read follows the speed."""
+        for outcome in await sent.task:
+            self._tell(outcome)
+        rate = sent.frames / max(time.monotonic() - sent.began, 1e-3)
+        self._batch = max(1, min(self._most, int(rate * BATCH_SECONDS), FASTEST_GROWTH * self._batch))
+
+    async def _send(self, batch: Sequence[_Read], name: str, before: _Sent | None = None) -> list[Outcome]:
+        """Send a batch, to be stored after the one before; in halves if it is more than the service takes at a time."""
+        order = {"batch": name} if before is None else {"batch": name, "after": before.name}
         try:
-            settled = await self._post(batch)
+            return [self._outcome(one, item, uploaded=True) for one, item in await self._post(batch, order)]
         except Refused as refused:
+            if before is not None:
+                # Whatever it is, the one before comes first; if that fails, this one is of no interest.
+                await asyncio.wait({before.task})
+                before.task.result()
+                if refused.slug == OUT_OF_ORDER:
+                    return await self._send(batch, name)
             if len(batch) == 1 and refused.status in OF_THE_FRAME:
-                self._tell(Outcome(batch[0].frame, None, refusal=str(refused)))
-                return
+                return [Outcome(batch[0].frame, None, refusal=str(refused))]
             # Of a form as a whole these say that it is longer than this service takes.
             if len(batch) == 1 or not (refused.status in OF_THE_FRAME or refused.slug in TOO_SLOW):
                 raise
             half = len(batch) // 2
             self._most = self._batch = half
-            await self._send(batch[:half])
-            await self._send(batch[half:])
-            return
-        for one, item in settled:
-            self._settle(one, item, uploaded=True)
+            first = await self._send(batch[:half], secrets.token_hex(8))
+            return first + await self._send(batch[half:], name)
 
-    def _settle(self, one: _Read, item: dict[str, Any] | None, uploaded: bool) -> None:
+    def _outcome(self, one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome:
         if item is None:
-            self._tell(Outcome(one.frame, None, refusal=one.refusal, uploaded=False))
-        elif "problem" in item:
-            self._tell(Outcome(one.frame, None, refusal=item["problem"]["detail"], uploaded=uploaded))
-        else:
-            self._tell(Outcome(one.frame, item["change"], posed=one.posed, uploaded=uploaded))
+            return Outcome(one.frame, None, refusal=one.refusal, uploaded=False)
+        if "problem" in item:
+            return Outcome(one.frame, None, refusal=item["problem"]["detail"], uploaded=uploaded)
+        return Outcome(one.frame, item["change"], posed=one.posed, uploaded=uploaded)
 
-    async def _post(self, batch: Sequence[_Read]) -> list[tuple[_Read, dict[str, Any] | None]]:
+    async def _post(
+        self, batch: Sequence[_Read], order: Mapping[str, str] | None = None
+    ) -> list[tuple[_Read, dict[str, Any] | None]]:
         """What the service says of each frame; None for one that could not be read, which is not sent."""
         sent = [one for one in batch if one.refusal is None]
         items: dict[str, dict[str, Any]] = {}
@@ -168,7 +200,7 @@ class _Sender:
             response = await self._service.request(
                 "POST",
                 path_of("maps", self._map_id, "places"),
-                params=self._parameters,
+                params={**self._parameters, **(order or {})},
                 content=form,
                 headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
                 patience=PATIENCE,

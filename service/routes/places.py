@@ -27,6 +27,7 @@ from service.dependencies import (
 from service.engine import Engine, camera_mask, in_thread
 from service.enrolment import Candidate, enrol
 from service.faults import (
+    BatchOutOfOrder,
     EncoderNotInstalled,
     InvalidRequest,
     JobQueueFull,
@@ -35,12 +36,14 @@ from service.faults import (
     TooManyPlaces,
     UnsupportedMediaType,
 )
+from service.inference import Patience
 from service.openapi import form_body, frame_body, json_patch
 from service.parameters import BatchParameters, EnrolParameters, check_metadata
 from service.problems import problem_documentation
 from service.routes.jobs import router as jobs
 from service.schemas.jobs import JobView
 from service.schemas.places import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+from service.succession import Sequel
 from service.uploads import json_part, read_frame, read_many
 
 router = APIRouter(
@@ -120,7 +123,7 @@ async def enrol_place(
     openapi_extra=BATCH_BODY,
     responses={
         202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
-        **problem_documentation(*ENROLMENT_PROBLEMS, JobQueueFull, StagingFull),
+        **problem_documentation(*ENROLMENT_PROBLEMS, BatchOutOfOrder, JobQueueFull, StagingFull),
     },
 )
 async def enrol_places(
@@ -138,9 +141,18 @@ async def enrol_places(
 
     To go on with a traverse that was broken off, name what the places should hold by `sha256` first: only the frames
     answered with `frame-needed` have to be sent.
+
+    To have the next batch encoded while this one is being stored, name them: `?batch=a`, then `?batch=b&after=a`.
     """
     if options.background:
         return await _enrol_later(map_id, options, request, engine)
+    with engine.succession.enter(map_id, options.batch, options.after, patience) as sequel:
+        return await _enrol_now(map_id, options, request, engine, patience, sequel)
+
+
+async def _enrol_now(
+    map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
+) -> BatchResults:
     engine.inference.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
@@ -169,7 +181,12 @@ async def enrol_places(
             reject(position, error)
     positions = list(candidates)
     stored = await enrol(
-        engine, map_, list(candidates.values()), patience, lambda index, error: reject(positions[index], error)
+        engine,
+        map_,
+        list(candidates.values()),
+        patience,
+        lambda index, error: reject(positions[index], error),
+        sequel=sequel,
     )
     for index, one in stored.items():
         results[positions[index]] = BatchResult(

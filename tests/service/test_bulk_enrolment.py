@@ -13,7 +13,7 @@ import httpx
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import blank, encoded, jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeeping import finished, places, reaching
+from tests.service.upkeeping import finished, places, reaching, wait_until
 
 
 def frames(count: int, offset: int = 0) -> list[bytes]:
@@ -76,7 +76,7 @@ def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> Non
     }
     assert [(place["id"], place["pose"]["x"]) for place in places(server, "bulk").values()] == [("a", 1), ("b", 3)]
     assert server.client.get("/v1/maps/bulk/places/a/thumbnail").status_code == 200
-    assert staged(server) == []
+    wait_until(lambda: staged(server) == [])  # it is cleared away once the job has ended
 
     again = finished(server, sent(server, "bulk", **form(pictures, listed)).json())
     assert again["result"]["changes"] == {"unchanged": 2}, "the same again changes nothing"
@@ -119,7 +119,8 @@ def test_a_kill_a_cancel_and_limits(tmp_path: Path) -> None:
     told = done["result"]["changes"]
     assert sum(told.values()) == count and told.get("unchanged", 0) <= 64, told
     assert list(places(server, "long")) == [f"p{n}" for n in range(count)], "all of them, once, in their order"
-    assert server.client.post("/v1/maps/long/verify").json()["ok"] and staged(server) == []
+    assert server.client.post("/v1/maps/long/verify").json()["ok"]
+    wait_until(lambda: staged(server) == [])
 
     # What is enrolled when the job is cancelled stays; the other map's job has its turn.
     server.create_map("other", encoder=COARSE)

@@ -271,7 +271,7 @@ def test_as_a_job(server: Server, source: str, content: bytes) -> None:
     failed = server.client.get(f"{bad.headers['location']}?wait=30").json()
     assert failed["state"] == "failed" and failed["problem"]["type"] == "urn:placerec:problem:invalid-archive"
     assert_problem(bring(server, content, name, background="true"), 409, "map-exists")
-    assert staged(server) == []
+    _until(lambda: staged(server) == [])
 
 
 MANY = 8_000

@@ -199,13 +199,13 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
 
 
 def test_a_full_disk_ends_the_run(placerec: Placerec, tmp_path: Path) -> None:
-    folder = many(tmp_path / "many", 3 * FIRST_BATCH + 1)
-    with http.server.HTTPServer(("127.0.0.1", 0), FullAfterOne) as full:
+    folder = many(tmp_path / "many", 5 * FIRST_BATCH)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), FullAfterOne) as full:
         threading.Thread(target=full.serve_forever, daemon=True).start()
         stopped = placerec("enroll", folder, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
         full.shutdown()
-    assert f"The disk is full. {FIRST_BATCH} of 49 frames are enrolled; the same command goes on" in stopped.stderr
-    assert FullAfterOne.taken == 2  # what comes after was not sent
+    assert f"The disk is full. {FIRST_BATCH} of 80 frames are enrolled; the same command goes on" in stopped.stderr
+    assert FullAfterOne.taken <= 3  # what comes after the batch that was under way meanwhile was not sent
 
 
 def many(folder: Path, count: int) -> Path:
