@@ -8,11 +8,12 @@ map with all that belongs to it, or not at all.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from core.errors import InvalidImage, MapExists, NoRegions, UnknownCamera, UnknownMap
+from core.errors import InvalidImage, MapExists, NoRegions, PlacerecError, UnknownCamera, UnknownMap
 from core.masks import Mask
 from core.places import PlaceFields
 from core.storage import Enrolment, History, Map
@@ -69,7 +70,8 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     except JobInterrupted:
         raise
     except BaseException:
-        engine.atlas.abandon(target)
+        with suppress(PlacerecError):  # it is at the next start
+            engine.atlas.abandon(target)
         raise
 
 

@@ -23,7 +23,7 @@ from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageF
 from core.places import check_map_id
 from core.storage.cursors import Listing, decode_name, encode_cursor
 from core.storage.descriptors import NO_LOCAL, ROWS_PER_SEGMENT, Layout
-from core.storage.disk import Damage, FolderLock, refusals, sync_file, sync_folder, write_file
+from core.storage.disk import Damage, FolderLock, make_folder, refusals, sync_file, sync_folder, write_file
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.records import MapRecord, MapSettings, VerifyReport
@@ -64,7 +64,7 @@ class Atlas:
         self._refused: dict[str, str] = {}
         self._closed = False
         with refusals(f"open the data directory {directory}"):
-            _make_durably(directory)
+            make_folder(directory)
             self._lock = FolderLock(directory / "LOCK")
             try:
                 self._check_format()
@@ -250,12 +250,35 @@ class Atlas:
         return listed
 
     def abandon(self, map_id: str) -> None:
-        """Remove a map that was being made; nothing happens if there is none."""
+        """Remove a map that was being made, for good; nothing happens if there is none.
+
+        Raises:
+            StorageFull, StorageFailure: it is still being made.
+        """
         with self._making, refusals(f"remove map {map_id!r}"):
-            made = self._unlisted.pop(map_id, None)
-            if made is not None:
-                made.close(deleted=True)
-        shutil.rmtree(self._folder / f"{UNLISTED}{map_id}", ignore_errors=True)
+            made = self._unlisted.get(map_id)
+            if made is None:
+                return
+            removed = self._put_away(made, self._folder / f"{UNLISTED}{map_id}", self._unlisted)
+        shutil.rmtree(removed, ignore_errors=True)
+
+    def _put_away(self, found: Map | None, folder: Path, among: dict[str, Map]) -> Path:
+        """Close a map and take it from its like, durably; where its folder is now, which any start would remove."""
+        map_id = folder.name.removeprefix(UNLISTED)
+        removed = self._folder / f"{_HALF_REMOVED}{map_id}-{secrets.token_hex(4)}"
+        if found is not None:
+            found.close(deleted=True)
+        try:
+            os.rename(folder, removed)
+        except FileNotFoundError:
+            log.warning("The folder of map %s was gone already.", map_id)
+        except OSError:
+            if found is not None:
+                among[map_id] = Map(folder, found.record, found.count_places())
+            raise
+        among.pop(map_id, None)
+        sync_folder(self._folder)
+        return removed
 
     def get(self, map_id: str) -> Map:
         """A map, ready to serve; its first use reads it from disk.
@@ -340,22 +363,9 @@ class Atlas:
             found = self._maps.get(map_id)
             if found is None and map_id not in self.quarantined():
                 raise self._absent(map_id)
-            folder = self._folder / map_id
-            removed = self._folder / f"{_HALF_REMOVED}{map_id}-{secrets.token_hex(4)}"
-            if found is not None:
-                found.close(deleted=True)
-            try:
-                os.rename(folder, removed)
-            except FileNotFoundError:
-                log.warning("The folder of map %s was gone already.", map_id)
-            except OSError:
-                if found is not None:
-                    self._maps[map_id] = Map(folder, found.record, found.count_places())
-                raise
-            self._maps.pop(map_id, None)
+            removed = self._put_away(found, self._folder / map_id, self._maps)
             self._damaged.pop(map_id, None)
             self._refused.pop(map_id, None)
-            sync_folder(self._folder)
         # What cannot be removed now is removed at the next start.
         shutil.rmtree(removed, ignore_errors=True)
 
@@ -387,11 +397,3 @@ class Atlas:
     def _expect_open(self) -> None:
         if self._closed:
             raise StorageFailure("The data directory is closed.")
-
-
-def _make_durably(directory: Path) -> None:
-    """Make a folder and those above it, as far as they are missing, and sync every name made."""
-    if not directory.is_dir():
-        _make_durably(directory.absolute().parent)
-        directory.mkdir(exist_ok=True)
-        sync_folder(directory.absolute().parent)

@@ -49,6 +49,14 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, as far as they are missing, and sync every name made."""
+    if not folder.is_dir():
+        make_folder(folder.absolute().parent)
+        folder.mkdir(exist_ok=True)
+        sync_folder(folder.absolute().parent)
+
+
 def sync_file(path: Path) -> None:
     """Make the contents of ``path`` durable."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -106,7 +106,7 @@ def files(first: int, count: int) -> dict[str, bytes]:
 
 
 def order(server: Server, map_id: str) -> list[str]:
-    return [item["id"] for item in server.client.get(f"/v1/maps/{map_id}/places").json()["items"]]
+    return [item["id"] for item in server.client.get(f"/v1/maps/{map_id}/places?limit=1000").json()["items"]]
 
 
 def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map_id: str) -> None:

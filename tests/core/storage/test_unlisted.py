@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from core.errors import MapExists, StorageFailure, UnknownMap
-from core.storage import Atlas, Map
+from core.storage import Atlas, Map, disk
+from core.storage import atlas as storage_atlas
 from core.storage.opening import UNLISTED
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
@@ -86,17 +87,36 @@ def test_one_that_a_crash_has_damaged_is_removed(atlas: Atlas, directory: Path) 
     again.close()
 
 
+def refuse(*_: object) -> None:
+    raise OSError(5, "Input/output error")
+
+
 def test_a_name_that_cannot_be_given_leaves_it_unlisted(
     atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     making(atlas).enrol([frame("a")])
-
-    def refuse(*_: object) -> None:
-        raise OSError(5, "Input/output error")
-
-    with monkeypatch.context() as broken:
-        broken.setattr(os, "rename", refuse)
-        with pytest.raises(StorageFailure):
-            atlas.publish("new")
-    assert list(atlas.unlisted()) == ["new"] and atlas.records(None, 10) == ([], None)
+    for action in (atlas.publish, atlas.abandon):
+        with monkeypatch.context() as broken:
+            broken.setattr(os, "rename", refuse)
+            with pytest.raises(StorageFailure):
+                action("new")
+        assert list(atlas.unlisted()) == ["new"] and atlas.records(None, 10) == ([], None)
     assert len(atlas.publish("new").snapshot()) == 1
+
+
+def test_abandoning_is_for_good_before_anything_is_removed(
+    atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    making(atlas).enrol([frame("a")])
+    seen: list[list[str]] = []
+    sync = disk.sync_folder
+
+    def watched(folder: Path) -> None:
+        sync(folder)
+        seen.append([path.name for path in folder.iterdir() if (path / "map.sqlite").exists()])
+
+    monkeypatch.setattr(storage_atlas, "sync_folder", watched)
+    atlas.abandon("new")
+    # By its name of then, the next start removes it: a power cut may undo the removal, but not the new name.
+    assert len(seen) == 1 and len(seen[0]) == 1 and seen[0][0].startswith(".removing-new-")
+    assert os.listdir(directory / "maps") == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import pytest
 from service.commands import bulk
 from service.commands.bulk import Outcome, enrol_frames
 from service.commands.client import Refused, Service
+from service.commands.console import Failure
 from service.commands.manifest import Frame
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 from tests.service.test_succession import order
+from tests.service.upkeeping import wait_until
 
 
 def problem(status: int, slug: str, **headers: str) -> httpx.Response:
@@ -126,3 +129,31 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, t
     # The same again goes on.
     enrol(server, map_id, tmp_path, 40, Mischief({}))
     assert order(server, map_id) == [f"p{index}" for index in range(40)]
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("moment", [13, 30])
+def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    monkeypatch.setattr(bulk, "PATIENCE", 0.0)
+    server = Server(tmp_path / "service").wait()
+    server.create_map("walk")
+    way, ended = Mischief({}), list[BaseException]()
+
+    def send() -> None:
+        try:
+            enrol(server, "walk", tmp_path, 160, way)
+        except Failure as error:
+            ended.append(error)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    wait_until(lambda: len(way.sent) >= moment)
+    server.kill()
+    sender.join(60)
+    assert len(ended) == 1
+    server = Server(tmp_path / "service").wait()
+    kept = order(server, "walk")
+    assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 160
+    enrol(server, "walk", tmp_path, 160, Mischief({}))
+    assert order(server, "walk") == [f"p{index}" for index in range(160)]
+    assert server.stop() == 0
