@@ -11,6 +11,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, MutableMapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from typing import TypeVar
 
@@ -71,10 +72,29 @@ def share_cores(threads: int) -> None:
     keep_numpy_single_threaded()
 
 
-def _compute_alone() -> None:
-    """Let this thread compute by itself: the others of its pool have the other cores."""
+def keep_to(number: int | None) -> None:
+    """Let this thread run on one core of the process's, or on any of them; where the system lets us say so.
+
+    Args:
+        number: of the core, from 0 on and counted round; None: any, also where this thread was begun by one that keeps
+            to a core, which it would otherwise share.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError):
+            every = sorted(os.sched_getaffinity(os.getpid()))
+            os.sched_setaffinity(0, every if number is None else [every[number % len(every)]])
+
+
+def compute_alone(number: int | None = None) -> None:
+    """Let this thread compute by itself: others have the other cores.
+
+    Args:
+        number: from 0 on, of this thread among those of which each has a core of its own from now on. Left to itself, a
+            system leaves two threads on one core for milliseconds while another core is idle.
+    """
     import torch
 
+    keep_to(number)
     torch.get_num_threads()  # torch settles a thread's number at its first use, and would undo what follows
     for library in ThreadpoolController().lib_controllers:
         if library.user_api == "openmp":
@@ -83,7 +103,7 @@ def _compute_alone() -> None:
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, "core", _compute_alone)
+    return ThreadPoolExecutor(threads, "core", compute_alone)
 
 
 def in_turns(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 from core.position import PoseEstimate
 from core.storage import Map
@@ -15,7 +16,7 @@ from service.schemas.queries import EstimatedPose, Match, QueryAnswer
 from service.selection import Selection
 
 MOST_AHEAD = 4000
-"""Places of a map that is searched in the encoder's thread, in some milliseconds."""
+"""Places of a map that is searched where frames are encoded, in some milliseconds."""
 
 
 async def answer_queries(
@@ -41,17 +42,27 @@ async def answer_queries(
     return answers
 
 
-def search_ahead(map_: Map, k: int, selection: Selection | None) -> Callable[[Encoded], list[Located] | None] | None:
-    """The search for a frame, to be done where it was encoded; None where other frames might wait long for it."""
+@dataclass(frozen=True)
+class SearchAhead:
+    """The search for frames in a map, to be done where they were encoded; equal ones are done together."""
+
+    map_: Map
+    k: int
+
+    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Located] | None]:
+        """What was located of each frame; None for those that are searched for in their own place."""
+        seen = [one for one in encoded if len(one.encoding.regions)]
+        if not seen or not self.map_.snapshot().holds:  # what is not in memory comes from the disk
+            return [None] * len(encoded)
+        found = iter(locate(self.map_, seen[0].encoder, [one.encoding for one in seen], self.k))
+        return [[next(found)] if len(one.encoding.regions) else None for one in encoded]
+
+
+def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
+    """The search for a frame where it was encoded; None where other frames might wait long for it."""
     if selection is not None or map_.count_places() > MOST_AHEAD:
         return None
-
-    def search(encoded: Encoded) -> list[Located] | None:
-        if not map_.snapshot().holds or not len(encoded.encoding.regions):  # what is not in memory comes from the disk
-            return None
-        return locate(map_, encoded.encoder, [encoded.encoding], k)
-
-    return search
+    return SearchAhead(map_, k)
 
 
 def count_answer(engine: Engine, map_: Map, answer: QueryAnswer) -> None:

@@ -6,7 +6,7 @@ import asyncio
 import gc
 import logging
 import time
-from collections.abc import AsyncGenerator, Callable, Iterator, Sequence
+from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 
 from anyio import to_thread
@@ -22,7 +22,7 @@ from service.blocking import in_thread as in_thread
 from service.exports import Exports
 from service.faults import EncoderNotInstalled, NotReady
 from service.imports import Imports
-from service.inference import Encoded, Inference, Outcomes, Patience
+from service.inference import Encoded, Inference, Outcomes, Patience, Then
 from service.jobs import Jobs
 from service.metrics import MapCollector, Metrics
 from service.pictures import Pictures
@@ -219,7 +219,7 @@ class Engine:
         data: bytes,
         patience: Patience,
         mask: Mask | None = None,
-        then: Callable[[Encoded], object] | None = None,
+        then: Then | None = None,
     ) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``inference.place_in_queue``.
 

@@ -15,17 +15,17 @@ from core.encoder import Encoder
 from core.encoders import EncoderCatalogue
 from core.images import Limits
 from core.masks import Mask
-from core.threads import share_cores
+from core.threads import cores, share_cores
 from service.faults import ClientGone, QueueFull
 from service.metrics import Metrics
-from service.microbatches import MOST_FRAMES, Encoded, MicroBatches, Turn, late
+from service.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then, Turn, late
 
-__all__ = ["Encoded", "Inference", "Outcomes", "Patience"]
+__all__ = ["Encoded", "Inference", "Outcomes", "Patience", "Then"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
 """What became of some frames of many, each with its index."""
 
-AHEAD = 2 * MOST_FRAMES
+AHEAD = 2 * MOST_FRAMES * max(2, cores())
 """Frames of one bulk request that wait at a time: enough that the encoder never waits for it."""
 
 
@@ -125,7 +125,7 @@ class Inference:
         data: bytes,
         patience: Patience,
         mask: Mask | None = None,
-        then: Callable[[Encoded], object] | None = None,
+        then: Then | None = None,
     ) -> Encoded:
         """Decode and encode one frame when its turn comes; call it within ``place_in_queue``.
 
@@ -184,7 +184,7 @@ class Inference:
         try:
             while begun < len(frames) or open_:
                 following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
-                turns = [Turn(identity, frames[i], hidden[i], patience.deadline, bulk) for i in following]
+                turns = [Turn(identity, frames[i], hidden[i], patience.deadline, bulk, asks=False) for i in following]
                 self._batches.put(turns)
                 open_ |= {asyncio.wrap_future(turn.result): (i, turn) for i, turn in zip(following, turns, strict=True)}
                 begun = following.stop

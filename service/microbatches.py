@@ -1,18 +1,21 @@
-"""The encoder's thread: frames that wait together are encoded together, a few to a forward pass and a pass to a core.
+"""The encoder's threads: frames that wait together are encoded together, a few to a forward pass and a pass to a core.
 
-It never waits for company: a frame that comes while the encoder is free is begun at once, alone.  Those that
-come meanwhile are the next batch, so that batches grow with the load and shrink with it again.
+They never wait for company: a frame that comes while nothing is encoded is begun at once, alone and with all cores.
+Those that come meanwhile are taken by the cores, each of which takes the next few when it has done its last:
+passes grow with the load and shrink with it again, and no core waits for another.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -23,23 +26,23 @@ from core.errors import InvalidImage
 from core.images import Limits, decode, read_header
 from core.masks import Mask
 from core.preprocessing import Pixels
-from core.threads import cores, each
+from core.threads import compute_alone, cores, each
 from service.faults import DeadlineExceeded
 
 Result = TypeVar("Result")
 
-MOST_FRAMES = FRAMES_A_PASS * max(2, cores())
-"""Frames of one batch: so many that each core has a forward pass of its own and of full size. More would gain nothing,
-and keep those who come next waiting for longer."""
+MOST_FRAMES = FRAMES_A_PASS
+"""Frames of one batch, which one core encodes with one forward pass. More would gain nothing, and keep those who come
+next waiting for longer."""
 
-MOST_BULK = MOST_FRAMES // 2
+MOST_BULK = max(1, MOST_FRAMES // 2)
 """The same where all frames are of bulk requests, so that a robot's frame comes in between soon …"""
 
 QUIET_SECONDS = 5.0
 """… unless no robot has asked for so long."""
 
 MOST_PIXELS = 40_000_000
-"""Pixels of all frames of a batch of more than one: it bounds the memory of what is decoded at one time."""
+"""Pixels of all frames at work, where they are more than one: it bounds the memory of what is decoded at one time."""
 
 BULK_SHARE = 4
 """One frame in so many of a batch is kept for bulk requests, which would otherwise wait for as long as robots ask."""
@@ -53,7 +56,7 @@ class Encoded:
 
     pixels: H x W x 3 uint8, BGR.
     milliseconds: of ``wait`` (in the queue), ``decode``, ``forward`` (its share), ``regions``, ``vlad``.
-    followed: what the turn's ``then`` gave; None where it was not called, or failed.
+    followed: what the turn's ``then`` gave for it; None where it was not called, or failed.
     """
 
     pixels: Pixels
@@ -67,14 +70,19 @@ class Encoded:
         return replace(self, pixels=np.zeros((0, 0, 3), np.uint8))
 
 
+Then = Callable[[Sequence[Encoded]], Sequence[object]]
+"""What is to be done with frames that were encoded together; gives something for each."""
+
+
 @dataclass(eq=False)
 class Turn:
     """One frame that waits for the encoder, with the bytes of its file; cancel ``result`` to give it up.
 
     deadline: ``time.monotonic`` after which it is not begun any more.
     bulk: it is one of many of its request, and may wait longer than a robot's one frame.
-    then: may be called with the encoded frame in the encoder's thread, where nobody waits for that: it spares who
-        asks alone the way through two more threads.  It is to take milliseconds.
+    asks: a robot asks by it where it is, and will most likely ask again soon.
+    then: may be called where the frame was encoded, with all frames of the same batch whose ``then`` is equal to it: it
+        spares who asks the way through two more threads.  It is to take milliseconds, and must be hashable.
     """
 
     identity: str
@@ -82,32 +90,34 @@ class Turn:
     mask: Mask | None
     deadline: float
     bulk: bool = False
-    then: Callable[[Encoded], object] | None = None
+    asks: bool = True
+    then: Then | None = None
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
 
+    @cached_property
     def pixels(self) -> int:
         """How many the frame has by its header; 0 where that cannot be read, which will show."""
         try:
             header = read_header(self.data)
-        except Exception:  # of whatever kind: the encoder's thread has to live on
+        except Exception:  # of whatever kind: the encoder's threads have to live on
             return 0
         return header.width * header.height
 
 
 @dataclass(eq=False)
 class _Errand(Generic[Result]):
-    """Something else for the encoder's thread to do."""
+    """Something else for the encoder's thread to do, while no frame is encoded."""
 
     work: Callable[[], Result]
     result: Future[Result] = field(default_factory=Future)
 
 
 class MicroBatches:
-    """Queue and thread.
+    """Queue and threads: one that has all cores, for a frame alone, and others of which each has a core of its own.
 
     Args:
-        load: gives the encoder of an identity; called in the thread.
+        load: gives the encoder of an identity; called in a thread of them.
         limits: of a frame.
         observe: is told the number of frames of each batch.
     """
@@ -118,46 +128,86 @@ class MicroBatches:
         self._robots: deque[Turn] = deque()
         self._bulk: deque[Turn] = deque()
         self._passed_over = 0  # batches since a bulk request's encoder had its turn
-        self._robot_asked = -QUIET_SECONDS  # time.monotonic
+        self._robot_asked = -math.inf  # time.monotonic
         self._closed = False
-        self._changed = threading.Condition()
-        self._thread = threading.Thread(target=self._run, name="encoder", daemon=True)
-        self._thread.start()
+        self._known: set[str] = set()  # identities of encoders that were loaded
+        self._has_all = False  # the thread that has all cores is at work, and no other
+        self._at_work = self._pixels = 0  # threads with a core of their own, and what they are at
+        self._changed = threading.Lock()
+        self._for_all, self._for_one = threading.Condition(self._changed), threading.Condition(self._changed)
+        threads = torch.get_num_threads()
+        self._cores = threads if threads > 1 else 0
+        self._threads = [threading.Thread(target=self._run, name="encoder", daemon=True)]
+        for number in range(self._cores):
+            arguments = (number if threads == cores() else None,)
+            one = threading.Thread(target=self._run_on_core, args=arguments, name=f"encoder-{number}", daemon=True)
+            self._threads.append(one)
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
-        """Drop what waits, and end the thread when it has finished what it is at."""
+        """Drop what waits, and end the threads when they have finished what they are at."""
         with self._changed:
             self._closed = True
             waiting: list[Turn | _Errand[Any]] = [*self._errands, *self._robots, *self._bulk]
             for queue in (self._errands, self._robots, self._bulk):
                 queue.clear()
-            self._changed.notify()
+            self._for_all.notify_all()
+            self._for_one.notify_all()
         for one in waiting:
             one.result.cancel()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
     def put(self, turns: Iterable[Turn]) -> None:
         """Let frames wait for their turn; those of one kind keep their order."""
+        known = [(turn, turn.pixels) for turn in turns]  # their headers are read here, where nobody waits for it
         with self._changed:
-            for turn in turns:
+            for turn, _ in known:
                 if self._closed:
                     turn.result.cancel()
                 elif turn.bulk:
                     self._bulk.append(turn)
                 else:
                     self._robots.append(turn)
-                    self._robot_asked = time.monotonic()
-            self._changed.notify()
+                    self._robot_asked = time.monotonic() if turn.asks else self._robot_asked
+            self._wake()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
-        """Let the thread do something else before the next batch."""
+        """Let the thread that has all cores do something else before the next frame."""
         errand = _Errand(work)
         with self._changed:
             if self._closed:
                 errand.result.cancel()
             self._errands.append(errand)
-            self._changed.notify()
+            self._wake()
         return errand.result
+
+    # Whose turn it is
+
+    def _is_for_all(self) -> bool:
+        """Whether the thread that has all cores is to do what is next: errands, a frame alone, an unknown encoder."""
+        if self._has_all or self._at_work:
+            return False
+        count = len(self._robots) + len(self._bulk)
+        return bool(self._errands) or count == 1 or (count > 1 and (not self._cores or not self._knows_encoders()))
+
+    def _is_for_one(self) -> bool:
+        """Whether one more of the others is to take frames."""
+        count = len(self._robots) + len(self._bulk)
+        if not count or self._has_all or self._errands or self._at_work == self._cores:
+            return False
+        return (self._at_work > 0 or count > 1) and self._knows_encoders()
+
+    def _knows_encoders(self) -> bool:
+        return all(queue[0].identity in self._known for queue in (self._robots, self._bulk) if queue)
+
+    def _wake(self) -> None:
+        """Wake who is to do what is next, if anyone is and sleeps."""
+        if self._is_for_all():
+            self._for_all.notify()
+        elif self._is_for_one():
+            self._for_one.notify()
 
     def _run(self) -> None:
         while (work := self._next()) is not None:
@@ -167,35 +217,66 @@ class MicroBatches:
                 self._encode(work)
 
     def _next(self) -> _Errand[Any] | list[Turn] | None:
-        """What to do now; waits for it; None at the end."""
+        """What to do now with all cores; waits for it; None at the end."""
         with self._changed:
-            while not (self._closed or self._errands or self._robots or self._bulk):
-                self._changed.wait()
+            self._has_all = False
+            while not (self._closed or self._is_for_all()):
+                self._wake()
+                self._for_all.wait()
             if self._closed:
                 return None
+            self._has_all = True
             if self._errands:
                 errand = self._errands.popleft()
                 return errand if errand.result.set_running_or_notify_cancel() else []
-            return self._take()
+            return self._take(MOST_FRAMES)
 
-    def _take(self) -> list[Turn]:
+    def _run_on_core(self, number: int | None) -> None:
+        compute_alone(number)
+        done: list[Turn] = []
+        while done := self._next_on_core(done):
+            self._encode(done)
+
+    def _next_on_core(self, done: Sequence[Turn]) -> list[Turn]:
+        """The next batch for one core, an equal share for each that is free; waits for it; empty at the end."""
+        with self._changed:
+            if done:
+                self._at_work -= 1
+                self._pixels -= sum(turn.pixels for turn in done)
+            while not self._closed:
+                taken: list[Turn] = []
+                if self._is_for_one():
+                    count = len(self._robots) + len(self._bulk)
+                    taken = self._take(-(-count // (self._cores - self._at_work)))
+                if taken:
+                    self._at_work += 1
+                    self._pixels += sum(turn.pixels for turn in taken)
+                if taken or not self._is_for_one():  # what does not fit beside what is at work waits for its end
+                    self._wake()
+                if taken:
+                    return taken
+                self._for_one.wait()
+            return []
+
+    def _take(self, share: int) -> list[Turn]:
         """The next batch: frames of one encoder, that of whoever is first; robots before bulk, which keeps a share."""
         first, most = self._first()
+        most = min(most, share)
         kept = most // BULK_SHARE if self._robots and self._bulk else 0
         taken: list[Turn] = []
-        pixels = 0
+        pixels = self._pixels
         for queue, limit in ((self._robots, most - kept), (self._bulk, most)):
             passed: list[Turn] = []
             while queue and len(taken) < limit:
                 turn = queue.popleft()
                 if turn.identity != first.identity:
                     passed.append(turn)
-                elif taken and pixels + turn.pixels() > MOST_PIXELS:
+                elif (taken or self._at_work) and pixels + turn.pixels > MOST_PIXELS:
                     passed.append(turn)
                     break
                 elif turn.result.set_running_or_notify_cancel():
                     taken.append(turn)
-                    pixels += turn.pixels()
+                    pixels += turn.pixels
             queue.extendleft(reversed(passed))
         return taken
 
@@ -231,6 +312,7 @@ class MicroBatches:
             return
         began = time.perf_counter()
         encoder = self._load(batch[0].identity)
+        self._known.add(batch[0].identity)
         decoded = each(self._decode, batch, torch.get_num_threads())
         shown: list[tuple[Turn, Pixels, float]] = []
         for turn, (pixels, spent) in zip(batch, decoded, strict=True):
@@ -241,22 +323,29 @@ class MicroBatches:
         outcomes = _encode_frames(encoder, [pixels for _, pixels, _ in shown], [turn.mask for turn, _, _ in shown])
         if shown:
             self._observe(len(shown))
+        made: list[tuple[Turn, Encoded]] = []
         for (turn, pixels, spent), outcome in zip(shown, outcomes, strict=True):
             if isinstance(outcome, Exception):
                 turn.result.set_exception(outcome)
                 continue
             times = {"wait": 1e3 * (began - turn.queued), "decode": spent, **outcome.milliseconds}
-            encoded = Encoded(pixels, outcome, encoder, times)
-            turn.result.set_result(self._follow(turn, encoded) if len(batch) == 1 else encoded)
+            made.append((turn, Encoded(pixels, outcome, encoder, times)))
+        for turn, encoded in self._followed(made):
+            turn.result.set_result(encoded)
 
-    def _follow(self, turn: Turn, encoded: Encoded) -> Encoded:
-        """Go on with what is to come next, unless someone waits for the encoder."""
-        if turn.then is None or self._robots or self._bulk or self._errands:
-            return encoded
-        try:
-            return replace(encoded, followed=turn.then(encoded))
-        except Exception:  # it is done once more in its own place, and told there
-            return encoded
+    def _followed(self, made: list[tuple[Turn, Encoded]]) -> list[tuple[Turn, Encoded]]:
+        """Go on with what is to come next, unless that would keep other cores from someone who waits."""
+        if self._has_all and self._cores and (self._robots or self._bulk or self._errands):
+            return made
+        after: dict[int, object] = {}
+        for then in {turn.then for turn, _ in made if turn.then is not None}:
+            group = [(turn, encoded) for turn, encoded in made if turn.then == then]
+            try:
+                given = then([encoded for _, encoded in group])
+                after |= {id(turn): what for (turn, _), what in zip(group, given, strict=True)}
+            except Exception:  # it is done once more in its own place, and told there
+                continue
+        return [(turn, replace(encoded, followed=after.get(id(turn)))) for turn, encoded in made]
 
     def _decode(self, turn: Turn) -> tuple[Pixels | Exception, float]:
         """The pixels of a frame or why there are none, and milliseconds."""

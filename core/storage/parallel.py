@@ -8,7 +8,7 @@ from functools import cache
 from threading import Barrier
 from typing import TypeVar
 
-from core.threads import cores, in_turns
+from core.threads import cores, in_turns, keep_to
 
 Part = TypeVar("Part")
 
@@ -17,7 +17,7 @@ Part = TypeVar("Part")
 def threads() -> tuple[ThreadPoolExecutor, int]:
     """The threads, and how many they are."""
     count = cores()
-    pool = ThreadPoolExecutor(count, thread_name_prefix="search")
+    pool = ThreadPoolExecutor(count, "search", keep_to, (None,))
     # All of them at once and now: a thread is as nice as the one that first needed it, and cannot be made less so.
     begun = Barrier(count)
     for _ in range(count):

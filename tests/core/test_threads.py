@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from threadpoolctl import ThreadpoolController
 
-from core.threads import SPINS, cores, each, share_cores, wait_briefly
+from core.threads import SPINS, compute_alone, cores, each, share_cores, wait_briefly
 
 
 @pytest.mark.parametrize(
@@ -81,3 +83,23 @@ def test_threads_are_shared_out() -> None:
     finally:
         share_cores(before)
     assert 1 <= cores() <= 4096
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="others do not let a thread keep to a core")
+def test_a_thread_keeps_to_its_core_and_what_it_begins_does_not() -> None:
+    every = sorted(os.sched_getaffinity(0))
+
+    def begins(number: int | None) -> tuple[set[int], int, set[int]]:
+        with ThreadPoolExecutor(1, initializer=compute_alone, initargs=(number,)) as outer:
+            own = outer.submit(lambda: (os.sched_getaffinity(0), torch.get_num_threads())).result()
+
+            def begin() -> set[int]:
+                with ThreadPoolExecutor(1, initializer=compute_alone) as inner:
+                    return inner.submit(os.sched_getaffinity, 0).result()
+
+            return *own, outer.submit(begin).result()
+
+    for number in range(len(every) + 1):
+        assert begins(number) == ({every[number % len(every)]}, 1, set(every))
+    assert begins(None) == (set(every), 1, set(every))
+    assert os.sched_getaffinity(0) == set(every)
