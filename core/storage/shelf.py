@@ -8,10 +8,7 @@ not the end of the process, and what the system keeps of the files counts as its
 from __future__ import annotations
 
 import os
-import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -37,7 +34,7 @@ class Shelf:
 
     def __init__(self, folder: Path, layout: Layout) -> None:
         """Of the map in ``folder``; no file is opened yet."""
-        self._folder = folder
+        self._folder, self._path = folder, os.path.join(folder, "")
         self._layout = layout
         record = layout.record
         assert record.fields is not None
@@ -62,11 +59,14 @@ class Shelf:
 
     def check(self, number: int, rows: int) -> None:
         """Is the file of a segment there, with its header, and long enough for so many rows?"""
-        with self._opened(number) as file:
+        file = self._open(number)
+        try:
             check_header(self._folder / segment_name(number), os.pread(file, HEADER_BYTES, 0), self._layout, number)
             found = (os.fstat(file).st_size - HEADER_BYTES) // self._layout.record.itemsize
-            if found < rows:
-                raise Damage(f"{segment_name(number)}: the file ends after {found} of {rows} rows")
+        finally:
+            os.close(file)
+        if found < rows:
+            raise Damage(f"{segment_name(number)}: the file ends after {found} of {rows} rows")
 
     def descriptors(self, rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D]."""
@@ -81,64 +81,69 @@ class Shelf:
         """The local descriptors of rows: int8 [k, C, L]."""
         if self._layout.local_shape == NO_LOCAL:
             return np.empty((len(rows), *NO_LOCAL), np.int8)
-        start, dtype = self._last
-        found = self._read(rows, start, dtype)
-        for position, row in enumerate(rows.tolist()):
-            self._check(found[position], row, int(checksums[position]), "local")
-        return self._layout.locals_of(found)
+        return self._layout.locals_of(self._checked(self._last, rows, checksums, "local"))
 
     def _first_parts(self, rows: Rows, checksums: Checksums) -> NDArray[np.void]:
-        start, dtype = self._first
-        found = self._read(rows, start, dtype)
-        for position, row in enumerate(rows.tolist()):
-            self._check(found[position], row, int(checksums[position]), "descriptor")
+        return self._checked(self._first, rows, checksums, "descriptor")
+
+    def _checked(
+        self, part: tuple[int, np.dtype[np.void]], rows: Rows, checksums: Checksums, name: str
+    ) -> NDArray[np.void]:
+        """Parts of records, each that of its row, whole, and of the frame that SQLite names."""
+        found = self._read(rows, *part)
+        whole = self._sound(found, rows, name)
+        stated = found["checksum"].tolist()
+        for row, named, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
+            where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
+            if not sound:
+                raise Damage(f"{where} does not match its checksum")
+            if named and named != checksum:
+                raise Damage(f"{where} is of another frame")
         return found
 
-    def _check(self, part: np.void, row: int, named: int, name: str) -> None:
-        """Is it that of ``row``, whole, and of the frame that SQLite names?"""
-        where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
+    def _sound(self, found: NDArray[np.void], rows: Rows, name: str) -> list[bool]:
+        """Whether each is that of its row and passes its checksums, as far as they are of ``name``."""
         if self._layout.precision == FULL:
-            sound = self._layout.is_sound(part, row)
-        else:
-            sums = int(part["of_descriptor"]), int(part["of_local"])
-            content = zlib.crc32(np.ascontiguousarray(part[name]).data)
-            own = sums[0] if name == "descriptor" else sums[1]
-            sound = (
-                int(part["row"]) == row
-                and zlib.crc32(struct.pack("<Q", row), content) == own
-                and zlib.crc32(struct.pack("<II", *sums)) == int(part["checksum"])
-            )
-        if not sound:
-            raise Damage(f"{where} does not match its checksum")
-        if named and named != int(part["checksum"]):
-            raise Damage(f"{where} is of another frame")
+            return [self._layout.is_sound(part, row) for part, row in zip(found, rows.tolist(), strict=True)]
+        fields = found.dtype.fields
+        assert fields is not None
+        part, row, sums = (fields[field][1] for field in (name, "row", "of_descriptor"))
+        size, length = found.dtype.itemsize, found.dtype[name].itemsize
+        content = found.view(np.uint8).reshape(-1).data
+        own, both = found[f"of_{name}"].tolist(), found["checksum"].tolist()
+        sound = []
+        for i, stated in enumerate((found["row"] == rows).tolist()):
+            record = content[i * size : (i + 1) * size]
+            its = zlib.crc32(record[row : row + 8], zlib.crc32(record[part : part + length]))
+            sound.append(stated and its == own[i] and zlib.crc32(record[sums : sums + 8]) == both[i])
+        return sound
 
     def _read(self, rows: Rows, start: int, dtype: np.dtype[Any]) -> NDArray[np.void]:
         """Bytes start … of the records of rows, in the order of the rows."""
         layout, order = self._layout, np.argsort(rows, kind="stable").tolist()
         found = np.empty(len(rows), dtype)
-        whole = found.view(np.uint8).reshape(len(rows), dtype.itemsize)
+        size, stride = dtype.itemsize, layout.record.itemsize
+        content = found.view(np.uint8).reshape(-1).data
         places = [(position, *divmod(int(rows[position]), layout.rows_per_segment)) for position in order]
         for number, group in groupby(places, key=lambda place: place[1]):
-            stride = layout.record.itemsize
-            wanted = [(position, HEADER_BYTES + offset * stride + start) for position, _, offset in group]
-            with self._opened(number) as file:
-                for _, at in wanted:  # the disk may fetch all of them at once
-                    os.posix_fadvise(file, at, dtype.itemsize, os.POSIX_FADV_WILLNEED)
-                for position, at in wanted:
-                    if os.preadv(file, [whole[position].data], at) < dtype.itemsize:
-                        row = int(rows[position])
+            wanted = [(position * size, HEADER_BYTES + offset * stride + start) for position, _, offset in group]
+            file = self._open(number)
+            try:
+                if len(wanted) > 1:
+                    for _, at in wanted:  # the disk may fetch all of them at once
+                        os.posix_fadvise(file, at, size, os.POSIX_FADV_WILLNEED)
+                for to, at in wanted:
+                    if os.preadv(file, [content[to : to + size]], at) < size:
+                        row = int(rows[to // size])
                         raise Damage(f"{segment_name(number)}: the file ends before row {row}")
+            finally:
+                os.close(file)
         return found
 
-    @contextmanager
-    def _opened(self, number: int) -> Iterator[int]:
-        path = self._folder / segment_name(number)
+    def _open(self, number: int) -> int:
+        """The file of a segment; to be closed."""
+        path = f"{self._path}{segment_name(number)}"
         try:
-            file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+            return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except FileNotFoundError as error:
-            raise missing(path, error) from error
-        try:
-            yield file
-        finally:
-            os.close(file)
+            raise missing(Path(path), error) from error

@@ -45,7 +45,7 @@ SHORTLIST = 100
 
 _PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
 _SHARE = 2  # one of two cores takes nearly all of the memory's speed, and the other has frames to encode
-_PART_ROWS = 32  # of rows that one thread reads from the shelf at a time
+_PART_ROWS = 25  # that one thread reads from the shelf at a time
 
 
 @dataclass(frozen=True, eq=False)
