@@ -14,8 +14,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -35,7 +35,7 @@ MOST_FRAMES = FRAMES_A_PASS
 """Frames of one batch, which one core encodes with one forward pass. More would gain nothing, and keep those who come
 next waiting for longer."""
 
-MOST_BULK = max(1, MOST_FRAMES // 2)
+MOST_BULK = MOST_FRAMES // 2
 """The same where all frames are of bulk requests, so that a robot's frame comes in between soon …"""
 
 QUIET_SECONDS = 5.0
@@ -81,6 +81,7 @@ class Turn:
     deadline: ``time.monotonic`` after which it is not begun any more.
     bulk: it is one of many of its request, and may wait longer than a robot's one frame.
     asks: a robot asks by it where it is, and will most likely ask again soon.
+    pixels: how many the frame has by its header, which is read where nobody waits for it; 0 where it cannot be.
     then: may be called where the frame was encoded, with all frames of the same batch whose ``then`` is equal to it: it
         spares who asks the way through two more threads.  It is to take milliseconds, and must be hashable.
     """
@@ -94,15 +95,12 @@ class Turn:
     then: Then | None = None
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
+    pixels: int = field(init=False, default=0)
 
-    @cached_property
-    def pixels(self) -> int:
-        """How many the frame has by its header; 0 where that cannot be read, which will show."""
-        try:
+    def __post_init__(self) -> None:
+        with suppress(Exception):  # of whatever kind: it will show
             header = read_header(self.data)
-        except Exception:  # of whatever kind: the encoder's threads have to live on
-            return 0
-        return header.width * header.height
+            self.pixels = header.width * header.height
 
 
 @dataclass(eq=False)
@@ -161,9 +159,8 @@ class MicroBatches:
 
     def put(self, turns: Iterable[Turn]) -> None:
         """Let frames wait for their turn; those of one kind keep their order."""
-        known = [(turn, turn.pixels) for turn in turns]  # their headers are read here, where nobody waits for it
         with self._changed:
-            for turn, _ in known:
+            for turn in turns:
                 if self._closed:
                     turn.result.cancel()
                 elif turn.bulk:
@@ -244,17 +241,15 @@ class MicroBatches:
                 self._at_work -= 1
                 self._pixels -= sum(turn.pixels for turn in done)
             while not self._closed:
-                taken: list[Turn] = []
                 if self._is_for_one():
                     count = len(self._robots) + len(self._bulk)
-                    taken = self._take(-(-count // (self._cores - self._at_work)))
-                if taken:
-                    self._at_work += 1
-                    self._pixels += sum(turn.pixels for turn in taken)
-                if taken or not self._is_for_one():  # what does not fit beside what is at work waits for its end
+                    if taken := self._take(-(-count // (self._cores - self._at_work))):
+                        self._at_work += 1
+                        self._pixels += sum(turn.pixels for turn in taken)
+                        self._wake()
+                        return taken
+                if not self._is_for_one():  # what does not fit beside what is at work waits for its end
                     self._wake()
-                if taken:
-                    return taken
                 self._for_one.wait()
             return []
 

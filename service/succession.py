@@ -48,7 +48,7 @@ class Succession:
         try:
             yield sequel
         except BaseException:
-            sequel.leave()
+            sequel.reach(None)
             raise
         sequel.reach(Stage.STORED)
 
@@ -82,15 +82,10 @@ class Sequel:
         self._line, self._patience = line, patience
         self._map_id, self._batch, self._after = map_id, batch, after
 
-    def reach(self, stage: Stage) -> None:
-        """Tell those behind how far this batch has come."""
+    def reach(self, stage: Stage | None) -> None:
+        """Tell those behind how far this batch has come; None: it ends here, and is not stored."""
         if self._batch is not None:
             self._line.change(self._map_id, self._batch, stage)
-
-    def leave(self) -> None:
-        """Tell them that it is not stored."""
-        if self._batch is not None:
-            self._line.change(self._map_id, self._batch, None)
 
     async def wait_for(self, stage: Stage) -> None:
         """Wait until the batch before, if there is one, has come so far.

@@ -94,11 +94,9 @@ class Shelf:
         whole = self._sound(found, rows, name)
         stated = found["checksum"].tolist()
         for row, named, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
-            where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
-            if not sound:
-                raise Damage(f"{where} does not match its checksum")
-            if named and named != checksum:
-                raise Damage(f"{where} is of another frame")
+            if not sound or (named and named != checksum):
+                where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
+                raise Damage(f"{where} {'is of another frame' if sound else 'does not match its checksum'}")
         return found
 
     def _sound(self, found: NDArray[np.void], rows: Rows, name: str) -> list[bool]:

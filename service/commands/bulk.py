@@ -118,7 +118,7 @@ class _Sender:
             if item is not None and item.get("problem", {}).get("type", "").endswith(":frame-needed"):
                 needed.add(one.frame.id)
             else:
-                self._tell(self._outcome(one, item, uploaded=False))
+                self._tell(_outcome(one, item, uploaded=False))
         return needed
 
     async def send_all(self, frames: Sequence[Frame]) -> None:
@@ -163,7 +163,7 @@ class _Sender:
         """Send a batch, to be stored after the one before; in halves if it is more than the service takes at a time."""
         order = {"batch": name} if before is None else {"batch": name, "after": before.name}
         try:
-            return [self._outcome(one, item, uploaded=True) for one, item in await self._post(batch, order)]
+            return [_outcome(one, item, uploaded=True) for one, item in await self._post(batch, order)]
         except Refused as refused:
             if before is not None:
                 # Whatever it is, the one before comes first; if that fails, this one is of no interest.
@@ -180,13 +180,6 @@ class _Sender:
             self._most = self._batch = half
             first = await self._send(batch[:half], secrets.token_hex(8))
             return first + await self._send(batch[half:], name)
-
-    def _outcome(self, one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome:
-        if item is None:
-            return Outcome(one.frame, None, refusal=one.refusal, uploaded=False)
-        if "problem" in item:
-            return Outcome(one.frame, None, refusal=item["problem"]["detail"], uploaded=uploaded)
-        return Outcome(one.frame, item["change"], posed=one.posed, uploaded=uploaded)
 
     async def _post(
         self, batch: Sequence[_Read], order: Mapping[str, str] | None = None
@@ -208,6 +201,15 @@ class _Sender:
             )
             items = dict(zip((one.frame.id for one in sent), response.json()["items"], strict=True))
         return [(one, items.get(one.frame.id)) for one in batch]
+
+
+def _outcome(one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome:
+    """What the service said of a frame, None where it was not sent, as callers hear it."""
+    if item is None:
+        return Outcome(one.frame, None, refusal=one.refusal, uploaded=False)
+    if "problem" in item:
+        return Outcome(one.frame, None, refusal=item["problem"]["detail"], uploaded=uploaded)
+    return Outcome(one.frame, item["change"], posed=one.posed, uploaded=uploaded)
 
 
 def _read(frame: Frame, digest: bool = False) -> _Read:

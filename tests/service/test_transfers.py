@@ -22,6 +22,7 @@ from tests.core.storage.archives.files import Parts, changed, line_changed, name
 from tests.service.encoders import install_coarse_encoder
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
+from tests.service.upkeeping import wait_until
 
 TAR = {"Content-Type": "application/x-tar"}
 _ids = itertools.count()
@@ -271,7 +272,7 @@ def test_as_a_job(server: Server, source: str, content: bytes) -> None:
     failed = server.client.get(f"{bad.headers['location']}?wait=30").json()
     assert failed["state"] == "failed" and failed["problem"]["type"] == "urn:placerec:problem:invalid-archive"
     assert_problem(bring(server, content, name, background="true"), 409, "map-exists")
-    _until(lambda: staged(server) == [])
+    wait_until(lambda: staged(server) == [])
 
 
 MANY = 8_000
@@ -314,10 +315,10 @@ def test_killed_at_every_stage(apart: Path) -> None:
     _limits(server)
     job = bring(server, content, "by-job", background="true").headers["location"]
     making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
-    _until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
+    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
     arriving = begun(server, "/v1/maps/import?id=arriving", len(content), content[: len(content) // 2])
-    _until(lambda: any(server.data_dir.glob("imports/.*")))
-    _until(lambda: server.client.get(job).json()["progress"]["done"] > 200)
+    wait_until(lambda: any(server.data_dir.glob("imports/.*")))
+    wait_until(lambda: server.client.get(job).json()["progress"]["done"] > 200)
     assert server.client.get("/v1/maps").json()["items"] == []
     assert_problem(server.client.post("/v1/maps", json={"id": "by-request"}), 409, "map-exists")
     second = bring(server, content, "second")
@@ -337,10 +338,10 @@ def test_killed_at_every_stage(apart: Path) -> None:
     assert server.client.get("/v1/maps/by-job").json()["places"] == MANY
     # Cancelled, nothing is left.
     other = bring(server, content, "other", background="true").headers["location"]
-    _until(lambda: server.client.get(other).json()["progress"]["done"] > 200)
+    wait_until(lambda: server.client.get(other).json()["progress"]["done"] > 200)
     assert server.client.post(f"{other}/cancel").status_code == 200
     assert server.client.get(f"{other}?wait=30").json()["state"] == "cancelled"
-    _until(lambda: staged(server) == [])
+    wait_until(lambda: staged(server) == [])
     assert server.client.get("/v1/maps/other").status_code == 404
     with tempfile.NamedTemporaryFile() as file:
         file.write(export(server, "by-job").content)
@@ -361,15 +362,8 @@ def _limits(server: Server) -> None:
     assert export(server, "a", if_match=tag).status_code == 200
     assert server.enrol("a", "p", jpeg(1)).status_code == 201
     assert export(server, "b").status_code == 200, "the moment of a makes room: nobody reads it"
-    _until(lambda: export(server, "a", if_match=tag).status_code != 503)  # that of b is being let go of
+    wait_until(lambda: export(server, "a", if_match=tag).status_code != 503)  # that of b is being let go of
     assert_problem(export(server, "a", if_match=tag), 412, "export-gone")
-    _until(lambda: not any(server.data_dir.glob("exports/*")))
+    wait_until(lambda: not any(server.data_dir.glob("exports/*")))
     for name in ("a", "b"):
         assert server.client.delete(f"/v1/maps/{name}").status_code == 204
-
-
-def _until(reached: Any) -> None:
-    until = time.monotonic() + 30
-    while not reached():
-        assert time.monotonic() < until
-        time.sleep(0.005)

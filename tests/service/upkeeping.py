@@ -34,7 +34,7 @@ def reaching(server: Server, job: Mapping[str, Any], least: int) -> dict[str, An
 
 def wait_until(holds: Callable[[], bool]) -> None:
     """Wait for what must come to hold."""
-    end = time.monotonic() + 60
+    end = time.monotonic() + 30
     while not holds():
         assert time.monotonic() < end, "it never came to hold"
         time.sleep(0.005)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,15 +15,11 @@ from service.commands.bulk import Outcome, enrol_frames
 from service.commands.client import Refused, Service
 from service.commands.console import Failure
 from service.commands.manifest import Frame
+from tests.service.commands.test_client import problem
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 from tests.service.test_succession import order
 from tests.service.upkeeping import wait_until
-
-
-def problem(status: int, slug: str, **headers: str) -> httpx.Response:
-    content = json.dumps({"type": f"urn:placerec:problem:{slug}", "detail": f"It is {slug}.", "status": status})
-    return httpx.Response(status, headers={"content-type": "application/problem+json", **headers}, content=content)
 
 
 class Mischief(httpx.AsyncBaseTransport):
