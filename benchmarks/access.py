@@ -2,8 +2,9 @@
 
     python -m benchmarks.access
 
-The layer of ``service.access`` alone, around an application that does nothing: the time of a request through it less
-that of one without it, with the headers that a robot sends.  Who asks, the rate, the role and the map are all checked.
+The layer of ``service.access.gate`` alone, around an application that does nothing: the time of a request through it
+less that of one without it, with the headers that a robot sends.  Who asks, the rate, the role and the map are
+all checked.
 """
 
 from __future__ import annotations
@@ -19,9 +20,9 @@ from typing import Any
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.access import Access, ways_of
-from service.app import create_app
-from service.keys import KeyStore
+from service.access.gate import Access, ways_of
+from service.access.keys import KeyStore
+from service.app.application import create_app
 from service.settings import Settings
 
 REQUESTS = 5000

@@ -13,14 +13,14 @@ import torch
 import typer
 
 from benchmarks.report import report, verdict
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.images import decode
-from core.preprocessing import contrast, prepare
+from core.evaluation.timing import better_forward, encoding_runs, jpeg, medians, sample_picture
+from core.frames.images import decode
+from core.frames.preprocessing import contrast, prepare
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.method.vlad import Words, aggregate
 from core.threads import cores, share_cores
-from core.vlad import Words, aggregate
-from service.heap import settle_heap
-from service.measurement import better_forward, encoding_runs, jpeg, medians, sample_picture
+from service.commands.memory_arenas import settle_heap
 
 LIMIT = 1.4
 TOGETHER = 8

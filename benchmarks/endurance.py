@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.fleet import Fleet, Picture, Plan, Seen
 from benchmarks.process import service
 from benchmarks.report import report, verdict
-from service.measurement import jpeg, sample_picture
+from core.evaluation.timing import jpeg, sample_picture
 
 MAP = "endurance"
 SAMPLE_SECONDS = 5.0

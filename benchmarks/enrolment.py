@@ -24,9 +24,9 @@ from benchmarks.frames import camera_frames
 from benchmarks.process import ROOT, median, peak_memory, service
 from benchmarks.report import report, verdict
 from benchmarks.service import BATCH, SETTLE, encode_in_batches
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import share_cores
-from service.heap import settle_heap
+from service.commands.memory_arenas import settle_heap
 
 LIMIT = 0.7
 

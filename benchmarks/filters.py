@@ -24,14 +24,14 @@ import typer
 from benchmarks.opening import built
 from benchmarks.process import descriptors, fill_map, median
 from benchmarks.report import report, verdict
-from core.encoder import Encoder, Encoding
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.evaluation.timing import sample_picture
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
+from core.recognition.localization import locate
+from core.recognition.selection import EVERYTHING, Selection
 from core.storage import Atlas, Map
-from service.filters import FilterParameters
-from service.localization import locate
-from service.measurement import sample_picture
-from service.selection import EVERYTHING, Selection
+from service.queries.filters import FilterParameters
 
 MAP = "filtered"
 START = datetime(2026, 1, 1, tzinfo=UTC)

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from benchmarks.references import Material, material
 from benchmarks.report import report
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.index import CodedQuery, Coder, CodeTable
-from core.index.kernels import GROUP_BITS, estimates_of
 from core.index.rotation import rotated
 from core.index.selection import best_first
+from core.kernels.codes import GROUP_BITS, estimates_of
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import cores, share_cores
 
 Array = NDArray[np.float32]

@@ -1,8 +1,8 @@
 """A fleet that works on one map for as long as it is told: robots, operators who enrol, one who deletes, housekeeping.
 
-Standard library and bytes made beforehand, like :mod:`service.load`, but every answer is read and judged: a place that
-was enrolled before a frame was sent, and whose deletion was not begun before the answer came, must be the best match
-of its own picture; one whose deletion was acknowledged before the frame was sent must not occur at all.
+Standard library and bytes made beforehand, like :mod:`service.commands.load`, but every answer is read and judged: a
+place that was enrolled before a frame was sent, and whose deletion was not begun before the answer came, must be the
+best match of its own picture; one whose deletion was acknowledged before the frame was sent must not occur at all.
 
 Robots keep to a timetable.  What an answer took counts from the moment when its frame was due, so that a robot that had
 to wait for the answer before does not hide the wait.

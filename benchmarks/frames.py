@@ -7,9 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.images import decode
-from core.traverses import find_images
-from service.measurement import jpeg, sample_picture
+from core.evaluation.timing import jpeg, sample_picture
+from core.frames.images import decode
+from core.frames.traverses import find_images
 
 WIDTH, HEIGHT = 640, 480
 REAL = Path(__file__).parents[2] / "shared" / "datasets" / "eval" / "lip6_outdoor"

@@ -25,9 +25,9 @@ import typer
 
 from benchmarks.process import ROOT, fill_map, median, service
 from benchmarks.report import report, verdict
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.evaluation.timing import jpeg, sample_picture
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.storage import Atlas, Map, NewPrecision
-from service.measurement import jpeg, sample_picture
 
 MAP = "large"
 FIRST_SECONDS = 10.0

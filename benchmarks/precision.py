@@ -17,12 +17,12 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.evaluation import auc_pr
-from core.images import decode
-from core.storage.resting import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
-from core.traverses import find_images, read_ground_truth
+from core.frames.images import decode
+from core.frames.traverses import find_images, read_ground_truth
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
 
 Side = tuple[NDArray[np.float32], NDArray[np.int8]]
 """Descriptors float32 [n, D] and local descriptors int8 [n, C, L]."""

@@ -17,10 +17,10 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
-from core.encoder import Encoder
+from core.evaluation.timing import sample_picture
+from core.method.encoder import Encoder
 from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, MapSettings, NewPrecision
-from service.measurement import sample_picture
 
 ROOT = Path(__file__).parents[1]
 START_SECONDS = 120.0

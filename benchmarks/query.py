@@ -19,9 +19,9 @@ import typer
 
 from benchmarks.process import fill_map, median, service
 from benchmarks.report import report, verdict
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.images import decode
-from service.measurement import forward_passes, jpeg, sample_picture
+from core.evaluation.timing import forward_passes, jpeg, sample_picture
+from core.frames.images import decode
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 
 LIMIT = 6.0
 SETTLE = 0.01

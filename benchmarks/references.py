@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from core.encoder import Encoder
-from core.images import decode
-from core.traverses import natural_key
+from core.frames.images import decode
+from core.frames.traverses import natural_key
+from core.method.encoder import Encoder
 
 Array = NDArray[np.float32]
 

@@ -12,10 +12,10 @@ import typer
 
 from benchmarks.reference_regions import reference_regions
 from benchmarks.report import report, verdict
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.features import FeatureExtractor
-from core.regions import extract_regions
-from service.measurement import medians, sample_picture
+from core.evaluation.timing import medians, sample_picture
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.features import FeatureExtractor
+from core.method.regions import extract_regions
 
 LIMIT = 500.0
 

@@ -34,13 +34,13 @@ from rich.progress import Progress
 
 from benchmarks.references import Material, material
 from benchmarks.report import report, verdict
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.errors import UnknownMap
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
 from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, Map, MapSettings, NewPrecision
-from core.storage.descriptors import Layout
-from core.storage.snapshot import Snapshot
+from core.storage.files.segment_files import Layout
+from core.storage.search.snapshot import Snapshot
 from core.threads import cores, share_cores
 
 Array = NDArray[np.float32]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from benchmarks.references import Material, material
 from benchmarks.report import RESULTS
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -5,7 +5,7 @@
 One robot: the time of a query against encoding and searching here, at most 1.2 times.  Many robots: queries a second
 against encoding in batches here, at least 85 % with 16 of them, none lost, and p99 at most 3 times p50.
 
-The service, the robots (``service.load``) and this process take turns on the same cores, several times each;
+The service, the robots (``service.commands.load``) and this process take turns on the same cores, several times each;
 medians over the turns are shown.  The robots' own cost counts against the service: on two cores it is shown.
 """
 
@@ -25,15 +25,15 @@ import typer
 from benchmarks.frames import camera_frames
 from benchmarks.process import fill_map, median, service
 from benchmarks.report import report, verdict
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.images import decode
+from core.evaluation.timing import encode_batch
+from core.frames.images import decode
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.recognition.localization import locate
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
-from service.heap import settle_heap
-from service.load import measure
-from service.localization import locate
-from service.measurement import encode_batch
+from service.commands.load import measure
+from service.commands.memory_arenas import settle_heap
 
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query"

@@ -17,14 +17,14 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import report
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.evaluation.timing import medians
 from core.index.exact import compare
-from core.storage.descriptors import ROWS_PER_SEGMENT
-from core.storage.snapshot import Snapshot
-from core.storage.spots import Spot
+from core.judgement.verdict import NO_POSE
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.storage.files.segment_files import ROWS_PER_SEGMENT
+from core.storage.search.snapshot import Snapshot
+from core.storage.search.spots import Spot
 from core.threads import share_cores
-from core.verdict import NO_POSE
-from service.measurement import medians
 
 Array = NDArray[np.float32]
 TOGETHER = (1, 2, 4, 8, 16)

@@ -17,7 +17,7 @@ import typer
 
 from benchmarks.process import Process, service
 from benchmarks.report import report, verdict
-from service.measurement import jpeg, sample_picture
+from core.evaluation.timing import jpeg, sample_picture
 
 READY_LIMIT = 6.0
 MEMORY_LIMIT = 1200.0

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from benchmarks.reference_pipeline import reference_encode
 from benchmarks.report import report, verdict
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.images import decode
-from core.regions import extract_regions
-from core.vlad import Words, aggregate
-from service.measurement import jpeg, medians, sample_picture
+from core.evaluation.timing import jpeg, medians, sample_picture
+from core.frames.images import decode
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.method.regions import extract_regions
+from core.method.vlad import Words, aggregate
 
 LIMIT = 40.0
 THESIS = "m-region-vlad-thesis"

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.preprocessing import Pixels
+from core.frames.preprocessing import Pixels
 
 REACH = 20
 """Frames around the stated reference within which the true one is looked for."""

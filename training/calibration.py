@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
-from core.probability import Curve, fit_curve
-from core.reliability import reliability
-from core.trials import Trial, Trials, gathered, joined
-from core.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.judgement.encoder_calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
+from core.judgement.probability import Curve, fit_curve
+from core.judgement.reliability import reliability
+from core.judgement.trials import Trial, Trials, gathered, joined
+from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
 from training.validation import Cameras
 
 Array = NDArray[np.float32]

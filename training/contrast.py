@@ -19,8 +19,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from core.agreement import AgreementDefinition
-from core.projection import Projection
+from core.method.agreement import AgreementDefinition
+from core.method.projection import Projection
 
 TEMPERATURE = 0.07
 RATE = 2e-4

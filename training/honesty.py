@@ -18,14 +18,14 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from core.agreement import Cells
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
 from core.errors import CalibrationImpossible
-from core.examination import examine
-from core.recalibration import Held, Target, held_figures, recalibrate
-from core.trials import Trial, Trials, area_under_roc, gathered
-from core.verdict import Whereabouts, judge
+from core.judgement.examination import examine
+from core.judgement.map_calibration import Held, Target, held_figures, recalibrate
+from core.judgement.trials import Trial, Trials, area_under_roc, gathered
+from core.judgement.verdict import Whereabouts, judge
+from core.method.agreement import Cells
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
 from training.calibration import NEIGHBORHOOD
 from training.validation import Shown, describe, realigned, walk
 

@@ -18,16 +18,16 @@ from rich.progress import track
 from safetensors.torch import load_file
 from torch import Tensor
 
-from core.encoder import Encoder, EncoderDefinition
-from core.encoders import NETWORK_SUFFIX, PACKAGED, save_encoder
 from core.evaluation import auc_roc
-from core.features import FeatureExtractor
-from core.network import ShallowNetwork, save_network
-from core.preprocessing import Pixels
-from core.presets import NETWORK, PRESETS
-from core.trials import Trials
-from core.verdict import Calibration
-from core.vocabulary import Vocabulary, pool_features, train_vocabulary
+from core.frames.preprocessing import Pixels
+from core.judgement.trials import Trials
+from core.judgement.verdict import Calibration
+from core.method.catalogue import NETWORK_SUFFIX, PACKAGED, save_encoder
+from core.method.encoder import Encoder, EncoderDefinition
+from core.method.features import FeatureExtractor
+from core.method.presets import NETWORK, PRESETS
+from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
+from core.networks.network import ShallowNetwork, save_network
 from training.calibration import camera_trials, choose, rates, walk_trials, worth
 from training.photographs import read, split_photographs
 from training.projection import fit_projections

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from rich.progress import track
 
-from core.network import ShallowNetwork
-from core.preprocessing import prepare
-from core.projection import Projection, fit_projection
-from core.regions import unit_length
+from core.frames.preprocessing import prepare
+from core.method.projection import Projection, fit_projection
+from core.method.regions import unit_length
+from core.networks.network import ShallowNetwork
 from training.contrast import Pairs
 from training.distillation import SIDE
 from training.photographs import DisturbedCrops, split_photographs

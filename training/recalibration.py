@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from core.encoders import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load_encoder, save_calibration
-from core.presets import NETWORK, PRESETS
+from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load_encoder, save_calibration
+from core.method.presets import NETWORK, PRESETS
 from training.packaging import assess, load_tasks
 
 

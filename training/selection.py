@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from rich.progress import track
 from safetensors.torch import load_file
 
-from core.encoder import Encoder, EncoderDefinition
 from core.evaluation import auc_pr
-from core.features import FeatureExtractor
-from core.network import ShallowNetwork
-from core.preprocessing import Pixels
-from core.presets import PRESETS
-from core.projection import Projection
-from core.vocabulary import pool_features, train_vocabulary
+from core.frames.preprocessing import Pixels
+from core.method.encoder import Encoder, EncoderDefinition
+from core.method.features import FeatureExtractor
+from core.method.presets import PRESETS
+from core.method.projection import Projection
+from core.method.vocabulary import pool_features, train_vocabulary
+from core.networks.network import ShallowNetwork
 from training.contrast import refine
 from training.packaging import UNCALIBRATED, Tasks, load_tasks, network_of, vocabulary_pictures
 from training.projection import fit_projections, paired_cells

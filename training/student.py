@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from core.network import Convolution, NetworkDefinition, build_layer, caffenet_definition
+from core.networks.network import Convolution, NetworkDefinition, build_layer, caffenet_definition
 
 TEACHER_CHANNELS = 512
 SCALE = 0.017

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.agreement import Cells
-from core.encoder import Encoder
-from core.preprocessing import Pixels
+from core.frames.preprocessing import Pixels
+from core.method.agreement import Cells
+from core.method.encoder import Encoder
 from training.alignment import aligned_truth
 from training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from core.belief.filter import Belief
 from core.belief.graph import PlaceGraph
-from core.verdict import Verdict
+from core.judgement.verdict import Verdict
 
 RECOGNIZED = 0.5
 """Least probability of a place, its neighbours included, with which it is told; the same of not being in the map."""

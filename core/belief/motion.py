@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.belief.graph import PlaceGraph
-from core.belief.moves import along_sequence, by_odometry, within_reach
+from core.kernels.belief_moves import along_sequence, by_odometry, within_reach
 from core.places import EARTH_RADIUS
 
 Masses = NDArray[np.float32]

@@ -1,7 +1,7 @@
 """How well systems recognize one traverse by another: the thesis's protocol, its data sets, its comparison."""
 
-from core.evaluation.comparison import Box, Comparison, Run, ScalePoint, SeverityCurve
-from core.evaluation.figures import (
+from core.evaluation.protocol.comparison import Box, Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
     Evaluation,
@@ -12,8 +12,8 @@ from core.evaluation.figures import (
     recall_at_full_precision,
     summarize,
 )
-from core.evaluation.outcomes import Outcome, judge, judge_ranking
-from core.evaluation.results import results_csv
+from core.evaluation.protocol.outcomes import Outcome, judge, judge_ranking
+from core.evaluation.protocol.results import results_csv
 
 __all__ = [
     "DEPTHS",

@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidTraverse
-from core.identity import canonical_json, json_digest
+from core.networks.identity import canonical_json, json_digest
 
 FORMAT = "placerec-evaluation/1"
 VALUES = "values"
 LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "torch")
 
 # What shows, keeps or transports figures but cannot change one.
-NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/datasets.py", "models", "storage")
+NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/data/datasets.py", "models", "storage")
 
 DIGEST_BYTES = 32
 

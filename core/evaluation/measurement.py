@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.evaluation.cache import CacheEntry, EvaluationCache
-from core.evaluation.comparison import Run
-from core.evaluation.figures import STAGES, summarize
-from core.evaluation.outcomes import judge
+from core.evaluation.protocol.comparison import Run
+from core.evaluation.protocol.figures import STAGES, summarize
+from core.evaluation.protocol.outcomes import judge
+from core.evaluation.protocol.trust import trust_figures
 from core.evaluation.subjects import Described, Subject
-from core.evaluation.trust import trust_figures
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ from dataclasses import asdict
 import numpy as np
 
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
-from core.evaluation.comparison import ScalePoint
-from core.evaluation.figures import auc_pr, recall_at
-from core.evaluation.outcomes import judge
-from core.evaluation.pairs import TraversePair
+from core.evaluation.data.pairs import TraversePair
+from core.evaluation.protocol.comparison import ScalePoint
+from core.evaluation.protocol.figures import auc_pr, recall_at
+from core.evaluation.protocol.outcomes import judge
 from core.evaluation.subjects import Subject
 
 POINTS = 6

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from core.baselines.system import Index
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
-from core.evaluation.comparison import SeverityCurve
-from core.evaluation.disturbances import DISTURBANCES, Disturbance
-from core.evaluation.figures import auc_pr, recall_at
-from core.evaluation.outcomes import judge
+from core.evaluation.data.disturbances import DISTURBANCES, Disturbance
+from core.evaluation.protocol.comparison import SeverityCurve
+from core.evaluation.protocol.figures import auc_pr, recall_at
+from core.evaluation.protocol.outcomes import judge
 from core.evaluation.subjects import Described, Subject
-from core.systems.system import Index
 
 
 def severity(

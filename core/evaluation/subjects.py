@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.baselines.system import About, Description, Index, System, Trainable
 from core.errors import InvalidModel
 from core.evaluation.cache import cache_key, files_digest
-from core.evaluation.pairs import TraversePair
-from core.preprocessing import Pixels
-from core.systems.system import About, Description, Index, System, Trainable
+from core.evaluation.data.pairs import TraversePair
+from core.frames.preprocessing import Pixels
 from core.threads import keep_numpy_single_threaded
 
 Load = Callable[[Path], Pixels]

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.kernels import GROUP_BITS, GROUP_WORDS, PLANES
 from core.index.rotation import random_signs, rotated
+from core.kernels.codes import GROUP_BITS, GROUP_WORDS, PLANES
 from core.threads import keep_numpy_single_threaded
 
 Array = NDArray[np.float32]

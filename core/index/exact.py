@@ -20,8 +20,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from core.index.kernels import prefetch
 from core.index.ranking import ranked
+from core.kernels.codes import prefetch
 
 Rows = NDArray[np.float16] | NDArray[np.float32]
 

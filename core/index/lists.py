@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index.codes import Bits, CodedQuery
-from core.index.kernels import GROUP_BITS, estimates_of
 from core.index.selection import best_positions, together
 from core.index.table import CodeTable
+from core.kernels.codes import GROUP_BITS, estimates_of
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]

@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.kernels import count_from, gather_from
+from core.kernels.codes import count_from, gather_from
 from core.threads import cores, in_turns
 
 Array = NDArray[np.float32]

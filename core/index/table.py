@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index.codes import CodedQuery, Coder, Codes, PlaneQuery
-from core.index.kernels import estimates_at, estimates_of
 from core.index.selection import best_first, best_positions, together
+from core.kernels.codes import estimates_at, estimates_of
 
 if TYPE_CHECKING:
     from core.index.lists import InvertedLists

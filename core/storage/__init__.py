@@ -1,6 +1,7 @@
 """Durable maps: what is acknowledged is on disk, what is on disk is checked, what is searched is in memory."""
 
 from core.storage.atlas import Atlas
+from core.storage.files.row_formats import NewPrecision
 from core.storage.map import Map
 from core.storage.records import (
     Change,
@@ -13,9 +14,8 @@ from core.storage.records import (
     SequenceSummary,
     VerifyReport,
 )
-from core.storage.resting import NewPrecision
-from core.storage.snapshot import Ranking, Snapshot
-from core.storage.tiers import IndexStatus, Recall, StorageStatus, TierSetting
+from core.storage.search.snapshot import Ranking, Snapshot
+from core.storage.search.tiers import IndexStatus, Recall, StorageStatus, TierSetting
 
 __all__ = [
     "Atlas",

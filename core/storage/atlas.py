@@ -21,13 +21,13 @@ from pathlib import Path
 
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.places import check_map_id
-from core.storage.cursors import Listing, decode_name, encode_cursor
-from core.storage.descriptors import NO_LOCAL, ROWS_PER_SEGMENT, Layout
-from core.storage.disk import Damage, FolderLock, make_folder, refusals, sync_file, sync_folder, write_file
+from core.storage.database.cursors import Listing, decode_name, encode_cursor
+from core.storage.files.disk import Damage, FolderLock, make_folder, refusals, sync_file, sync_folder, write_file
+from core.storage.files.row_formats import HALF, Precision
+from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.records import MapRecord, MapSettings, VerifyReport
-from core.storage.resting import HALF, Precision
 from core.storage.verification import Progress, inspect_folder, untold
 
 log = logging.getLogger(__name__)

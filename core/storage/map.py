@@ -20,22 +20,23 @@ from core.errors import (
     UnknownSequence,
 )
 from core.places import Place, PlaceFields
-from core.storage import ledger, pages
+from core.storage import pages
 from core.storage.archives.capture import Capturing
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
-from core.storage.database import DatabaseClosed
-from core.storage.disk import Damage, refusals
-from core.storage.doubts import Doubts
-from core.storage.indexing import IndexedMap, Indexer, Stopped
-from core.storage.memo import Memo
-from core.storage.named import NamedSegment, named_segments
+from core.storage.database import ledger
+from core.storage.database.connections import DatabaseClosed
+from core.storage.database.segment_table import NamedSegment, named_segments
+from core.storage.failed_writes import Doubts
+from core.storage.files.disk import Damage, refusals
 from core.storage.opening import OpenMap, open_map
 from core.storage.patches import patched_fields, patched_record
 from core.storage.pictures import small_picture
+from core.storage.recent_places import Memo
 from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
-from core.storage.snapshot import Snapshot
-from core.storage.tiers import IndexStatus, StorageStatus, storage_of, unopened
+from core.storage.search.indexing import IndexedMap, Indexer, Stopped
+from core.storage.search.snapshot import Snapshot
+from core.storage.search.tiers import IndexStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
 from core.storage.verification import Progress, inspect, untold
 from core.storage.writing import Write, check_enrolment

@@ -18,27 +18,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index import Codes, CodeTable
+from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.places import Pose, microseconds
-from core.storage import descriptors, ledger, seals
-from core.storage.arrays import StaleArrays
-from core.storage.columns import read_columns
-from core.storage.database import FILE, Database, connect
-from core.storage.descriptors import Layout
-from core.storage.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
-from core.storage.index_files import IndexFiles
-from core.storage.log import check_log
-from core.storage.named import NamedSegment, named_segments
+from core.storage.database import ledger
+from core.storage.database import row_checksums as seals
+from core.storage.database.columns import read_columns
+from core.storage.database.connections import FILE, Database, connect
+from core.storage.database.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
+from core.storage.database.segment_table import NamedSegment, named_segments
+from core.storage.database.write_ahead_log import check_log
+from core.storage.files import segment_files as descriptors
+from core.storage.files.arrays import StaleArrays
+from core.storage.files.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
+from core.storage.files.row_formats import HALF
+from core.storage.files.row_reader import Shelf
+from core.storage.files.segment_files import Layout
 from core.storage.patches import complaint
 from core.storage.reclaiming import Remains, clear_folder
 from core.storage.records import MapRecord
-from core.storage.resting import HALF
-from core.storage.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
-from core.storage.segment import Held, Segment, flat_index, vectors
-from core.storage.shelf import Shelf
-from core.storage.snapshot import Snapshot
-from core.storage.spots import Spot
-from core.storage.tiers import tier_for
-from core.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
+from core.storage.search.index_files import IndexFiles
+from core.storage.search.segment import Held, Segment, flat_index, vectors
+from core.storage.search.snapshot import Snapshot
+from core.storage.search.spots import Spot
+from core.storage.search.tiers import tier_for
 
 log = logging.getLogger(__name__)
 

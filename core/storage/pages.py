@@ -5,8 +5,8 @@ from __future__ import annotations
 import sqlite3
 
 from core.places import Place
-from core.storage import ledger
-from core.storage.cursors import Listing, decode_name, decode_number, encode_cursor
+from core.storage.database import ledger
+from core.storage.database.cursors import Listing, decode_name, decode_number, encode_cursor
 from core.storage.records import SequenceSummary
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 from core.errors import InvalidImage, NoThumbnail, StorageFailure
-from core.images import Limits, decode, encode_thumbnail
+from core.frames.images import Limits, decode, encode_thumbnail
 from core.places import Place
 
 LARGEST = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)

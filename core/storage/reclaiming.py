@@ -18,9 +18,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from core.storage.descriptors import Layout, segment_name
-from core.storage.named import NamedSegment
-from core.storage.snapshot import Snapshot
+from core.storage.database.segment_table import NamedSegment
+from core.storage.files.segment_files import Layout, segment_name
+from core.storage.search.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
 

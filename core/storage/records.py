@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Timestamp
-from core.storage.resting import Precision
-from core.storage.tiers import COMPACT_FROM, INVERTED_FROM, TierSetting
-from core.verdict import Calibration
+from core.storage.files.row_formats import Precision
+from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM, TierSetting
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]

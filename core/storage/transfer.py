@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 from core.errors import StorageFailure
 from core.places import Place
-from core.storage import ledger
 from core.storage.cameras import Access
+from core.storage.database import ledger
 from core.storage.records import Change, Enrolment, History, Keep, SameFrame
 from core.storage.writing import Write, check_enrolment
 

@@ -11,20 +11,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage import descriptors, seals
-from core.storage.columns import read_columns
-from core.storage.database import FILE, connect, connect_aside
-from core.storage.descriptors import Layout
-from core.storage.disk import Damage
-from core.storage.index_files import IndexFiles
-from core.storage.indexing import tier_of
-from core.storage.log import check_log
-from core.storage.named import NamedSegment, named_segments
+from core.storage.database import row_checksums as seals
+from core.storage.database.columns import read_columns
+from core.storage.database.connections import FILE, connect, connect_aside
+from core.storage.database.schema import check_schema, contradictions
+from core.storage.database.segment_table import NamedSegment, named_segments
+from core.storage.database.write_ahead_log import check_log
+from core.storage.files import segment_files as descriptors
+from core.storage.files.disk import Damage
+from core.storage.files.segment_files import Layout
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
-from core.storage.schema import check_schema, contradictions
-from core.storage.segment import Segment, vectors
-from core.storage.snapshot import Snapshot
+from core.storage.search.index_files import IndexFiles
+from core.storage.search.indexing import tier_of
+from core.storage.search.segment import Segment, vectors
+from core.storage.search.snapshot import Snapshot
 
 _NAMED = 10  # of the rows of one kind of damage, so many are told one by one
 

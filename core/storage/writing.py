@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
-from core.storage import descriptors, ledger
-from core.storage.descriptors import Layout
-from core.storage.ledger import StoredPlace
+from core.storage.database import ledger
+from core.storage.database.ledger import StoredPlace
+from core.storage.files import segment_files as descriptors
+from core.storage.files.row_formats import LARGEST_HALF
+from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, spot_of
 from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
-from core.storage.resting import LARGEST_HALF
-from core.storage.snapshot import Snapshot, Spot
+from core.storage.search.snapshot import Snapshot, Spot
 
 
 def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:

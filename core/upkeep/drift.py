@@ -10,7 +10,7 @@ from typing import get_args
 
 import numpy as np
 
-from core.verdict import Verdict
+from core.judgement.verdict import Verdict
 
 SCORE_BINS = 20
 """Of equal width over the scores from 0 to 1; what lies outside counts in the first or last."""

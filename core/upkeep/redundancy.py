@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from core.judgement.verdict import NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
-from core.verdict import NO_POSE, Neighborhood, Whereabouts
 
 MOST_NEIGHBOURS = 32
 """A place is held against so many of its nearest at most: where a robot stood still, pairs would be without number."""

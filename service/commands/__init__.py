@@ -5,7 +5,7 @@ commands that need them, so that ``placerec --help`` answers at once.
 """
 
 from service.commands.application import application
-from service.heap import settle_heap
+from service.commands.memory_arenas import settle_heap
 
 
 def main() -> None:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import typer
 
-from service.commands.backup import backup
 from service.commands.bench import bench
 from service.commands.calibrate import calibrate
 from service.commands.console import Commands
 from service.commands.enroll import enroll
-from service.commands.evaluate import evaluate
+from service.commands.evaluation.evaluate import evaluate
 from service.commands.jobs import jobs
 from service.commands.keys import keys
-from service.commands.maps import maps
+from service.commands.maps.backup import backup
+from service.commands.maps.maps import maps
 from service.commands.model import model
 from service.commands.query import query
 from service.commands.serve import serve

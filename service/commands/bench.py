@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.client import Target, ask, path_of, read_bytes
+from service.commands.connection.client import Target, ask, path_of, read_bytes
+from service.commands.connection.credentials import given_key
 from service.commands.console import Failure, number, progress, show, table, write_file
-from service.commands.credentials import given_key
 from service.commands.models import ModelsDir, default_encoder, open_catalogue
 
 if TYPE_CHECKING:
-    from core.encoder import Encoder
+    from core.method.encoder import Encoder
 
 PICTURES = 16
 """Frames that the robots send in turn, if none is given."""
@@ -58,8 +58,7 @@ def _measure_here(
     # Imported here because they take a second.
     import torch
 
-    from core.threads import share_cores
-    from service.measurement import (
+    from core.evaluation.timing import (
         better_forward,
         encode_batch,
         encoding_runs,
@@ -68,6 +67,7 @@ def _measure_here(
         sample_picture,
         search_run,
     )
+    from core.threads import share_cores
 
     share_cores(threads or torch.get_num_threads())
     chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
@@ -98,8 +98,8 @@ def _measure_service(
 ) -> dict[str, Any]:
     import subprocess
 
-    from service.load import measure
-    from service.measurement import jpeg, sample_picture
+    from core.evaluation.timing import jpeg, sample_picture
+    from service.commands.load import measure
 
     path = "/v1/encode" if map_id is None else path_of("maps", map_id, "query")
     version = ask(Target(url, None), "GET", "/version").json()
@@ -127,7 +127,7 @@ def _measure_service(
 
 
 def summary(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Percentiles in milliseconds, answers a second, and how many were none, of what ``service.load`` measured."""
+    """Percentiles in milliseconds, answers a second, and how many were none, of what the load measured."""
     import numpy as np
 
     times = np.array(found["milliseconds"])

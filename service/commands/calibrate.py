@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands.client import AsJson, DataDir, Target, Url, ask, media_type, path_of, read_bytes
+from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, media_type, path_of, read_bytes
 from service.commands.console import Failure, number, output, remark, show, show_json, table
 from service.commands.jobs import submit
 

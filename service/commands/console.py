@@ -24,8 +24,8 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from core.errors import PlacerecError
-from service.commands.credentials import add_key
-from service.faults import Fault
+from service.commands.connection.credentials import add_key
+from service.errors.faults import Fault
 
 output = Console()
 """Results."""

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from service.commands.bulk import Outcome, enrol_frames
-from service.commands.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
+from service.commands.connection.bulk import Outcome, enrol_frames
+from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress, remark
 from service.commands.manifest import Frame, read_traverse, unlisted
 

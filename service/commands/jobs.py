@@ -6,7 +6,18 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.client import AsJson, DataDir, Service, Target, Url, ask, list_items, open_service, path_of, run
+from service.commands.connection.client import (
+    AsJson,
+    DataDir,
+    Service,
+    Target,
+    Url,
+    ask,
+    list_items,
+    open_service,
+    path_of,
+    run,
+)
 from service.commands.console import Commands, Failure, progress, remark, show, show_json, table
 
 jobs = typer.Typer(cls=Commands, help="List, follow and cancel long work.", no_args_is_help=True)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from service.commands.client import AsJson, DataDir, read_settings
+from service.commands.connection.client import AsJson, DataDir, read_settings
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
 if TYPE_CHECKING:
-    from service.keys import Key, KeyStore
+    from service.access.keys import Key, KeyStore
 
 keys = typer.Typer(cls=Commands, help="Create, list and revoke the keys of a data directory.", no_args_is_help=True)
 
@@ -105,7 +105,7 @@ def state_of(key: Key) -> str:
 
 
 def _store(data_dir: Any) -> KeyStore:
-    from service.keys import KeyStore  # with it comes numpy
+    from service.access.keys import KeyStore  # with it comes numpy
 
     return KeyStore(read_settings(data_dir).data_dir)
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from core.exif import read_whereabouts
+from core.frames.exif import read_whereabouts
+from core.frames.traverses import find_images
 from core.places import PlaceFields, Pose, Sequence, Timestamp, check_place_id
-from core.traverses import find_images
 from service.commands.console import Failure
 
 FILE_NAME = "places.csv"

@@ -35,9 +35,9 @@ def import_model(
 ) -> None:
     """Turn a .caffemodel into a network that vocabularies can be trained for; no weight is changed."""
     # Imported here because they take a second.
-    from core.caffe import import_caffe
-    from core.encoders import NETWORK_SUFFIX
-    from core.network import Convolution, save_network
+    from core.method.catalogue import NETWORK_SUFFIX
+    from core.networks.caffe import import_caffe
+    from core.networks.network import Convolution, save_network
 
     folder = models_directory(models_dir)
     check_free_name(folder, name, "network", overwrite)

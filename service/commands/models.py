@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from core.errors import InvalidImage
-from service.commands.client import read_bytes, read_settings
+from service.commands.connection.client import read_bytes, read_settings
 from service.commands.console import Failure
 
 if TYPE_CHECKING:
-    from core.encoders import EncoderCatalogue
-    from core.preprocessing import Pixels
+    from core.frames.preprocessing import Pixels
+    from core.method.catalogue import EncoderCatalogue
 
 ModelsDir = Annotated[
     Path | None,
@@ -29,7 +29,7 @@ def models_directory(chosen: Path | None) -> Path:
 
 def open_catalogue(models_dir: Path | None) -> EncoderCatalogue:
     """The packaged encoders and those of the directory."""
-    from core.encoders import EncoderCatalogue
+    from core.method.catalogue import EncoderCatalogue
 
     return EncoderCatalogue(models_directory(models_dir))
 
@@ -50,7 +50,7 @@ def load_image(path: Path) -> Pixels:
     Raises:
         Failure: it cannot be read or decoded; the text names the file.
     """
-    from core.images import decode
+    from core.frames.images import decode
 
     try:
         return decode(read_bytes(path))
@@ -64,8 +64,8 @@ def check_free_name(folder: Path, name: str, kind: Literal["encoder", "network"]
     Raises:
         Failure: it cannot name one, a packaged one has it, or an installed one that is not to be overwritten.
     """
-    from core.encoders import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED
-    from core.network import NAME
+    from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED
+    from core.networks.network import NAME
 
     if not re.fullmatch(NAME, name):
         raise Failure(f"{name!r} cannot name an {kind}: it must match {NAME}.")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands.client import (
+from service.commands.connection.client import (
     DataDir,
     Refused,
     Service,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.commands.client import read_settings
+from service.commands.connection.client import read_settings
 from service.commands.console import Failure
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def serve(
 
 
 def _serve(settings: Settings) -> None:
-    from service.serving.native import logged_stderr
+    from service.telemetry.native_output import logged_stderr
 
     with logged_stderr():
         _serve_logged(settings)
@@ -48,12 +48,12 @@ def _serve(settings: Settings) -> None:
 def _serve_logged(settings: Settings) -> None:
     import uvicorn
 
-    from service.app import create_app
-    from service.serving.connections import Connections, patient
-    from service.serving.http import HttpConnection
-    from service.serving.streams import StreamConnection
+    from service.app.application import create_app
+    from service.http.connections import Connections, patient
+    from service.http.protocol import HttpConnection
+    from service.http.websocket_protocol import StreamConnection
     from service.settings import SettingsError
-    from service.telemetry import configure_logging
+    from service.telemetry.requests import configure_logging
 
     configure_logging(settings.log_level)
     try:
@@ -90,7 +90,7 @@ def _serve_logged(settings: Settings) -> None:
 
 
 async def _run(application: Any, config: Any, socket: Any, settings: Settings, connections: Any) -> None:
-    from service.serving.server import DrainingServer
+    from service.http.server import DrainingServer
 
     def drain() -> None:
         application.state.engine.stopping = connections.draining = True

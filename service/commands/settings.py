@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.commands.client import read_settings
+from service.commands.connection.client import read_settings
 from service.commands.console import remark, show, show_json, table
 
 

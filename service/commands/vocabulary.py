@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
 
 from core.errors import InvalidImage
-from core.traverses import SUPPORTED_SUFFIXES, natural_key
-from service.commands.client import read_bytes
+from core.frames.traverses import SUPPORTED_SUFFIXES, natural_key
+from service.commands.connection.client import read_bytes
 from service.commands.console import Commands, Failure, messages, output, progress, remark
 from service.commands.models import ModelsDir, check_free_name, models_directory
 
 if TYPE_CHECKING:
-    from core.encoder import EncoderDefinition
-    from core.features import FeatureExtractor
-    from core.preprocessing import Pixels
-    from core.verdict import Calibration
-    from core.vocabulary import Vocabulary
+    from core.frames.preprocessing import Pixels
+    from core.judgement.verdict import Calibration
+    from core.method.encoder import EncoderDefinition
+    from core.method.features import FeatureExtractor
+    from core.method.vocabulary import Vocabulary
 
 vocabulary = typer.Typer(cls=Commands, help="Train vocabularies for encoders of your own.", no_args_is_help=True)
 
@@ -93,11 +93,11 @@ def train(
     # Imported here because they take a second.
     from pydantic import ValidationError
 
-    from core.encoder import Encoder, EncoderDefinition
-    from core.encoders import save_encoder
-    from core.features import FeatureExtractor
-    from core.network import load_network
-    from core.vocabulary import pool_features, train_vocabulary
+    from core.method.catalogue import save_encoder
+    from core.method.encoder import Encoder, EncoderDefinition
+    from core.method.features import FeatureExtractor
+    from core.method.vocabulary import pool_features, train_vocabulary
+    from core.networks.network import load_network
 
     pictures = _choose(_find(images), limit, seed)
     folder = models_directory(models_dir)
@@ -165,8 +165,8 @@ def _choose(paths: list[Path], limit: int, seed: int) -> Pictures:
 
 
 def _find_network(given: str, folder: Path) -> tuple[str, Path]:
-    from core.encoders import EncoderCatalogue
-    from core.network import read_definition
+    from core.method.catalogue import EncoderCatalogue
+    from core.networks.network import read_definition
 
     if given.endswith(".safetensors") or os.sep in given:
         return read_definition(Path(given)).name, Path(given)
@@ -175,7 +175,7 @@ def _find_network(given: str, folder: Path) -> tuple[str, Path]:
 
 def _install_network(name: str, file: Path, folder: Path) -> None:
     """Put a network that was named by its file where the encoder will look for it."""
-    from core.encoders import NETWORK_SUFFIX, PACKAGED
+    from core.method.catalogue import NETWORK_SUFFIX, PACKAGED
 
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / f"{name}{NETWORK_SUFFIX}"
@@ -189,7 +189,7 @@ def _install_network(name: str, file: Path, folder: Path) -> None:
 
 
 def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[float, ...]:
-    from core.presets import NETWORK, PRESETS
+    from core.method.presets import NETWORK, PRESETS
 
     if text is None:
         default = PRESETS["m-region-vlad"].steps[0] if network == NETWORK else CAFFE_STEP
@@ -203,7 +203,7 @@ def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[flo
 
 def _read(paths: Sequence[Path], bar: Progress, task: TaskID) -> Iterator[tuple[Path, Pixels]]:
     """The images that can be decoded; of the others it is said that they cannot."""
-    from core.images import decode
+    from core.frames.images import decode
 
     for path in paths:
         try:
@@ -225,9 +225,9 @@ def _calibrate(
     paths: Sequence[Path],
     bar: Progress,
 ) -> Calibration:
-    from core.calibration import calibrate, second_look
-    from core.encoder import Encoder
-    from core.verdict import Calibration
+    from core.judgement.encoder_calibration import calibrate, second_look
+    from core.judgement.verdict import Calibration
+    from core.method.encoder import Encoder
 
     nothing = Calibration(source="encoder-default", threshold=0, margin=0, background_mean=0, background_deviation=1)
     encoder = Encoder(name, extractor, definition, made, nothing)

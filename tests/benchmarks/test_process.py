@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.process import descriptors, fill_map, service
-from core.encoders import EncoderCatalogue
-from service.measurement import jpeg, sample_picture
+from core.evaluation.timing import jpeg, sample_picture
+from core.method.catalogue import EncoderCatalogue
 
 
 def test_descriptors_are_made_of_parts_of_real_ones() -> None:

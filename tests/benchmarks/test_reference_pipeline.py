@@ -7,10 +7,10 @@ import pytest
 
 from benchmarks.reference_pipeline import reference_vlad
 from benchmarks.thesis_pipeline import THESIS, literal, ours
-from core.encoders import EncoderCatalogue
-from core.images import decode
-from core.vlad import Words, aggregate
-from service.measurement import jpeg, sample_picture
+from core.evaluation.timing import jpeg, sample_picture
+from core.frames.images import decode
+from core.method.catalogue import EncoderCatalogue
+from core.method.vlad import Words, aggregate
 
 
 def test_the_literal_vlad_is_the_compiled_one() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.reference_regions import reference_regions
-from core.regions import extract_regions
+from core.method.regions import extract_regions
 
 
 @pytest.mark.parametrize("count", [3, 40, 10_000])

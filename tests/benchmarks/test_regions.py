@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import report
 from benchmarks.regions import main
-from core.encoders import EncoderCatalogue
+from core.method.catalogue import EncoderCatalogue
 
 
 @pytest.mark.parametrize("encoder", [summary.name for summary in EncoderCatalogue().describe()])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.sequences import FILTERS, HALVED, RECALL, SHARE, costs, recalls
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from tests.service.server import ROOT
 
 DATA = ROOT.parent / "shared" / "datasets" / "eval"

@@ -12,8 +12,8 @@ from typing import Any
 
 import httpx
 
-from service.job_records import JobRecords
-from service.session_store import SessionStore
+from service.jobs.records import JobRecords
+from service.sessions.store import SessionStore
 from tests.durability import server_operations
 from tests.durability.lives import Lives
 from tests.durability.model import Lost, World

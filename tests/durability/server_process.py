@@ -20,13 +20,13 @@ MODULES = (
     "torch",
     "uvicorn",
     "uvloop",
-    "service.app",
+    "service.app.application",
     "service.commands.serve",
-    "service.serving.connections",
-    "service.serving.http",
-    "service.serving.native",
-    "service.serving.server",
-    "service.serving.streams",
+    "service.http.connections",
+    "service.http.protocol",
+    "service.telemetry.native_output",
+    "service.http.server",
+    "service.http.websocket_protocol",
 )
 
 

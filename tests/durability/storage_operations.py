@@ -12,7 +12,7 @@ import numpy as np
 
 from core.places import PlaceFields
 from core.storage import Enrolment, MapSettings
-from core.storage.resting import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
+from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
 from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, local_of
 from tests.durability.contents import sha
 from tests.durability.model import MapModel, Refused, Shown, World

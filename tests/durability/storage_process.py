@@ -23,11 +23,13 @@ from typing import Any
 import numpy as np
 
 from core.errors import PlacerecError
+from core.frames.masks import Mask
 from core.index import Coder, CodeTable, InvertedLists
-from core.masks import Mask
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, History, MapSettings, database, index_files, opening, recall
-from core.storage.resting import inner_products, pack_descriptors
+from core.storage import Atlas, Enrolment, History, MapSettings, opening
+from core.storage.database import connections as database
+from core.storage.files.row_formats import inner_products, pack_descriptors
+from core.storage.search import index_files, recall
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 from tests.durability.contents import contents, map_contents
 from tests.durability.storage_operations import Operation, enrolment

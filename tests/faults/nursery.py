@@ -16,7 +16,7 @@ from pathlib import Path
 
 import faiss
 
-from core.storage import parallel
+from core.storage.search import parallel
 from tests.faults import script
 
 _SET_TRACER, _ANY = 0x59616D61, ctypes.c_ulong(-1)

@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import PlacerecError
-from core.masks import Mask
+from core.frames.masks import Mask
 from core.places import PlaceFields
-from core.storage import Atlas, Map, MapSettings, index_files
+from core.storage import Atlas, Map, MapSettings
+from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 from tests.faults.model import State, all_told, best_of, place
 

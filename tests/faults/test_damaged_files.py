@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure
-from core.storage import Atlas, Map, MapSettings, index_files
+from core.storage import Atlas, Map, MapSettings
+from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.faults.damage import DAMAGES, Damage, flip, flip_anywhere, flip_used
 from tests.faults.model import State, told

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.storage import Atlas
 from tests.core.storage.frames import frame
 from tests.faults.injection import attached
+from tests.service.places.test_durability import all_places, answers
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.test_durability import all_places, answers
 from tests.syscalls import strace
 
 needs_strace = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")

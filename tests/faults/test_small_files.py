@@ -16,11 +16,11 @@ import pytest
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
 from core.storage import Atlas
 from core.storage.archives.reading import Archive, check
-from service.faults import KeysUnreadable
-from service.job_records import Job, JobRecords
-from service.keys import KeyStore
-from service.session_store import SessionStore, StoredSession
-from service.statistics import QueryStatistics, Statistics
+from service.access.keys import KeyStore
+from service.errors.faults import KeysUnreadable
+from service.jobs.records import Job, JobRecords
+from service.sessions.store import SessionStore, StoredSession
+from service.upkeep.statistics import QueryStatistics, Statistics
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import torch
 
-from core.encoder import EncoderDefinition
-from core.encoders import NETWORK_SUFFIX
-from core.features import FeatureExtractor
-from core.network import Convolution, NetworkDefinition, Relu, load_network, save_network
-from core.preprocessing import InputDefinition
+from core.frames.preprocessing import InputDefinition
+from core.method.catalogue import NETWORK_SUFFIX
+from core.method.encoder import EncoderDefinition
+from core.method.features import FeatureExtractor
+from core.networks.network import Convolution, NetworkDefinition, Relu, load_network, save_network
 from tests.service.encoders import install
 
 SMALL = "small"

@@ -6,7 +6,7 @@ import random
 import zlib
 from collections.abc import Callable
 
-from core.containers import PNG_SIGNATURE
+from core.frames.containers import PNG_SIGNATURE
 
 Chunks = list[tuple[bytes, bytes]]
 

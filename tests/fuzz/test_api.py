@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from service.links import LINKS
-from service.roles import OPERATIONS
+from service.access.roles import OPERATIONS
+from service.http.links import LINKS
 from tests.fuzz import api
 from tests.service.server import Server
 

@@ -7,8 +7,8 @@ from collections import Counter
 import pytest
 
 from core.errors import InvalidImage
-from core.exif import read_whereabouts
-from core.images import Limits, decode
+from core.frames.exif import read_whereabouts
+from core.frames.images import Limits, decode
 from tests.fuzz import images
 from tests.fuzz.mutations import KINDS, mutant
 from tests.fuzz.originals import originals

@@ -15,23 +15,23 @@ from hypothesis import strategies as st
 from safetensors.torch import save_file
 from scipy.io import savemat
 
-from core.checkpoints import read_checkpoint
-from core.containers import find_exif
-from core.encoders import load_encoder
 from core.errors import InvalidArchive, InvalidCursor, InvalidImage, InvalidModel, PlacerecError
-from core.exif import read_orientation, read_whereabouts
-from core.images import decode
-from core.matfiles import read_mat
-from core.network import load_network, read_definition
+from core.frames.containers import find_exif
+from core.frames.exif import read_orientation, read_whereabouts
+from core.frames.images import decode
+from core.method.catalogue import load_encoder
+from core.networks.checkpoints import read_checkpoint
+from core.networks.matfiles import read_mat
+from core.networks.network import load_network, read_definition
 from core.storage.archives.manifest import read_manifest
-from core.storage.archives.tape import manifest_size
-from core.storage.arrays import StaleArrays, read_arrays, write_arrays
-from core.storage.cursors import decode_name, decode_number, encode_cursor
-from service.faults import Fault
-from service.filters import FilterParameters, parse_box, parsed_json
-from service.multipart import FormReader
-from service.parameters import EnrolParameters, validated
-from service.traces import read_trace
+from core.storage.archives.tar_layout import manifest_size
+from core.storage.database.cursors import decode_name, decode_number, encode_cursor
+from core.storage.files.arrays import StaleArrays, read_arrays, write_arrays
+from service.errors.faults import Fault
+from service.http.multipart import FormReader
+from service.http.parameters import EnrolParameters, validated
+from service.queries.filters import FilterParameters, parse_box, parsed_json
+from service.telemetry.traces import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 
 FEW = settings(max_examples=60, deadline=2000, suppress_health_check=[HealthCheck.too_slow], derandomize=True)

@@ -59,7 +59,10 @@ def test_the_packages_are_found() -> None:
     [
         ("core", {"service", "training", "benchmarks", "examples", "tests"} | HTTP),
         ("core", {"typer", "click", "rich", "prometheus_client"}),
-        ("core/storage", {"torch", "numba", "cv2", "core.encoder", "core.encoders", "core.network"}),
+        (
+            "core/storage",
+            {"torch", "numba", "cv2", "core.method.encoder", "core.method.catalogue", "core.networks.network"},
+        ),
         ("service", {"training", "benchmarks", "examples", "tests"}),
         ("training", {"service", "benchmarks", "tests"}),
         ("examples", {"core", "service", "training", "tests"}),

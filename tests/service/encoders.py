@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from core.agreement import AgreementDefinition
-from core.backbone import Backbone
-from core.encoder import Encoder, EncoderDefinition
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
-from core.features import FeatureExtractor
-from core.network import load_network
-from core.projection import Projection, fit_projection
-from core.regions import unit_length
-from core.verdict import Calibration
-from core.vocabulary import train_vocabulary
+from core.judgement.verdict import Calibration
+from core.method.agreement import AgreementDefinition
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
+from core.method.encoder import Encoder, EncoderDefinition
+from core.method.features import FeatureExtractor
+from core.method.projection import Projection, fit_projection
+from core.method.regions import unit_length
+from core.method.vocabulary import train_vocabulary
+from core.networks.backbone import Backbone
+from core.networks.network import load_network
 from tests.service.scenes import scene, seen_again
 
 COARSE = "coarse"

@@ -12,10 +12,10 @@ import numpy as np
 
 from core.places import PlaceFields, Pose
 from core.storage import Enrolment
-from service.engine import Engine
-from service.job_records import Job
-from service.metrics import Metrics
+from service.engine.engine import Engine
+from service.jobs.records import Job
 from service.settings import Settings
+from service.telemetry.metrics import Metrics
 
 ENCODER = "some@" + "0" * 64
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from core.preprocessing import Pixels
+from core.frames.preprocessing import Pixels
 
 WORDS = ("EXIT", "LAB 2", "NORTH", "MUSEUM", "42", "STAIRS", "CAFE", "WAREHOUSE")
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.encoder import Encoder
-from core.encoders import DEFAULT_ENCODER, EncoderCatalogue
-from core.images import decode
-from core.recalibration import Measurement, Target, held_figures, recalibrate
-from core.traverses import find_images
-from core.trials import Trials
+from core.frames.images import decode
+from core.frames.traverses import find_images
+from core.judgement.map_calibration import Measurement, Target, held_figures, recalibrate
+from core.judgement.trials import Trials
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
 from training.honesty import half_trials, widened
 from training.validation import Shown, describe
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from core.agreement import AgreementDefinition
-from core.network import ShallowNetwork
-from core.projection import Projection
+from core.method.agreement import AgreementDefinition
+from core.method.projection import Projection
+from core.networks.network import ShallowNetwork
 from training.contrast import CellDescriptor, Pairs, contrastive_loss, neighbours, refine
 from training.curve import draw
 from training.projection import fit_projections, paired_cells

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from safetensors.torch import load_file
 
-from core.network import ShallowNetwork
+from core.networks.network import ShallowNetwork
 from training.distillation import cosine_loss, distill, learning_rate
 from training.disturbance import STEPS, disturb
 from training.photographs import DisturbedCrops, day_and_night, random_crop, split_photographs

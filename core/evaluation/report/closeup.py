@@ -16,8 +16,8 @@ from core.evaluation.report.text import counted, escape, number
 from core.evaluation.report.theme import Mark
 
 if TYPE_CHECKING:
-    from core.evaluation.comparison import Comparison, Run
-    from core.evaluation.thresholds import Thresholding
+    from core.evaluation.protocol.comparison import Comparison, Run
+    from core.evaluation.protocol.thresholds import Thresholding
 
 RULES = {
     "mean_of_negatives": "the mean score of the queries without a true reference",

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from core.evaluation import Outcome
-    from core.evaluation.comparison import Run
+    from core.evaluation.protocol.comparison import Run
 
 Curve = tuple[NDArray[np.float64], NDArray[np.float64]]
 """x and y of a curve's points, each float64 [P], by rising x."""

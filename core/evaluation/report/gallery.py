@@ -14,7 +14,7 @@ from core.evaluation.report.text import escape, number
 
 if TYPE_CHECKING:
     from core.evaluation import Outcome
-    from core.evaluation.comparison import Box, Comparison, Run
+    from core.evaluation.protocol.comparison import Box, Comparison, Run
 
 Regions = Callable[[Path], "Sequence[Box] | None"]
 

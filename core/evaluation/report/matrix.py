@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.evaluation.report.drawing import SHARPNESS, Margins, Sheet, paint_png
 from core.evaluation.report.text import counted
 from core.evaluation.report.theme import LIGHT, Theme, rgb
-from core.traverses import Truth
+from core.frames.traverses import Truth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,7 @@ from core.evaluation.report.theme import DARK, LIGHT, Cast
 from core.evaluation.report.trends import plot_cost, plot_scalability, plot_severity
 
 if TYPE_CHECKING:
-    from core.evaluation.comparison import Comparison
+    from core.evaluation.protocol.comparison import Comparison
 
 
 @dataclass

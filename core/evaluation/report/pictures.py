@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from core.containers import read_header
 from core.errors import InvalidImage
 from core.evaluation.report.text import escape
-from core.images import decode, encode_thumbnail
+from core.frames.containers import read_header
+from core.frames.images import decode, encode_thumbnail
 
 if TYPE_CHECKING:
-    from core.evaluation.comparison import Box
+    from core.evaluation.protocol.comparison import Box
 
 LONGEST = 256
 """Pixels of a small copy's longer side."""

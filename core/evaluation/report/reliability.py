@@ -12,9 +12,9 @@ from core.evaluation.report.theme import Cast, Mark, Theme
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from core.evaluation.comparison import Run
-    from core.evaluation.trust import Trust
-    from core.reliability import Share
+    from core.evaluation.protocol.comparison import Run
+    from core.evaluation.protocol.trust import Trust
+    from core.judgement.reliability import Share
 
 HEADINGS = ("system", "right against wrong, AUC-ROC", "ECE", "Brier", "of the base rate", "P at 95 %", "R at 95 %")
 

@@ -12,7 +12,7 @@ from core.evaluation.report.theme import Cast, Mark
 from core.evaluation.report.trends import time_per_query
 
 if TYPE_CHECKING:
-    from core.evaluation.comparison import Run
+    from core.evaluation.protocol.comparison import Run
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from core.evaluation.report.text import plain
 
 if TYPE_CHECKING:
-    from core.evaluation.comparison import Run
+    from core.evaluation.protocol.comparison import Run
 
 Dashes = tuple[float, ...]
 

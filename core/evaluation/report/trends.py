@@ -23,7 +23,7 @@ from core.evaluation.report.theme import Cast, Mark, Theme, short
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from core.evaluation.comparison import Run, ScalePoint, SeverityCurve
+    from core.evaluation.protocol.comparison import Run, ScalePoint, SeverityCurve
 
 
 SHORTEST = 1e-3

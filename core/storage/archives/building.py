@@ -15,20 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidArchive, InvalidField, InvalidImage
-from core.storage import descriptors, ledger, seals
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
 from core.storage.cameras import MOST_CAMERAS
-from core.storage.database import FILE, connect
-from core.storage.descriptors import ROWS_PER_SEGMENT, Layout
-from core.storage.disk import Damage, sync_file, sync_folder
-from core.storage.ledger import moment_text
-from core.storage.named import named_segments
+from core.storage.database import ledger
+from core.storage.database import row_checksums as seals
+from core.storage.database.connections import FILE, connect
+from core.storage.database.ledger import moment_text
+from core.storage.database.schema import NO_SEQUENCE
+from core.storage.database.segment_table import named_segments
+from core.storage.files import segment_files as descriptors
+from core.storage.files.disk import Damage, sync_file, sync_folder
+from core.storage.files.row_formats import LARGEST_HALF
+from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder
 from core.storage.records import MapRecord
-from core.storage.resting import LARGEST_HALF
-from core.storage.schema import NO_SEQUENCE
 from core.storage.writing import name_appended
 
 CHUNK_BYTES = 16 << 20

@@ -19,7 +19,6 @@ from typing import BinaryIO
 import numpy as np
 
 from core.errors import StorageFailure, UnknownMap
-from core.storage import seals
 from core.storage.archives.lines import StoredLine, camera_lines, place_lines, sequence_lines
 from core.storage.archives.manifest import (
     CAMERAS,
@@ -37,10 +36,11 @@ from core.storage.archives.manifest import (
 )
 from core.storage.archives.playback import ROW, ROWS, Links, Playback
 from core.storage.cameras import Access
-from core.storage.database import FILE
-from core.storage.descriptors import Layout, segment_name
-from core.storage.disk import Damage
-from core.storage.named import named_segments
+from core.storage.database import row_checksums as seals
+from core.storage.database.connections import FILE
+from core.storage.database.segment_table import named_segments
+from core.storage.files.disk import Damage
+from core.storage.files.segment_files import Layout, segment_name
 from core.storage.opening import OpenMap, read_layout
 
 PLACES_PER_GROUP = 1024

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.errors import InvalidArchive
-from core.masks import Mask
+from core.frames.masks import Mask
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
 from core.storage.patches import complaint

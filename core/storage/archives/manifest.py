@@ -25,11 +25,11 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
+from core.judgement.probability import Curve
+from core.judgement.verdict import Calibration
 from core.places import check_map_id
-from core.probability import Curve
 from core.storage.patches import complaint
 from core.storage.records import MapRecord
-from core.verdict import Calibration
 
 FORMAT = "placerec map"
 VERSION = 1

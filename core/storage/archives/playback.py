@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, seal_of
-from core.storage.archives.tape import BLOCK, Member, Tape, header
-from core.storage.descriptors import HEADER_BYTES, Layout, segment_name
-from core.storage.disk import Damage, refusals
+from core.storage.archives.tar_layout import BLOCK, Member, Tape, header
+from core.storage.files.disk import Damage, refusals
+from core.storage.files.segment_files import HEADER_BYTES, Layout, segment_name
 
 ROWS = "rows.bin"
 ROW = np.dtype([("row", "<u8"), ("checksum", "<u4")])

@@ -12,7 +12,7 @@ from typing import Self
 from core.errors import InvalidArchive
 from core.storage.archives.lines import MOST_LINE_BYTES
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
-from core.storage.archives.tape import BLOCK, END_BYTES, Member, Tape, describe, header, manifest_size, padded
+from core.storage.archives.tar_layout import BLOCK, END_BYTES, Member, Tape, describe, header, manifest_size, padded
 
 CHUNK_BYTES = 1 << 20
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from core.belief.evidence import LISTED, STRENGTH, STRONGEST, UNKNOWN, evidence
-from core.verdict import Calibration, Neighborhood, judge
+from core.judgement.verdict import Calibration, Neighborhood, judge
 from tests.core.belief.maps import walk
 
 CALIBRATION = Calibration(

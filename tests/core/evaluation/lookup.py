@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.preprocessing import Pixels
-from core.systems.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.frames.preprocessing import Pixels
 
 
 def write_pictures(folder: Path, values: Sequence[int]) -> list[Path]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from core.evaluation.cache import EvaluationCache
+from core.evaluation.data.pairs import TraversePair
 from core.evaluation.measurement import best_first, measure, run
-from core.evaluation.pairs import TraversePair
 from core.evaluation.subjects import Subject, Training
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.lookup import Learner, Lookup, load, write_pictures
 
 

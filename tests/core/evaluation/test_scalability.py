@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from core.evaluation.cache import EvaluationCache
-from core.evaluation.pairs import TraversePair
+from core.evaluation.data.pairs import TraversePair
 from core.evaluation.scalability import scalability, scale_sizes
 from core.evaluation.subjects import Subject, Training
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.lookup import Lookup, load, write_pictures
 
 

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.encoders import EncoderCatalogue
+from core.baselines.catalogue import build
 from core.evaluation.cache import EvaluationCache
-from core.evaluation.disturbances import Disturbance, darkness
-from core.evaluation.pairs import TraversePair
+from core.evaluation.data.disturbances import Disturbance, darkness
+from core.evaluation.data.pairs import TraversePair
 from core.evaluation.severity import severity, severity_steps
 from core.evaluation.subjects import Subject, Training
-from core.images import decode
-from core.preprocessing import Pixels
-from core.systems.catalogue import build
-from core.traverses import tolerance_truth
+from core.frames.images import decode
+from core.frames.preprocessing import Pixels
+from core.frames.traverses import tolerance_truth
+from core.method.catalogue import EncoderCatalogue
 from tests.core.evaluation.lookup import Lookup, load, write_pictures
 from tests.service.scenes import encoded, scene
 

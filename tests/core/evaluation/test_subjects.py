@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.baselines.system import Description, Index, Trainable
 from core.errors import InvalidModel
-from core.evaluation.pairs import TraversePair
+from core.evaluation.data.pairs import TraversePair
 from core.evaluation.subjects import Subject, Training
-from core.systems.system import Description, Index, Trainable
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.lookup import Learner, Lookup, Together, load, write_pictures
 
 TABLE = np.eye(6, dtype=np.float32)

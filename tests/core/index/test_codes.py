@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from core.index import Coder, Codes
 from core.index.codes import PlaneQuery
-from core.index.kernels import estimates_at, estimates_of
 from core.index.rotation import random_signs
+from core.kernels.codes import estimates_at, estimates_of
 from tests.core.index.made_up import Array, descriptors, second_looks
 
 WIDE = 4096

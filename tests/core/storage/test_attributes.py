@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map
 from core.storage.attributes import Scalar
-from core.storage.database import FILE, connect
-from core.storage.schema import _VALUES, LONGEST_INDEXED, MIGRATIONS, check_schema, migrate
+from core.storage.database.connections import FILE, connect
+from core.storage.database.schema import _VALUES, LONGEST_INDEXED, MIGRATIONS, check_schema, migrate
 
 DIMENSION = 4
 

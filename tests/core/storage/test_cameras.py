@@ -10,7 +10,7 @@ from sqlite3 import Connection
 import pytest
 
 from core.errors import UnknownCamera
-from core.masks import Mask
+from core.frames.masks import Mask
 from core.storage import Map
 from core.storage.writing import Write
 

@@ -20,10 +20,10 @@ from core.errors import (
     UnknownPlace,
     UnknownSequence,
 )
-from core.images import decode, encode_png
+from core.frames.images import decode, encode_png
+from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Map, MapSettings
-from core.verdict import Calibration
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)

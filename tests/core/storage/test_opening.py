@@ -12,7 +12,7 @@ import pytest
 
 from core.errors import MapQuarantined
 from core.storage import Atlas
-from core.storage.descriptors import HEADER_BYTES
+from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import (
     DESCRIPTOR_BYTES,
     DIMENSION,

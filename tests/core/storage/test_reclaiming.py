@@ -11,13 +11,13 @@ import pytest
 
 from core.errors import MapQuarantined, UnknownPlace
 from core.storage import Atlas, Map
-from core.storage.database import FILE
-from core.storage.descriptors import segment_name
+from core.storage.database.connections import FILE
+from core.storage.files.segment_files import segment_name
 from core.storage.opening import open_map
 from core.storage.reclaiming import Remains
-from core.storage.snapshot import Snapshot
+from core.storage.search.snapshot import Snapshot
 from tests.core.storage.frames import frame
-from tests.core.storage.test_tier_memory import become
+from tests.core.storage.search.test_tier_memory import become
 
 
 def files(directory: Path) -> list[str]:

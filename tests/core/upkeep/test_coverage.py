@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from core.judgement.verdict import METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.upkeep.coverage import backward_steps, distances, durations, long_steps, unlike_steps
-from core.verdict import METRIC, NO_POSE, NO_TIME, Whereabouts
 
 
 def along(x: list[float], kinds: list[int] | None = None, seconds: list[float | None] | None = None) -> Whereabouts:

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from core.judgement.verdict import Verdict
 from core.upkeep.drift import SCORE_BINS, Week, score_trend, trend, unknown_trend
-from core.verdict import Verdict
 
 MONDAY = date(2026, 1, 5)
 

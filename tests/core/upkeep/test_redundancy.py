@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import MOST_NEIGHBOURS, Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
-from core.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 
 
 def where(kinds: list[int], x: list[float], sequences: list[int] | None = None) -> Whereabouts:

@@ -17,7 +17,7 @@ import httpx
 import pytest
 from PIL import ExifTags, Image
 
-from service.commands.bulk import FIRST_BATCH
+from service.commands.connection.bulk import FIRST_BATCH
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server

@@ -10,14 +10,14 @@ import httpx
 import pytest
 import typer.main
 
+from service.access.keys import KeyStore
+from service.access.principals import TOKEN
 from service.commands import application
-from service.commands.client import Refused, refusal
+from service.commands.connection.client import Refused, refusal
+from service.commands.connection.credentials import travels_openly
 from service.commands.console import Failure
-from service.commands.credentials import travels_openly
 from service.commands.keys import moment
-from service.keys import KeyStore
-from service.load import request
-from service.principals import TOKEN
+from service.commands.load import request
 from tests.service.commands.conftest import Placerec
 
 

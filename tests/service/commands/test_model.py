@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.encoders import EncoderCatalogue
-from core.network import load_network, read_definition
-from tests.core.caffe_writer import caffemodel, input_dim, small_network
+from core.method.catalogue import EncoderCatalogue
+from core.networks.network import load_network, read_definition
+from tests.core.networks.caffe_writer import caffemodel, input_dim, small_network
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, scene
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.encoders import PACKAGED, EncoderCatalogue
+from core.method.catalogue import PACKAGED, EncoderCatalogue
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, scene
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from core.baselines.system import About
 from core.evaluation import Comparison, Outcome, Run, judge, summarize
-from core.systems.system import About
-from core.traverses import Truth, tolerance_truth
+from core.frames.traverses import Truth, tolerance_truth
 
 TIMES: dict[str, float | None] = {"forward": 4.25, "regions": None, "vlad": None, "match": 0.5}
 

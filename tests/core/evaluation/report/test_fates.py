@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from core.evaluation.protocol.thresholds import Counts, thresholdings
 from core.evaluation.report.fates import fate, fate_before, plot_fates, scores_by_fate
-from core.evaluation.thresholds import Counts, thresholdings
 from tests.core.evaluation.report.comparisons import outcome
 
 OUTCOMES = [

@@ -6,7 +6,7 @@ import numpy as np
 from core.evaluation import judge
 from core.evaluation.report.matrix import RIGHT, TRUTH, WRONG, heat_file, layers, matrix_file, png, true_cells
 from core.evaluation.report.theme import rgb
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 
 
 def test_true_cells_of_kept_references() -> None:

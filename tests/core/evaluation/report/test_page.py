@@ -12,7 +12,7 @@ import pytest
 from core.errors import StorageFailure
 from core.evaluation import Comparison, ScalePoint, SeverityCurve
 from core.evaluation.report import write_report
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_pictures
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from core.evaluation import Comparison
+from core.evaluation.protocol.trust import trust_figures
 from core.evaluation.report import write_report
 from core.evaluation.report.reliability import plot_reliability, trust_table
 from core.evaluation.report.theme import Cast
-from core.evaluation.trust import trust_figures
 from tests.core.evaluation.report.comparisons import make_comparison, read_page
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from core.evaluation.report.table import columns, figures_table, stages
 from core.evaluation.report.theme import Cast
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.report.comparisons import make_comparison, make_run, read_page
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.evaluation.report.theme import DARK, LIGHT, Cast, Theme, rgb, short
-from core.traverses import tolerance_truth
+from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.report.comparisons import make_comparison, make_run
 
 # Machado, Oliveira, Fernandes, 2009, severity 1, on linear RGB.

@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import pytest
 
-from core.masks import Mask
+from core.frames.masks import Mask
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from tests.core.storage.archives.files import exported

@@ -14,7 +14,7 @@ from core.storage import Map
 from core.storage.archives.building import build
 from core.storage.archives.manifest import seal_of
 from core.storage.archives.reading import Archive
-from core.storage.archives.tape import header, padded
+from core.storage.archives.tar_layout import header, padded
 from core.storage.atlas import Atlas
 
 Parts = dict[str, bytes]

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
-from core.storage import Atlas, descriptors
+from core.storage import Atlas
 from core.storage.archives import building
 from core.storage.archives.building import build, layout_of
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive
+from core.storage.files import segment_files as descriptors
 from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, frame
 

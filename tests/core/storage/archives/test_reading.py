@@ -18,7 +18,7 @@ from core.errors import ArchiveTooNew, InvalidArchive
 from core.storage.archives.lines import CameraLine, PlaceLine, read_line
 from core.storage.archives.manifest import MOST_MANIFEST_BYTES, group_names, read_manifest
 from core.storage.archives.reading import Archive, check
-from core.storage.archives.tape import BLOCK, header
+from core.storage.archives.tar_layout import BLOCK, header
 from tests.core.storage.archives.files import Parts, grown, named, parts_of, sealed, taped
 
 Made = Callable[[bytes], bytes]

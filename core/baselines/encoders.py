@@ -1,0 +1,98 @@
+"""This project's encoders, M-Region-VLAD and Region-VLAD among them, as systems of the comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.frames.preprocessing import Pixels
+
+if TYPE_CHECKING:
+    from core.method.catalogue import EncoderSummary
+    from core.method.encoder import Encoder
+
+_CAMAL = (
+    "Khaliq, Ehsan, Milford, McDonald-Maier: CAMAL: Context-Aware Multi-layer Attention framework "
+    "for Lightweight Environment Invariant Visual Place Recognition, 2019"
+)
+TITLES = {
+    "m-region-vlad": "M-Region-VLAD",
+    "m-region-vlad-thesis": "M-Region-VLAD as in the thesis",
+    "region-vlad": "Region-VLAD",
+}
+PAPERS = {
+    "m-region-vlad": _CAMAL,
+    "m-region-vlad-thesis": _CAMAL,
+    "region-vlad": "Khaliq, Ehsan, Chen, Milford, McDonald-Maier: A Holistic Visual Place Recognition Approach Using "
+    "Lightweight CNNs for Significant ViewPoint and Appearance Changes, IEEE Transactions on Robotics 36(2), 2020",
+}
+
+
+def about_encoder(summary: EncoderSummary) -> About:
+    """An installed encoder as the catalogue shows it; of a damaged one, what is wrong with it."""
+    definition = summary.definition
+    if definition is None:
+        return About(summary.name, summary.name, summary.damaged or "", {})
+    return About(
+        name=summary.name,
+        title=TITLES.get(summary.name, summary.name),
+        paper=PAPERS.get(summary.name, "an encoder installed on this machine"),
+        configuration={"network": summary.network, **constants(definition.model_dump())},
+    )
+
+
+def constants(fields: Mapping[str, Any], within: str = "") -> dict[str, Any]:
+    """The fields of a definition, those of its parts as ``part.field``; what is not in use (None) is left out."""
+    flat: dict[str, Any] = {}
+    for name, value in fields.items():
+        if isinstance(value, Mapping):
+            flat |= constants(value, f"{within}{name}.")
+        elif value is not None:
+            flat[within + name] = value
+    return flat
+
+
+class EncoderSystem:
+    """One vector a frame, compared by inner products, and local descriptors if there is a second stage."""
+
+    sequential = False
+
+    def __init__(self, encoder: Encoder, about: About) -> None:
+        self.encoder, self.about = encoder, about
+        self.identity = encoder.identity
+
+    def describe(self, pixels: Pixels) -> Description:
+        encoding = self.encoder.encode(pixels)
+        arrays: dict[str, NDArray[Any]] = {"descriptor": encoding.descriptor}
+        if self.encoder.candidates:
+            arrays["local"] = encoding.local
+        return Description(arrays, encoding.milliseconds)
+
+    def index(self, references: Sequence[Description]) -> Index:
+        first = InnerProducts(stack(references), finish=self.encoder.scores_from_inner_products)
+        if not self.encoder.candidates:
+            return first
+        return TwoStages(first, local_of(references), self.encoder)
+
+
+@dataclass(frozen=True)
+class TwoStages:
+    """The first candidates by inner product are examined cell by cell; local: int8 [R, C, L]."""
+
+    first: InnerProducts
+    local: NDArray[np.int8]
+    encoder: Encoder
+
+    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+        ranked = self.first.compare(queries)
+        return self.encoder.with_agreement(ranked, local_of(queries), self.local)
+
+
+def local_of(descriptions: Sequence[Description]) -> NDArray[np.int8]:
+    """The local descriptors of n descriptions, int8 [n, C, L]."""
+    return np.stack([description.arrays["local"] for description in descriptions]).astype(np.int8, copy=False)

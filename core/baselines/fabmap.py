@@ -1,0 +1,208 @@
+"""FAB-MAP: how probable a frame's visual words are at each place, and at a new one.
+
+Cummins, Newman: FAB-MAP: Probabilistic Localization and Mapping in the Space of Appearance, International
+Journal of Robotics Research 27(6), 2008.  The local features are SIFT's: OpenCV's wheels do not contain the
+paper's SURF.  A place is known by one frame, no motion is assumed, and the new place is the paper's mean
+field: the sampled one would draw from the training frames, which may show these very places.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from core.baselines.chow_liu import Tree, chow_liu
+from core.baselines.entry import Constants, Entry, Ingredients, arrays_digest, system_identity
+from core.baselines.system import About, Description, Index
+from core.baselines.words import nearest_words, train_words
+from core.errors import InvalidModel
+from core.frames.preprocessing import Pixels
+
+Array = NDArray[np.float32]
+Observations = NDArray[np.bool_]
+Reals = NDArray[np.float64]
+
+V = 4000
+LONGEST_SIDE = 640
+P_Z_GIVEN_E, P_Z_GIVEN_NOT_E = 0.39, 0.0
+"""The detector: how often a word is observed where the thing that makes it is, and where it is not."""
+
+CONSTANTS: Constants = {
+    "V": V,
+    "features": "SIFT",
+    "longest_side": LONGEST_SIDE,
+    "p(z|e)": P_Z_GIVEN_E,
+    "p(z|not e)": P_Z_GIVEN_NOT_E,
+    "new_place": "mean field",
+}
+ABOUT = About(
+    "fabmap",
+    "FAB-MAP",
+    "Cummins, Newman: FAB-MAP: Probabilistic Localization and Mapping in the Space of Appearance, International "
+    "Journal of Robotics Research 27(6), 2008",
+    CONSTANTS,
+)
+
+
+def local_features(pixels: Pixels) -> Array:
+    """SIFT descriptors, float32 [T, 128] of whole numbers to 255; T may be 0.  A large frame is shrunk first."""
+    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    scale = LONGEST_SIDE / max(grey.shape)
+    if scale < 1:
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
+    return np.empty((0, 128), np.float32) if descriptors is None else np.asarray(descriptors, np.float32)
+
+
+def existence(observed: Observations, marginals: Reals) -> Reals:
+    """p(e_q = 1 | L): that what makes word q is at a place where it was, or was not, observed once.
+
+    Its prior is the word's marginal, as in OpenFABMAP (Glover et al., ICRA 2012).
+
+    Args:
+        observed: bool [..., V].
+        marginals: float64 [V], p(z_q = 1).
+    """
+    there = np.where(observed, P_Z_GIVEN_E, 1 - P_Z_GIVEN_E) * marginals
+    absent = np.where(observed, P_Z_GIVEN_NOT_E, 1 - P_Z_GIVEN_NOT_E) * (1 - marginals)
+    return np.asarray(there / (there + absent))
+
+
+def observed_given(observed: Observations, tree: Tree) -> Reals:
+    """p(z_q | e_q, z_parent) of a frame's observations z, for e_q = 0 and 1:
+    proportional to p(z_q | e_q) p(z_q | z_parent) / p(z_q).
+
+    Args:
+        observed: bool [V].
+
+    Returns:
+        float64 [2, V].
+    """
+    detector = np.array([P_Z_GIVEN_NOT_E, P_Z_GIVEN_E])[:, None]  # p(z = 1 | e)
+    given = np.where(observed[tree.parents], tree.given[1], tree.given[0])  # p(z = 1 | z_parent)
+    seen = detector * given / tree.marginals
+    unseen = (1 - detector) * (1 - given) / (1 - tree.marginals)
+    return np.asarray(np.where(observed, seen, unseen) / (seen + unseen))
+
+
+def log_likelihoods(observed: Observations, places: Observations, tree: Tree) -> Reals:
+    """log p(Z | L) of a frame at each place, and last at the average place (mean field).
+
+    Args:
+        observed: bool [V], the frame's words.
+        places: bool [R, V], each place's words.
+
+    Returns:
+        float64 [R + 1].
+    """
+    without, with_it = observed_given(observed, tree)
+    # Only two values are possible a word: that of places where it was observed, and that of the others.
+    word = np.ones_like(observed)
+    if_observed, if_not, average = (
+        np.log(there * with_it + (1 - there) * without)
+        for there in (existence(word, tree.marginals), existence(~word, tree.marginals), tree.marginals)
+    )
+    known = if_not.sum() + places.astype(np.float64) @ (if_observed - if_not)
+    return np.append(known, average.sum())
+
+
+def log_odds(likelihoods: Reals) -> Reals:
+    """log p / (1 - p) of the posterior p(L | Z) of each place, all and the new one equally likely before.
+
+    The logarithm of the odds, because the posterior itself is 1 to the last digit of many good matches.
+
+    Args:
+        likelihoods: float64 [R + 1], logarithms, the new place last.
+
+    Returns:
+        float64 [R].
+    """
+    best = int(np.argmax(likelihoods))
+    scaled = np.exp(likelihoods - likelihoods[best])
+    # What all others have together: each but the best one has the best among them, so this loses nothing...
+    with np.errstate(divide="ignore"):
+        others = likelihoods[best] + np.log(scaled.sum() - scaled)
+    # ... and the best one's would be lost to rounding.
+    others[best] = np.logaddexp.reduce(np.delete(likelihoods, best))
+    return np.asarray((likelihoods - others)[:-1])
+
+
+class Places:
+    """Known places, each by the words of its frame."""
+
+    def __init__(self, references: Sequence[Description], tree: Tree) -> None:
+        self._tree = tree
+        self._places = np.stack([unpack(reference, len(tree.parents)) for reference in references])
+
+    def compare(self, queries: Sequence[Description]) -> Array:
+        frames = (unpack(query, len(self._tree.parents)) for query in queries)
+        return np.stack([log_odds(log_likelihoods(frame, self._places, self._tree)) for frame in frames]).astype(
+            np.float32
+        )
+
+
+def unpack(description: Description, words: int) -> Observations:
+    """Which words a frame shows, bool [V]."""
+    return np.unpackbits(description.arrays["words"].astype(np.uint8), count=words).astype(np.bool_)
+
+
+class FabMap:
+    """The words of a frame as one bit each; scores are log-odds of the places."""
+
+    about, sequential = ABOUT, False
+
+    def __init__(self) -> None:
+        self.centers = np.empty((0, 128), np.float32)
+        self.tree: Tree | None = None
+
+    @property
+    def identity(self) -> str:
+        if self.tree is None:
+            return system_identity(ABOUT)
+        tree = self.tree
+        learned = arrays_digest(centers=self.centers, parents=tree.parents, marginals=tree.marginals, given=tree.given)
+        return system_identity(ABOUT, training=learned)
+
+    def train(self, pictures: Iterable[Pixels], seed: int) -> None:
+        """Learn the vocabulary, and from its words in the same pictures the tree.
+
+        Raises:
+            InvalidModel: none has a local feature.
+        """
+        # Whole numbers: bytes keep them, in a quarter of the room.
+        frames = [local_features(pixels).astype(np.uint8) for pixels in pictures]
+        self.centers = train_words(frames, V, seed)
+        self.tree = chow_liu(np.stack([self.observe(frame.astype(np.float32)) for frame in frames]))
+
+    def observe(self, features: Array) -> Observations:
+        """Which words the features of a frame, float32 [T, 128], are nearest to; bool [V]."""
+        observed = np.zeros(len(self.centers), np.bool_)
+        observed[nearest_words(features, self.centers)] = True
+        return observed
+
+    def describe(self, pixels: Pixels) -> Description:
+        if self.tree is None:
+            raise InvalidModel("fabmap has no words yet; train it on pictures first.")
+        began = time.perf_counter()
+        features = local_features(pixels)
+        between = time.perf_counter()
+        words = np.packbits(self.observe(features))
+        times = {"forward": 1e3 * (between - began), "words": 1e3 * (time.perf_counter() - between)}
+        return Description({"words": words}, times)
+
+    def index(self, references: Sequence[Description]) -> Index:
+        if self.tree is None:
+            raise InvalidModel("fabmap has no words yet; train it on pictures first.")
+        return Places(references, self.tree)
+
+
+def build(ingredients: Ingredients) -> FabMap:
+    ingredients.none(ABOUT)
+    return FabMap()
+
+
+SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)

@@ -1,0 +1,82 @@
+"""Two traverses of the same places, and what is true of them: what systems are compared on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidGroundTruth
+from core.frames.traverses import Truth
+
+
+@dataclass(frozen=True)
+class TraversePair:
+    """A known traverse and one to recognize.
+
+    name: of the data set.
+    references, queries: the full traverses, in order.
+    truth: of each query, indices into ``references``, kept or not.
+    kept: int64 [R'], ascending, indices of the references to match against.
+    notes: sentences about the data that a reader of its figures must know.
+    """
+
+    name: str
+    references: list[Path]
+    queries: list[Path]
+    truth: Truth
+    kept: NDArray[np.int64]
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def kept_references(self) -> list[Path]:
+        """The pictures to match against."""
+        return [self.references[index] for index in self.kept]
+
+    def negatives(self) -> int:
+        """Queries without a kept true reference."""
+        return count_negatives(self.truth, self.kept)
+
+
+def all_references(references: list[Path]) -> NDArray[np.int64]:
+    """What is kept where no reference is left out; int64 [R]."""
+    return np.arange(len(references), dtype=np.int64)
+
+
+def count_negatives(truth: Truth, kept: NDArray[np.int64]) -> int:
+    """Queries without a kept true reference."""
+    return sum(not np.isin(true, kept).any() for true in truth)
+
+
+def leave_run_out(truth: Truth, references: int, keep: int, answerable: int, seed: int) -> NDArray[np.int64]:
+    """The references that stay when one contiguous run is left out, so that new places are among the queries.
+
+    The thesis gives counts only (Table 2.2), so which references go is our choice: of all runs that
+    leave ``keep``, one that comes nearest to ``answerable`` queries, drawn by ``seed``.
+
+    Args:
+        truth: of each query.
+        references: R.
+        keep: R'.
+        answerable: T', the queries that are to keep a true reference.
+
+    Returns:
+        int64 [R'], ascending.
+
+    Raises:
+        InvalidGroundTruth: there are not more references than are to be kept.
+    """
+    if not 0 < keep < references:
+        raise InvalidGroundTruth(
+            f"{keep} of {references} references cannot be kept: it must be fewer, and one at least."
+        )
+    removed = references - keep
+    starts = np.arange(keep + 1)
+    lost = sum(not len(true) for true in truth) + sum(
+        ((starts <= true[0]) & (true[-1] < starts + removed)).astype(np.int64) for true in truth if len(true)
+    )
+    misses = np.abs(lost - (len(truth) - answerable))
+    start = int(np.random.default_rng(seed).choice(starts[misses == misses.min()]))
+    return np.concatenate([np.arange(start), np.arange(start + removed, references)]).astype(np.int64)

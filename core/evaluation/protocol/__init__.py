@@ -1,0 +1,1 @@
+"""The thesis's protocol: outcomes of queries, figures, thresholds, files of results."""

@@ -1,0 +1,102 @@
+"""What an evaluation finds out, and hands to whoever shows it: the command line, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.evaluation.protocol.figures import Evaluation
+from core.evaluation.protocol.outcomes import Outcome
+from core.frames.traverses import Truth
+
+if TYPE_CHECKING:
+    from core.baselines.system import About
+
+Box = tuple[float, float, float, float]
+"""A region of a picture: left, top, right, bottom, as fractions of its width and height."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One system on one pair of traverses.
+
+    identity: of the system, ``<name>@<sha256>``.
+    outcomes: one for each query, in their order.
+    scores: float32 [Q, R'], higher is more alike; column j belongs to reference ``kept[j]`` of the comparison.
+    bytes_per_place: mean over the kept references.
+    milliseconds: medians per query, by stage; ``match`` is one query against all kept references.  None
+        for a stage that the system lacks.
+    cached: the figures, times included, are those of an earlier run.
+    """
+
+    about: About
+    identity: str
+    evaluation: Evaluation
+    outcomes: list[Outcome]
+    scores: NDArray[np.float32]
+    bytes_per_place: int
+    milliseconds: dict[str, float | None]
+    cached: bool = False
+
+
+@dataclass(frozen=True)
+class ScalePoint:
+    """One system on the first ``references`` places of the traverses (thesis, Fig. 3.9).
+
+    milliseconds: median of matching one query against all these references.
+    """
+
+    system: str
+    references: int
+    queries: int
+    auc_pr: float
+    recall_at_1: float | None
+    milliseconds: float
+
+
+@dataclass(frozen=True)
+class SeverityCurve:
+    """One system on query traverses that one disturbance changes more and more (thesis, 5.2 item 3).
+
+    levels: rising, the first is the undisturbed traverse; in ``unit``.
+    recall_at_1, auc_pr: one for each level.
+    """
+
+    disturbance: str
+    system: str
+    levels: list[float]
+    unit: str
+    recall_at_1: list[float]
+    auc_pr: list[float]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Systems on one pair of traverses.
+
+    name: of the data set.
+    references, queries: the full traverses.
+    kept: int64 [R'], ascending, indices of the references that were matched against.
+    truth: of each query, indices into ``references``, kept or not.
+    runs: best AUC-PR first.
+    regions: the regions of interest of a picture, of the best run whose system has some; None without one.
+    regions_of: identity of that run; its matches alone are shown with regions.
+    notes: sentences about the data that a reader must know, such as how references were chosen.
+    """
+
+    name: str
+    references: list[Path]
+    queries: list[Path]
+    kept: NDArray[np.int64]
+    truth: Truth
+    runs: list[Run]
+    regions: Callable[[Path], Sequence[Box] | None] | None = None
+    regions_of: str | None = None
+    scalability: list[ScalePoint] | None = None
+    severity: list[SeverityCurve] | None = None
+    notes: list[str] = field(default_factory=list)

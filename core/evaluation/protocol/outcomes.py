@@ -1,0 +1,68 @@
+"""What became of each query: its best match, whether that is right, where the first right one stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.frames.traverses import Truth
+
+Scores = NDArray[np.floating[Any]]
+"""float32 as systems give them, or float64 as others have saved them."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one query.
+
+    retrieved: index of its best match, in the full list of references.
+    rank: place of its best true reference in the ranking, from 1; None for a true negative.
+    """
+
+    retrieved: int
+    score: float
+    matched: bool
+    rank: int | None
+
+
+def judge_ranking(scores: Scores, kept: NDArray[np.int64], true: NDArray[np.int64]) -> Outcome:
+    """The outcome of one query; of equal scores the lower reference index comes first.
+
+    Args:
+        scores: [R'], against each kept reference.
+        kept: int64 [R'], their indices, ascending.
+        true: int64, indices of the query's true references, kept or not.
+
+    Raises:
+        ValueError: there is no score, or one that is not finite.
+    """
+    if len(scores) == 0 or not np.isfinite(scores).all():
+        raise ValueError("a ranking needs at least one score, all of them finite")
+    best = int(np.argmax(scores))
+    right = np.flatnonzero(np.isin(kept, true))
+    rank = None
+    if len(right):
+        first = right[np.argmax(scores[right])]
+        ahead = (scores > scores[first]) | ((scores == scores[first]) & (kept < kept[first]))
+        rank = 1 + int(np.count_nonzero(ahead))
+    return Outcome(int(kept[best]), float(scores[best]), rank == 1, rank)
+
+
+def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth) -> list[Outcome]:
+    """The outcomes of all queries.
+
+    Args:
+        scores: [Q, R'].
+        kept: int64 [R'], ascending.
+        truth: of each query.
+    """
+    return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
+
+
+def answerable(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The outcomes of queries with a kept true reference; the others are true negatives."""
+    return [outcome for outcome in outcomes if outcome.rank is not None]

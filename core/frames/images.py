@@ -1,0 +1,156 @@
+"""From the bytes of a frame to colour pixels, and back to small pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import cv2.utils.logging
+import numpy as np
+
+from core.errors import (
+    EmptyImage,
+    ImageTooLarge,
+    ImageTooSmall,
+    InvalidImage,
+    NotAnImage,
+    TooManyPixels,
+    TruncatedImage,
+)
+from core.frames.containers import Header, read_header, read_structure
+from core.frames.exif import read_orientation
+from core.frames.preprocessing import Pixels
+from core.frames.truncation import may_be_filled, same, with_other_endings
+
+__all__ = ["Header", "Limits", "Pixels", "decode", "encode_png", "encode_thumbnail", "read_header"]
+
+# The orientation is applied here, the same way for the three formats; OpenCV's versions differ in it.
+_COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+
+# A bad picture is an error that the caller gets; OpenCV need not tell stderr of it as well.
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large a frame may be, in bytes as sent and in pixels by its header, and how small."""
+
+    max_bytes: int = 16 * 1024 * 1024
+    max_pixels: int = 40_000_000
+    min_side: int = 16
+
+
+def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
+    """The pixels of a JPEG, PNG or WebP file, upright by its EXIF orientation.
+
+    Grey pictures and palettes become colour, transparency is dropped, 16 bits become 8.
+
+    Returns:
+        H x W x 3 uint8, BGR, contiguous.
+
+    Raises:
+        EmptyImage: no bytes.
+        ImageTooLarge: more than ``limits.max_bytes``.
+        TooManyPixels: the header announces more than ``limits.max_pixels``; nothing was decoded.
+        ImageTooSmall: a side is under ``limits.min_side``.
+        TruncatedImage: the bytes end before the image does, or do not hold all of it.
+        UnsupportedFormat: an image, but not one of the three formats, or an animation.
+        NotAnImage: anything else, or damaged.
+        MemoryError: there is no room for the pixels.
+    """
+    if not data:
+        raise EmptyImage("The image has no bytes.")
+    if len(data) > limits.max_bytes:
+        raise ImageTooLarge(f"The image has {len(data)} bytes; the limit is {limits.max_bytes}.")
+    header = read_header(data)
+    size = f"{header.width}x{header.height} pixels"
+    if header.width * header.height > limits.max_pixels:
+        raise TooManyPixels(f"The image has {size}; the limit is {limits.max_pixels}.")
+    if min(header.width, header.height) < limits.min_side:
+        raise ImageTooSmall(f"The image has {size}; a side needs at least {limits.min_side}.")
+    structure = read_structure(data, header)
+    if structure.needed:
+        data = b"".join(data[start:end] for start, end in structure.needed)
+    pixels = _pixels(data)
+    if pixels is None:
+        raise NotAnImage(f"The {header.format} data is damaged: it cannot be decoded.")
+    if pixels.shape != (header.height, header.width, 3) or pixels.dtype != np.uint8:
+        raise NotAnImage(f"The {header.format} header announces {size}, its data holds another picture.")
+    filled = header.format == "jpeg" and may_be_filled(structure, pixels)
+    if filled and not same(_pixels(with_other_endings(data, structure)), pixels):
+        raise TruncatedImage(f"The JPEG file is cut: its data ends before the {size} of its header do.")
+    return _upright(pixels, read_orientation(structure.exif))
+
+
+def _pixels(data: bytes) -> Pixels | None:
+    """What OpenCV makes of a file, None if nothing."""
+    try:
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)
+    except cv2.error as error:
+        if error.code == cv2.Error.StsNoMem:
+            raise MemoryError("the pixels find no room") from error
+        return None
+    return None if decoded is None else np.asarray(decoded)
+
+
+def _upright(pixels: Pixels, orientation: int) -> Pixels:
+    """Pixels as they are to be seen, for an EXIF orientation from 1 to 8; no copy is made for 1."""
+    match orientation:
+        case 2:
+            turned = cv2.flip(pixels, 1)
+        case 3:
+            turned = cv2.rotate(pixels, cv2.ROTATE_180)
+        case 4:
+            turned = cv2.flip(pixels, 0)
+        case 5:
+            turned = cv2.transpose(pixels)
+        case 6:
+            turned = cv2.rotate(pixels, cv2.ROTATE_90_CLOCKWISE)
+        case 7:
+            turned = cv2.transpose(cv2.rotate(pixels, cv2.ROTATE_180))
+        case 8:
+            turned = cv2.rotate(pixels, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        case _:
+            return pixels
+    return np.asarray(turned, np.uint8)
+
+
+def encode_thumbnail(pixels: Pixels, longest_side: int = 320, quality: int = 80) -> bytes:
+    """A JPEG of the picture, shrunk (never enlarged) to ``longest_side`` pixels.
+
+    Args:
+        pixels: H x W x 3 uint8, BGR.
+        longest_side: pixels of the longer side at most.
+        quality: 1 to 100, as JPEG encoders count it.
+
+    Raises:
+        InvalidImage: the picture cannot be encoded (a side is zero, or over 65 535).
+    """
+    height, width = pixels.shape[:2]
+    factor = longest_side / max(height, width, 1)
+    if factor < 1:
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return _encode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_png(pixels: Pixels) -> bytes:
+    """A PNG of the picture, pixel for pixel.
+
+    Args:
+        pixels: H x W x 3 uint8, BGR.
+
+    Raises:
+        InvalidImage: the picture cannot be encoded (a side is zero).
+    """
+    return _encode(".png", pixels, [])
+
+
+def _encode(extension: str, pixels: Pixels, options: list[int]) -> bytes:
+    try:
+        done, encoded = cv2.imencode(extension, pixels, options)
+    except cv2.error:
+        done = False
+    if not done:
+        raise InvalidImage(f"A picture of the shape {pixels.shape} cannot be written as {extension[1:]}.")
+    return encoded.tobytes()

@@ -1,0 +1,254 @@
+"""What a robot knows of where it is, held against where the places of a map are.
+
+A constraint used as a *filter* leaves only the places that satisfy it.  Used as a *soft prior* it weighs them: with
+the probability t ("trust") what the robot knows is right, and with 1 - t it says nothing, so that a place weighs
+
+    w = (1 - t) + t · Π fit,    fit in [0, 1],
+
+and log w, at most 0 and at least log(1 - t), is added to the place's log odds.  The weight is relative to the place
+that fits best, hence a prior can make an answer less sure, or choose among places that look alike, but it never makes
+a match surer than its frame did; and a robot that was carried away is still found, by stronger evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_TIME, Calibration, Whereabouts
+from core.places import EARTH_RADIUS, Pose
+
+Flags = NDArray[np.bool_]
+Values = NDArray[np.float64]
+
+LARGEST_TRUST = 0.999
+"""Nothing is known for certain; who wants certainty filters."""
+
+TOLERANCE = 1e-8
+"""Metres by which a place may be beyond the edge of an area: what rounding does to a position on the Earth."""
+
+UNCALIBRATED_STEEPNESS = 4.0
+"""Log odds lost from the threshold down to a decision value of 0, for encoders that nobody calibrated."""
+
+
+class Constraint(Protocol):
+    """Something that is true of some places."""
+
+    def holds(self, places: Whereabouts) -> Flags:
+        """Of which of the n places it is true; bool [n]."""
+
+    def fit(self, places: Whereabouts) -> Values:
+        """How well each of the n places goes with it; float64 [n] in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Within ``radius`` metres of a position; the fit is Gaussian with ``radius`` as its standard deviation.
+
+    A position in metres without z is compared in the plane.  Places without a pose of its kind are outside.
+    """
+
+    centre: Pose
+    radius: float
+
+    def _squares(self, places: Whereabouts) -> Values:
+        centre = self.centre.position()
+        axes = 2 if self.centre.kind() == "metric" and self.centre.z is None else 3
+        squares = np.zeros(len(places))
+        for axis in range(axes):
+            squares += np.square(places.position[:, axis] - centre[axis])
+        squares[places.kind != (METRIC if self.centre.kind() == "metric" else GEOGRAPHIC)] = np.inf
+        return squares
+
+    def holds(self, places: Whereabouts) -> Flags:
+        return self._squares(places) <= (self._straight() + TOLERANCE) ** 2
+
+    def fit(self, places: Whereabouts) -> Values:
+        return np.exp(-self._squares(places) / (2 * max(self._straight(), 1e-3) ** 2))
+
+    def _straight(self) -> float:
+        """The radius as the chord of its arc where positions are points of a sphere."""
+        if self.centre.kind() == "metric":
+            return self.radius
+        return 2 * EARTH_RADIUS * float(np.sin(min(self.radius / (2 * EARTH_RADIUS), np.pi / 2)))
+
+
+@dataclass(frozen=True)
+class Box:
+    """Between two parallels and two meridians, degrees; ``west`` > ``east`` crosses the antimeridian.  With edges."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+    def holds(self, places: Whereabouts) -> Flags:
+        x, y, z = places.position.T
+        south, north = (EARTH_RADIUS * np.sin(np.radians(edge)) for edge in (self.south, self.north))
+        inside = (places.kind == GEOGRAPHIC) & (z >= south - TOLERANCE) & (z <= north + TOLERANCE)
+        width = (self.east - self.west) % 360
+        if width == 0 and self.east != self.west:
+            return inside  # all around
+        # Half-planes through the axis instead of longitudes: no angle is computed, and nothing jumps at ±180°.
+        # At a pole x and y are 0, which is on every meridian.
+        west, east, middle = (np.radians(angle) for angle in (self.west, self.east, self.west + width / 2))
+        after_west = np.cos(west) * y - np.sin(west) * x >= -TOLERANCE
+        before_east = np.sin(east) * x - np.cos(east) * y >= -TOLERANCE
+        if width > 180:
+            return inside & (after_west | before_east)
+        return inside & after_west & before_east & (np.cos(middle) * x + np.sin(middle) * y >= -TOLERANCE)
+
+    def fit(self, places: Whereabouts) -> Values:
+        return self.holds(places).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Heading within ``tolerance`` degrees of ``heading``, around the circle; the fit is Gaussian in the angle between.
+
+    Headings count as the poses of the places do.  Places whose heading nobody knows do not satisfy it.
+    """
+
+    heading: float
+    tolerance: float
+
+    def _apart(self, places: Whereabouts) -> NDArray[np.float32]:
+        """Degrees between the headings; NaN where one is not known."""
+        apart = np.abs(places.heading - np.float32(self.heading % 360))
+        return np.minimum(apart, np.float32(360) - apart)
+
+    def holds(self, places: Whereabouts) -> Flags:
+        return self._apart(places) <= np.float32(self.tolerance + 1e-4)  # headings are kept as float32
+
+    def fit(self, places: Whereabouts) -> Values:
+        apart = np.nan_to_num(self._apart(places).astype(np.float64), nan=np.inf)
+        return np.exp(-0.5 * np.square(apart / max(self.tolerance, 1e-3)))
+
+
+@dataclass(frozen=True)
+class Period:
+    """Taken at or after ``after`` and at or before ``before``, microseconds since 1970 UTC; None: no bound."""
+
+    after: int | None
+    before: int | None
+
+    def holds(self, places: Whereabouts) -> Flags:
+        found = places.timestamp != NO_TIME
+        if self.after is not None:
+            found &= places.timestamp >= self.after
+        if self.before is not None:
+            found &= places.timestamp <= self.before
+        return found
+
+    def fit(self, places: Whereabouts) -> Values:
+        return self.holds(places).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class InSequences:
+    """Of one of these sequences, by code."""
+
+    codes: tuple[int, ...]
+
+    def holds(self, places: Whereabouts) -> Flags:
+        found = np.zeros(len(places), np.bool_)
+        for code in self.codes:
+            found |= places.sequence == code
+        return found
+
+    def fit(self, places: Whereabouts) -> Values:
+        return self.holds(places).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class NotLately:
+    """Not of the robot's own last frames, which it would find again at every standstill.
+
+    sequence: code of its own sequence.
+    ordinal: the oldest of its last frames in that sequence; None: no bound.
+    moment, span: microseconds; of its own sequence, places less than ``span`` from ``moment`` are left out, and
+        those of which nobody knows the time; None: no bound.
+    """
+
+    sequence: int
+    ordinal: int | None
+    moment: int | None = None
+    span: int = 0
+
+    def holds(self, places: Whereabouts) -> Flags:
+        lately = np.zeros(len(places), np.bool_)
+        if self.ordinal is not None:
+            lately |= places.ordinal >= self.ordinal
+        if self.moment is not None:
+            timed = places.timestamp != NO_TIME
+            # In floating point, for the difference of two int64 may be none: a microsecond in 285 years is exact.
+            apart = np.abs(places.timestamp.astype(np.float64) - self.moment)
+            lately |= ~timed | (apart < self.span)
+        return ~(lately & (places.sequence == self.sequence))
+
+    def fit(self, places: Whereabouts) -> Values:
+        return self.holds(places).astype(np.float64)
+
+
+def holding(constraints: Iterable[Constraint], places: Whereabouts) -> Flags:
+    """Which of n places satisfy all of the constraints; bool [n]."""
+    found = np.ones(len(places), np.bool_)
+    for constraint in constraints:
+        found &= constraint.holds(places)
+    return found
+
+
+def log_weights(fits: Sequence[Values], trust: float) -> Values:
+    """log w of n places by what the robot knows (module's docstring); float64 [n] in [log(1 - trust), 0].
+
+    Args:
+        fits: float64 [n] in [0, 1], one array for each constraint, at least one.
+        trust: probability that what the robot knows is right, in [0, 1].
+    """
+    trusted = min(trust, LARGEST_TRUST)
+    product = fits[0].copy()
+    for fit in fits[1:]:
+        product *= fit
+    return np.log((1 - trusted) + trusted * product)
+
+
+def log_odds_per_score(calibration: Calibration, second_stage: bool) -> float:
+    """By how much the log odds of a match grow with its score.
+
+    The derivative of the calibrated curve at a match that leads: √(s · (s - top)) grows by about one with s.  The
+    older decision value of one stage is a score in units of the rest's deviation, for which that of the background
+    stands.  Without a curve the threshold is taken for even odds.
+    """
+    slope = decision_slope(calibration)
+    leads = second_stage or calibration.decision == "leading"
+    return slope if leads else slope / calibration.background_deviation
+
+
+def decision_slope(calibration: Calibration) -> float:
+    """By how much the log odds of a match grow with its decision value."""
+    if calibration.curve is not None:
+        return calibration.curve.slope
+    return UNCALIBRATED_STEEPNESS / max(abs(calibration.threshold), 1e-6)
+
+
+def log_odds(decision: float, calibration: Calibration) -> float:
+    """The log odds of a match with this decision value; without a curve, with even odds at the threshold."""
+    slope = decision_slope(calibration)
+    intercept = -slope * calibration.threshold if calibration.curve is None else calibration.curve.intercept
+    return slope * decision + intercept
+
+
+def weighed(
+    scores: NDArray[np.float32], weights: Values, calibration: Calibration, second_stage: bool
+) -> NDArray[np.float32]:
+    """Scores as the prior changes them: log weights in units of the score added, float32 [n].
+
+    No score falls under what unrelated frames have, unless it was under it before: a place that the prior rules out
+    counts as one that shows something else, and not as a sign of how well the others stand out.
+    """
+    lowered = scores + (weights / log_odds_per_score(calibration, second_stage)).astype(np.float32)
+    return np.asarray(np.maximum(lowered, np.minimum(scores, np.float32(calibration.background_mean))), np.float32)

@@ -1,0 +1,269 @@
+"""Connected cells of like activation, the strongest of a layer (thesis, equations 3.1–3.3 and 4.1–4.3), compiled.
+
+The maps stand channels last, as the network leaves them, and are read once, in that order: which cells are above
+the background becomes one bit each, so that what has no neighbour (most cells) is seen sixty-four channels at a time.
+A cell joins the regions of its neighbours that came before it (left of it, and in the row above), so that boxes and
+sums are complete when the last cell has been seen.  Only cells at or above the level where enough regions are
+complete are labelled: a region's mean lies within its level, so that none below can be among the strongest.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from core.kernels.bit_masks import BLOCK, lowest_bit, reaching, set_bits
+
+HISTOGRAM_BINS = 1024
+"""Levels of the histogram that prunes; all higher levels share its last bin."""
+
+FIRST_GUESS = 2
+"""Cells per wanted region in the first attempt to label few enough cells."""
+
+KEYS = 2048
+"""Different keys by which regions are sorted at first."""
+
+SHORT_RUN = 32
+"""So many regions of one key are put into order one by one; more are sorted properly."""
+
+# What is kept of each cell above the background, and of the region that begins with it.
+CHANNEL, PARENT, SIZE, TOP, LEFT, BOTTOM, RIGHT, ORDER, SPARE, KEY = range(10)
+INTEGERS = 10
+"""Rows of int32 that :func:`strongest` needs, one column a cell."""
+VALUE, LEVEL = range(2)
+SINGLES = 2
+"""Rows of float32 that it needs."""
+TOTAL, ENERGY = range(2)
+DOUBLES = 2
+"""Rows of float64 that it needs."""
+
+
+def bits_shape(height: int, width: int, channels: int) -> tuple[int, int]:
+    """Of the bits of a layer: cells, with a rim above, to the left and to the right, and blocks of channels."""
+    return (height + 1) * (width + 2), -(-channels // BLOCK)
+
+
+@numba.njit(cache=True, nogil=True)
+def _foreground(activations, step, cells, singles, bits, firsts):  # type: ignore[no-untyped-def]
+    """Keep the cells of level 1 and above, row by row and within a cell by channel; how many there are.
+
+    ``bits`` says which they are, ``firsts`` which of those kept is the first of each block.
+    """
+    height, width, channels = activations.shape
+    found = 0
+    for y in range(height):
+        for x in range(width):
+            values, at = activations[y, x], (y + 1) * (width + 2) + x + 1
+            for block in range(bits.shape[1]):
+                start = block * BLOCK
+                if start + BLOCK <= channels:
+                    reached = reaching(values, start, step)
+                else:
+                    reached = np.uint64(0)
+                    for k in range(start, channels):
+                        reached |= np.uint64(values[k] >= step) << np.uint64(k - start)
+                bits[at, block], firsts[at, block] = reached, found
+                while reached != 0:
+                    k = start + int(lowest_bit(reached))
+                    cells[CHANNEL, found], cells[TOP, found], cells[LEFT, found] = k, y, x
+                    singles[VALUE, found] = values[k]
+                    found += 1
+                    reached &= reached - np.uint64(1)
+    for i in range(found):
+        singles[LEVEL, i] = np.floor(singles[VALUE, i] / step)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _keep_from(lowest, cells, singles, bits, firsts):  # type: ignore[no-untyped-def]
+    """Keep only the cells of level >= ``lowest``; how many there are."""
+    i, found = 0, 0
+    for at in range(bits.shape[0]):
+        for block in range(bits.shape[1]):
+            reached = bits[at, block]
+            firsts[at, block] = found
+            while reached != 0:
+                if singles[LEVEL, i] >= lowest:
+                    for row in (CHANNEL, TOP, LEFT):
+                        cells[row, found] = cells[row, i]
+                    singles[VALUE, found], singles[LEVEL, found] = singles[VALUE, i], singles[LEVEL, i]
+                    found += 1
+                else:
+                    bits[at, block] ^= reached & ~(reached - np.uint64(1))
+                i += 1
+                reached &= reached - np.uint64(1)
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _level_with(levels, wanted):  # type: ignore[no-untyped-def]
+    """The highest level >= 1 at or above which at least ``wanted`` of the cells lie (1 if there are fewer)."""
+    if len(levels) < wanted:
+        return np.float32(1)
+    histogram = np.zeros(HISTOGRAM_BINS, np.int32)
+    highest = 1
+    for i in range(len(levels)):
+        level = int(min(levels[i], np.float32(HISTOGRAM_BINS - 1)))
+        histogram[level] += 1
+        highest = max(highest, level)
+    seen, level = 0, highest + 1
+    while level > 1 and seen < wanted:
+        level -= 1
+        seen += histogram[level]
+    return np.float32(level)
+
+
+@numba.njit(cache=True, nogil=True)
+def _first(parents, i):  # type: ignore[no-untyped-def]
+    """The first cell of the region that cell i belongs to."""
+    while parents[i] != i:
+        parents[i] = parents[parents[i]]
+        i = parents[i]
+    return i
+
+
+@numba.njit(cache=True, nogil=True)
+def _merge(cells, totals, into, other):  # type: ignore[no-untyped-def]
+    """Make two regions one, which begins with cell ``into``."""
+    cells[PARENT, other] = into
+    totals[into] += totals[other]
+    cells[SIZE, into] += cells[SIZE, other]
+    cells[TOP, into] = min(cells[TOP, into], cells[TOP, other])
+    cells[LEFT, into] = min(cells[LEFT, into], cells[LEFT, other])
+    cells[BOTTOM, into] = max(cells[BOTTOM, into], cells[BOTTOM, other])
+    cells[RIGHT, into] = max(cells[RIGHT, into], cells[RIGHT, other])
+
+
+@numba.njit(cache=True, nogil=True)
+def _label(count, shape, cells, singles, totals, bits, firsts):  # type: ignore[no-untyped-def]
+    """Join the cells that are kept to regions; how many regions there are."""
+    height, width = shape
+    parents, levels = cells[PARENT], singles[LEVEL]
+    for i in range(count):  # each by itself at first
+        parents[i], cells[SIZE, i], totals[i] = i, 1, singles[VALUE, i]
+        cells[BOTTOM, i], cells[RIGHT, i] = cells[TOP, i] + 1, cells[LEFT, i] + 1
+    regions = count
+    for y in range(height):
+        for x in range(width):
+            at = (y + 1) * (width + 2) + x + 1
+            over = at - width - 2
+            neighbours = (at - 1, over - 1, over, over + 1)
+            for block in range(bits.shape[1]):
+                here = bits[at, block]
+                there = bits[at - 1, block] | bits[over - 1, block] | bits[over, block] | bits[over + 1, block]
+                touching = here & there
+                while touching != 0:
+                    below = (touching & ~(touching - np.uint64(1))) - np.uint64(1)
+                    i = firsts[at, block] + int(set_bits(here & below))
+                    region = i
+                    for place in neighbours:
+                        if bits[place, block] & (below + np.uint64(1)):
+                            j = firsts[place, block] + int(set_bits(bits[place, block] & below))
+                            if levels[j] == levels[i]:
+                                other = _first(parents, j)
+                                if other != region:
+                                    _merge(cells, totals, min(region, other), max(region, other))
+                                    region = min(region, other)
+                                    regions -= 1
+                    touching &= touching - np.uint64(1)
+    return regions
+
+
+@numba.njit(cache=True, nogil=True)
+def _before(a, b, energies, channels):  # type: ignore[no-untyped-def]
+    """Does the region that begins with cell a come before that of cell b?"""
+    if energies[a] != energies[b]:
+        return energies[a] > energies[b]
+    return channels[a] < channels[b] if channels[a] != channels[b] else a < b
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(run, energies, channels):  # type: ignore[no-untyped-def]
+    """Put a run of regions of one key into order."""
+    if len(run) > SHORT_RUN:
+        run.sort()  # by their first cells
+        run[:] = run[np.argsort(channels[run], kind="mergesort")]
+        run[:] = run[np.argsort(-energies[run], kind="mergesort")]
+        return
+    for i in range(1, len(run)):
+        moved, place = run[i], i
+        while place > 0 and _before(moved, run[place - 1], energies, channels):
+            run[place] = run[place - 1]
+            place -= 1
+        run[place] = moved
+
+
+@numba.njit(cache=True, nogil=True)
+def _sorted(count, wanted, cells, doubles):  # type: ignore[no-untyped-def]
+    """The first cells of the ``wanted`` regions of highest energy, ties by channel, then by the first cell.
+
+    One pass by a coarse key; the runs of one key that matter are then put into order one by one.
+    """
+    energies, keys, channels = doubles[ENERGY], cells[KEY], cells[CHANNEL]
+    found, least, most = 0, np.inf, 0.0
+    for i in range(count):
+        if cells[PARENT, i] == i:
+            energy = doubles[TOTAL, i] / cells[SIZE, i]
+            energies[i] = energy
+            least, most = min(least, energy), max(most, energy)
+            cells[SPARE, found] = i
+            found += 1
+    scale = (KEYS - 1) / (most - least) if most > least else 0.0
+    ends = np.zeros(KEYS, np.int32)
+    for t in range(found):  # a higher energy never has a higher key
+        i = cells[SPARE, t]
+        keys[i] = np.int32(min(KEYS - 1.0, (most - energies[i]) * scale))
+        ends[keys[i]] += 1
+    for key in range(1, KEYS):
+        ends[key] += ends[key - 1]
+    for t in range(found - 1, -1, -1):  # from the last one, so that the ends become the starts
+        i = cells[SPARE, t]
+        ends[keys[i]] -= 1
+        cells[ORDER, ends[keys[i]]] = i
+    starts = ends
+    for key in range(KEYS):
+        stop = starts[key + 1] if key + 1 < KEYS else found
+        if stop - starts[key] > 1:
+            _settle(cells[ORDER, starts[key] : stop], energies, channels)
+        if stop >= wanted:
+            break
+    return cells[ORDER, : min(found, wanted)]
+
+
+@numba.njit(cache=True, nogil=True)
+def strongest(  # type: ignore[no-untyped-def]
+    activations, step, cells, singles, doubles, bits, firsts, boxes, energies, channels
+):
+    """The regions of highest energy over all maps (eq. 3.3), as many as the results have room for.
+
+    Args:
+        activations: float32 [X, Y, K], finite, contiguous.
+        step: float32, over 0.
+        cells, singles, doubles: room to work in, of INTEGERS, SINGLES and DOUBLES rows and X·Y·K columns.
+        bits, firsts: uint64 and int32 of ``bits_shape``, the bits of the rim 0.
+        boxes: int32 [N, 4], becomes top, left, bottom, right, half-open.
+        energies: float32 [N], becomes the mean activations.
+        channels: int32 [N], becomes the feature maps.
+
+    Returns:
+        How many there are, at most N: by falling energy, ties by first occurrence (map by map, then row by row).
+    """
+    wanted = len(energies)
+    guess = FIRST_GUESS * wanted
+    while True:
+        count = _foreground(activations, step, cells, singles, bits, firsts)
+        lowest = _level_with(singles[LEVEL, :count], guess)
+        if lowest > 1:
+            count = _keep_from(lowest, cells, singles, bits, firsts)
+        regions = _label(count, activations.shape[:2], cells, singles, doubles[TOTAL], bits, firsts)
+        if regions >= wanted or lowest == 1:
+            break
+        guess *= 2
+    order = _sorted(count, wanted, cells, doubles)
+    for t in range(len(order)):
+        i = order[t]
+        boxes[t, 0], boxes[t, 1] = cells[TOP, i], cells[LEFT, i]
+        boxes[t, 2], boxes[t, 3] = cells[BOTTOM, i], cells[RIGHT, i]
+        energies[t] = doubles[ENERGY, i]
+        channels[t] = cells[CHANNEL, i]
+    return len(order)

@@ -1,0 +1,187 @@
+"""Mutual best matches of the cells of one frame with those of many others, compiled: only what is within reach.
+
+The rows of a reference are gone through one after another, each against the rows of the query within reach.  Of each
+query cell the best so far is kept until all rows were seen; of each cell of the row it is known at once.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from core.kernels.cell_blocks import (
+    CELLS,
+    FEWER_CELLS,
+    HELD,
+    HIGHEST,
+    LANES,
+    LOWEST,
+    MOVED,
+    byte_at,
+    fetch,
+    fewer_cells,
+    highest,
+    is_wide,
+    one_row,
+    one_with_one,
+    three_rows,
+    two_rows,
+    values_a_word,
+)
+
+WHOLE_WORDS = 4
+"""The values of a cell have to be a multiple of this."""
+
+LINE = 64
+"""Bytes that a cache fetches together."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _words_of(query, columns):  # type: ignore[no-untyped-def]
+    """Vectors of a query's rows, int32 [rows, parts, words, LANES]: HELD cells of a row and a zero in each part."""
+    cells, length = query.shape
+    values = values_a_word()
+    zero = np.int32(MOVED if values == 4 else 0)
+    words = np.full((cells // columns, -(-columns // HELD), length // values, LANES), zero, np.int32)
+    for cell in range(cells):
+        y, x = cell // columns, cell % columns
+        for step in range(length // values):
+            word = np.int32(query[cell, step])
+            if values == 2:
+                word = (np.int32(query[cell, 2 * step]) & 0xFFFF) | (np.int32(query[cell, 2 * step + 1]) << 16)
+            elif values == 4:
+                word = zero
+                for i in range(4):
+                    word ^= (np.int32(query[cell, 4 * step + i]) & 0xFF) << (8 * i)
+            words[y, x // HELD, step, x % HELD] = word
+    return words
+
+
+@numba.njit(cache=True, nogil=True)
+def _limits_of(columns, apart):  # type: ignore[no-untyped-def]
+    """Which lanes are within reach of each column: HIGHEST, else LOWEST; int32 [parts, columns, LANES]."""
+    limits = np.full((-(-columns // HELD), columns, LANES), LOWEST, np.int32)
+    for u in range(columns):
+        for x in range(max(0, u - apart), min(columns, u + apart + 1)):
+            limits[x // HELD, u, x % HELD] = HIGHEST
+    return limits
+
+
+@numba.njit(cache=True, nogil=True)
+def _words_given(address, width, words):  # type: ignore[no-untyped-def]
+    """The address of a reference row's words; where they are not four bytes each, they are put into ``words``."""
+    values = values_a_word()
+    if values == 4:
+        return address
+    if values == 2:
+        halves = words.view(np.int16)
+        for i in range(width):
+            halves[i] = byte_at(address + i)
+    else:
+        for i in range(width):
+            words[i] = byte_at(address + i)
+    return np.int64(words.ctypes.data)
+
+
+@numba.njit(cache=True, nogil=True)
+def _compare(held, limits, part, given, row, low, high, there, back):  # type: ignore[no-untyped-def]
+    """One row of a reference with one part of the query's rows low … high; what is best is kept in there and back."""
+    columns, steps = limits.shape[1], held.shape[2]
+    stride = steps * 4
+    size = CELLS if is_wide() else FEWER_CELLS
+    if columns < size:
+        size = 1
+    u = 0
+    while u < columns:
+        u = min(u, columns - size)  # the last ones once more rather than one by one
+        y = low
+        while y < high:
+            place = (
+                held[y, part].ctypes.data,
+                held.strides[0],
+                given + u * stride,
+                stride,
+                steps,
+                limits[part, u].ctypes.data,
+                there[y, part].ctypes.data,
+                there.strides[0],
+                back[u].ctypes.data,
+                row * columns + u,
+                y * columns + part * HELD,
+                columns,
+            )
+            left = high - y
+            if size == 1:
+                one_with_one(place)
+                y += 1
+            elif not is_wide():
+                fewer_cells(place)
+                y += 1
+            elif left == 2 or left == 4:
+                two_rows(place)
+                y += 2
+            elif left > 2:
+                three_rows(place)
+                y += 3
+            else:
+                one_row(place)
+                y += 1
+        u += size
+
+
+@numba.njit(cache=True, nogil=True)
+def _keep_backs(back, part, highs, backs):  # type: ignore[no-untyped-def]
+    """Of each cell of a reference's row the best query cell of this part and those before it; ties to the lower."""
+    for u in range(len(back)):
+        product, cell = highest(back[u].ctypes.data)
+        if part == 0 or product > highs[u] or (product == highs[u] and cell < backs[u]):
+            highs[u], backs[u] = product, cell
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_of(there, backs, columns, cosine):  # type: ignore[no-untyped-def]
+    """Σ cos² over the cells of a reference that are the best matches of their best matches, in their order."""
+    total = np.zeros(1, np.float32)
+    for cell in range(len(backs)):
+        y, x = backs[cell] // columns, backs[cell] % columns
+        product = there[y, x // HELD, 0, x % HELD]
+        if product > 0 and there[y, x // HELD, 1, x % HELD] == cell:
+            value = np.float32(product) * cosine
+            total[0] += value * value
+    return total[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def squared_sums(query, addresses, columns, rows_apart, columns_apart, cosine):  # type: ignore[no-untyped-def]
+    """Σ cos² over the mutual best matches of a query with each of k references; ties to the lower cell.
+
+    Args:
+        query: int8 [C, L]; C is a multiple of the columns, L of WHOLE_WORDS.
+        addresses: int64 [k], of the references, int8 [C, L] each.
+        cosine: float32, what an inner product is multiplied by.
+
+    Returns:
+        float32 [k].
+    """
+    cells, length = query.shape
+    rows, width = cells // columns, columns * length
+    held, limits = _words_of(query, columns), _limits_of(columns, columns_apart)
+    parts = held.shape[1]
+    words = np.empty(width // values_a_word(), np.int32)
+    there, back = np.empty((rows, parts, 2, LANES), np.int32), np.empty((columns, 2, LANES), np.int32)
+    highs, backs = np.empty(columns, np.int32), np.empty(cells, np.int32)
+    sums = np.empty(len(addresses), np.float32)
+    for k in range(len(addresses)):
+        following = addresses[min(k + 1, len(addresses) - 1)]
+        there[:] = LOWEST
+        for row in range(rows):
+            for line in range(row * width, (row + 1) * width, LINE):
+                fetch(following + line)
+            given = _words_given(addresses[k] + row * width, width, words)
+            low, high = max(0, row - rows_apart), min(rows, row + rows_apart + 1)
+            for part in range(parts):
+                back[:] = LOWEST
+                _compare(held, limits, part, given, row, low, high, there, back)
+                _keep_backs(back, part, highs, backs[row * columns : (row + 1) * columns])
+        sums[k] = _sum_of(there, backs, columns, cosine)
+    return sums

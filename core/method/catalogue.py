@@ -1,0 +1,284 @@
+"""The encoders installed on a machine: those packaged here and those of the user's directory.
+
+An encoder is one file ``<name>.encoder.safetensors`` (vocabulary, projections, golden values, definition,
+calibration) that names a network file ``<network>.network.safetensors`` beside it or among the
+packaged ones.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from core.errors import InvalidModel, UnknownEncoder
+from core.judgement.verdict import Calibration
+from core.method.encoder import Encoder, EncoderDefinition, canary_frame
+from core.method.features import FeatureExtractor, projection_tensors
+from core.method.projection import Projection
+from core.method.vocabulary import Vocabulary
+from core.networks.forward import Device, Precision
+from core.networks.identity import canonical_json
+from core.networks.network import NAME, load_network
+
+DEFAULT_ENCODER = "m-region-vlad"
+PACKAGED = Path(__file__).parents[1] / "models"
+FORMAT = "placerec-encoder/1"
+PROJECTION = "projection."
+ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
+
+
+class EncoderSummary(BaseModel):
+    """One installed encoder as a user sees it; ``damaged`` says why it cannot be used."""
+
+    name: str
+    identity: str
+    dimension: int
+    local_shape: tuple[int, int] = Field(description="Cells and values of each that the second stage compares.")
+    default: bool
+    source: Literal["packaged", "installed"]
+    network: str
+    definition: EncoderDefinition | None
+    calibration: Calibration | None
+    training: dict[str, Any]
+    damaged: str | None = None
+
+
+class _Header(BaseModel):
+    """The metadata of an encoder file."""
+
+    name: str
+    identity: str
+    network: str
+    origin: str
+    definition: EncoderDefinition
+    calibration: Calibration
+    training: dict[str, Any]
+    dimension: int
+    local_shape: tuple[int, int] = (0, 0)
+
+
+def save_encoder(
+    folder: Path,
+    encoder: Encoder,
+    vocabulary: Vocabulary,
+    network: str,
+    training: dict[str, Any],
+) -> Path:
+    """Write ``<name>.encoder.safetensors``, whole or not at all.
+
+    Args:
+        network: name of the network file that the encoder uses.
+        training: how the vocabulary was made (images, features, seed …), for the reader.
+
+    Raises:
+        InvalidModel: the encoder's name cannot name a file.
+    """
+    if not re.match(NAME, encoder.name):
+        raise InvalidModel(f"{encoder.name!r} cannot name an encoder: it must match {NAME}.")
+    header = _Header(
+        name=encoder.name,
+        identity=encoder.identity,
+        network=network,
+        origin=vocabulary.origin,
+        definition=encoder.definition,
+        calibration=encoder.calibration,
+        training=training,
+        dimension=encoder.dimension,
+        local_shape=encoder.local_shape,
+    )
+    canary = encoder.encode(canary_frame())
+    tensors: dict[str, NDArray[Any]] = {
+        "centers": vocabulary.centers,
+        "golden": canary.descriptor.astype(np.float16),
+        "golden_local": canary.local,
+    }
+    for name, tensor in projection_tensors(encoder.extractor.projections).items():
+        tensors[f"{PROJECTION}{name}"] = tensor.numpy()
+    path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
+    _write(path, tensors, header)
+    return path
+
+
+def save_calibration(path: Path, calibration: Calibration) -> None:
+    """Give an encoder file another default calibration; nothing else of it changes, nor its identity.
+
+    Raises:
+        InvalidModel: it cannot be read.
+    """
+    header = _read_header(path).model_copy(update={"calibration": calibration})
+    try:
+        with safe_open(path, "np") as file:
+            tensors = {name: np.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise InvalidModel(f"{path.name} cannot be read: {error}") from error
+    _write(path, tensors, header)
+
+
+def _write(path: Path, tensors: Mapping[str, NDArray[Any]], header: _Header) -> None:
+    """The file of an encoder, whole or not at all."""
+    partial = path.with_name(path.name + ".tmp")
+    save_file(dict(tensors), partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
+    partial.chmod(0o644)
+    os.replace(partial, path)
+
+
+def _read_header(path: Path) -> _Header:
+    try:
+        with safe_open(path, "np") as file:
+            metadata = file.metadata() or {}
+        if metadata.get("format") != FORMAT:
+            raise InvalidModel(f"{path.name} is not a {FORMAT} file.")
+        header = _Header.model_validate(json.loads(metadata["header"]))
+    except (OSError, SafetensorError, KeyError, ValueError, ValidationError) as error:
+        raise InvalidModel(f"{path.name} is not a readable encoder file: {error}") from error
+    if path.name != header.name + ENCODER_SUFFIX:
+        raise InvalidModel(f"{path.name} holds the encoder {header.name!r}: a file is named as its encoder.")
+    return header
+
+
+def load_encoder(path: Path, network: Path) -> Encoder:
+    """Build the encoder of a file on the network of another.
+
+    Raises:
+        InvalidModel: a file is missing or damaged, or the parts do not give the identity that the
+            encoder was saved with.
+    """
+    header = _read_header(path)
+    try:
+        with safe_open(path, "np") as file:
+            tensors = {name: np.asarray(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118
+        centers, golden = tensors["centers"].astype(np.float32), tensors["golden"]
+    except (OSError, SafetensorError, KeyError) as error:
+        raise InvalidModel(f"{path.name} cannot be read: {error}") from error
+    vocabulary = Vocabulary(centers, header.origin)
+    backbone = load_network(network, header.definition.outputs)
+    extractor = FeatureExtractor(backbone, header.definition, _read_projections(path, tensors))
+    canary = (golden, tensors.get("golden_local", np.zeros((0, 0), np.int8)))
+    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, canary)
+    if encoder.identity != header.identity:
+        raise InvalidModel(f"{path.name} says it is {header.identity}, its contents are {encoder.identity}.")
+    return encoder
+
+
+def _read_projections(path: Path, tensors: Mapping[str, NDArray[np.generic]]) -> dict[str, Projection]:
+    parts = {name.removeprefix(PROJECTION): tensor for name, tensor in tensors.items() if name.startswith(PROJECTION)}
+    projections = {}
+    for layer in sorted({name.rpartition(".")[0] for name in parts}):
+        mean, matrix = parts.get(f"{layer}.mean"), parts.get(f"{layer}.matrix")
+        fits = mean is not None and matrix is not None and matrix.ndim == 2 and mean.shape == matrix.shape[:1]
+        if mean is None or matrix is None or not fits or not (np.isfinite(mean).all() and np.isfinite(matrix).all()):
+            raise InvalidModel(f"{path.name}: its projection of {layer} is not a finite mean and matrix.")
+        projections[layer] = Projection(mean.astype(np.float32), matrix.astype(np.float32))
+    return projections
+
+
+class EncoderCatalogue:
+    """Finds encoders by name or identity and loads each once; thread-safe.
+
+    Args:
+        models_dir: the user's directory, which need not exist; its encoders cannot take a packaged
+            name.
+        precision, device: how forward passes are computed, as :meth:`core.method.encoder.Encoder.settle` takes them.
+    """
+
+    def __init__(
+        self,
+        models_dir: Path | None = None,
+        precision: Precision | Literal["auto"] = "auto",
+        device: Device = "cpu",
+    ) -> None:
+        self._precision, self._device = precision, device
+        self._folders = [PACKAGED] + ([models_dir] if models_dir is not None else [])
+        self._loaded: dict[Path, Encoder] = {}
+        self._lock = threading.Lock()
+
+    def _files(self) -> dict[str, Path]:
+        found: dict[str, Path] = {}
+        for folder in self._folders:
+            for path in sorted(folder.glob(f"*{ENCODER_SUFFIX}")):
+                found.setdefault(path.name.removesuffix(ENCODER_SUFFIX), path)
+        return found
+
+    def network_file(self, name: str) -> Path:
+        """The file of a network.
+
+        Raises:
+            InvalidModel: there is none of that name.
+        """
+        for folder in self._folders:
+            path = folder / f"{name}{NETWORK_SUFFIX}"
+            if re.match(NAME, name) and path.is_file():
+                return path
+        raise InvalidModel(f"no network named {name!r} is installed; its file would be {name}{NETWORK_SUFFIX}.")
+
+    def describe(self) -> list[EncoderSummary]:
+        """All installed encoders by name, damaged ones too; no weights are read."""
+        return [self._summary(name, path) for name, path in self._files().items()]
+
+    def _summary(self, name: str, path: Path) -> EncoderSummary:
+        source: Literal["packaged", "installed"] = "packaged" if path.parent == PACKAGED else "installed"
+        common: dict[str, Any] = {"name": name, "source": source, "default": name == DEFAULT_ENCODER}
+        try:
+            header = _read_header(path)
+        except InvalidModel as error:
+            blank: dict[str, Any] = {
+                "identity": "",
+                "dimension": 0,
+                "local_shape": (0, 0),
+                "network": "",
+                "definition": None,
+                "calibration": None,
+            }
+            return EncoderSummary(**common, **blank, training={}, damaged=str(error))
+        fields = header.model_dump(exclude={"origin", "name"})
+        return EncoderSummary(**common, **fields)
+
+    def resolve(self, name_or_identity: str) -> str:
+        """The full identity of an installed encoder.
+
+        Raises:
+            UnknownEncoder: none has this name or identity; the text says what to do.
+            InvalidModel: its file is damaged.
+        """
+        return _read_header(self._find(name_or_identity)).identity
+
+    def _find(self, name_or_identity: str) -> Path:
+        name, _, digest = name_or_identity.partition("@")
+        files = self._files()
+        if name not in files:
+            raise UnknownEncoder(f"no encoder {name[:80]!r} is installed; there are {', '.join(files) or 'none'}.")
+        if digest:
+            identity = _read_header(files[name]).identity
+            if identity != name_or_identity:
+                raise UnknownEncoder(
+                    f"the encoder {name} installed here is {identity}, not {name_or_identity[:140]}: its model has "
+                    "changed. Re-encode the map from its kept images, or enrol its traverses again into a new map."
+                )
+        return files[name]
+
+    def get(self, name_or_identity: str) -> Encoder:
+        """The encoder itself, loaded on first use.
+
+        Raises:
+            UnknownEncoder: none has this name or identity.
+            InvalidModel: its files are missing or damaged, or this machine lacks the precision or device asked for.
+            GoldenMismatch: the precision asked for changes its descriptors.
+        """
+        path = self._find(name_or_identity)
+        with self._lock:
+            if path not in self._loaded:
+                encoder = load_encoder(path, self.network_file(_read_header(path).network))
+                encoder.settle(self._precision, self._device)
+                self._loaded[path] = encoder
+            return self._loaded[path]

@@ -1,0 +1,128 @@
+"""Why two frames score as they do: words, regions and cells that carried the score (thesis, section 3.4.3).
+
+The score of an encoder with two stages is a sum, and both of its parts are sums again: the first over
+the words of the vocabulary (eqs. 3.13, 4.13), the second over the cells that choose each other
+(``agreement.py``).  Between the regions of one word and its part v_u of the VLAD stand a power and a
+norm, so a region has no share by itself; what is said of it is how much the score would lose without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.method.agreement import Cells, Correspondences, correspondences
+from core.method.encoder import Encoder
+from core.method.regions import Regions
+from core.method.vlad import assign, normalize, power, residuals
+
+Array = NDArray[np.float32]
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is known of a frame that is explained.
+
+    descriptor: float32 [D].  local: int8 [C, L].
+    regions: None where the frame itself is not at hand, as for a place of which no picture is kept.
+    """
+
+    descriptor: Array
+    local: Cells
+    regions: Regions | None
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The score of a frame a against a frame b, taken apart.
+
+    words: float32 [V], what each word adds to the score (j_u, as it counts).
+    losses: of a and of b, float32 [T], what the score would lose without each region; negative: it would gain.
+        None where a frame's regions are not known.
+    answers: int64 [n, 2], regions of a and of b that are each other's nearest among those of their word.
+    cells: which cell of a answers to which of b; none without a second stage.
+    gains: float32, what each pair of cells adds to the score.
+    """
+
+    words: Array
+    losses: tuple[Array | None, Array | None]
+    answers: Indices
+    cells: Correspondences
+    gains: Array
+
+    @property
+    def score(self) -> float:
+        """The sum of all parts."""
+        return float(self.words.sum(dtype=np.float64) + self.gains.sum(dtype=np.float64))
+
+
+def explain(encoder: Encoder, a: Shown, b: Shown) -> Explanation:
+    """Take the score of two frames apart; for the parts to add up both stages must have been applied to them.
+
+    Args:
+        encoder: that of both descriptors.
+    """
+    shape = encoder.centers.shape
+    products = np.einsum("vk,vk->v", a.descriptor.reshape(shape), b.descriptor.reshape(shape))
+    cells = _cells(encoder, a.local, b.local)
+    stage = encoder.definition.agreement
+    share = 0.0 if stage is None else stage.share / len(a.local)
+    return Explanation(
+        words=encoder.scores_from_inner_products(products),
+        losses=(_losses(encoder, a, b), _losses(encoder, b, a)),
+        answers=_answers(encoder, a.regions, b.regions),
+        cells=cells,
+        gains=np.asarray(cells.cosines**2 * np.float32(share), np.float32),
+    )
+
+
+def _cells(encoder: Encoder, a: Cells, b: Cells) -> Correspondences:
+    stage = encoder.definition.agreement
+    if stage is None or not a.any() or not b.any():
+        none = np.empty(0, np.int64)
+        return Correspondences(none, none, np.empty(0, np.float32))
+    return correspondences(a, b, encoder.grid[1], stage)
+
+
+def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
+    """What the score loses without each region of ``frame``; float32 [T]."""
+    if frame.regions is None:
+        return None
+    features, centers, definition = frame.regions.features, encoder.centers, encoder.definition
+    if not len(features):
+        return np.zeros(0, np.float32)
+    against = other.descriptor.reshape(centers.shape)
+    words = assign(features, centers)
+    sums = residuals(features, centers)  # V x K
+    without = power(sums[words] - (features - centers[words]), definition.gamma)  # T x K
+    whole = power(sums, definition.gamma)
+    products = np.einsum("tk,tk->t", without, against[words])
+    if definition.normalization == "intra":
+        reduced = np.einsum("tk,tk->t", normalize(without, "intra"), against[words])
+        parts = np.einsum("vk,vk->v", normalize(whole, "intra"), against)[words]
+    else:
+        # The other words' parts stay, but the norm of the whole is another.
+        by_word, squares = np.einsum("vk,vk->v", whole, against), np.einsum("vk,vk->v", whole, whole)
+        left = by_word.sum() - by_word[words] + products
+        norms = np.sqrt(np.maximum(0, squares.sum() - squares[words] + np.einsum("tk,tk->t", without, without)))
+        reduced = np.divide(left, norms, out=np.zeros_like(left), where=norms > 0)
+        parts = np.full(len(words), by_word.sum() / max(float(np.sqrt(squares.sum())), 1e-12), np.float32)
+    return encoder.scores_from_inner_products(np.asarray(parts - reduced, np.float32))
+
+
+def _answers(encoder: Encoder, a: Regions | None, b: Regions | None) -> Indices:
+    """Regions of one word that are each other's nearest by cosine, best first; int64 [n, 2]."""
+    if a is None or b is None or not len(a) or not len(b):
+        return np.empty((0, 2), np.int64)
+    cosines = normalize(a.features, "intra") @ normalize(b.features, "intra").T  # T_a x T_b
+    apart = assign(a.features, encoder.centers)[:, None] != assign(b.features, encoder.centers)[None, :]
+    cosines[apart] = -np.inf
+    there, back = cosines.argmax(axis=1), cosines.argmax(axis=0)
+    mine = np.arange(len(a))
+    best = cosines[mine, there]
+    mutual = np.flatnonzero((back[there] == mine) & np.isfinite(best))
+    mutual = mutual[np.argsort(-best[mutual], kind="stable")]
+    return np.stack([mutual, there[mutual]], axis=1)

@@ -1,0 +1,215 @@
+"""From a frame to its features: backbone, regions of interest, fusion, projection (thesis, sections 3.2 and 4.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from torch import Tensor
+
+from core.errors import InvalidModel
+from core.frames.masks import Mask
+from core.frames.preprocessing import Pixels, contrast, prepare
+from core.method.projection import Projection
+from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums, unit_length
+from core.networks.backbone import Backbone
+from core.networks.forward import CudaPass, Device, Precision, fused_pass
+from core.networks.identity import json_digest, tensors_digest
+from core.networks.network import ShallowNetwork
+from core.threads import keep_numpy_single_threaded
+
+Array = NDArray[np.float32]
+
+
+class FeatureDefinition(BaseModel):
+    """Which regions are taken from which layers (method, sections 3 and 4).
+
+    ``steps`` are the quantisation steps, one a layer, in units of its activations.
+    ``unit_features`` scales each regional feature to unit length before anything else.
+    ``projection`` is to how many values regional features are projected (``projection.py``); None: not at all.
+    ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
+    network through its biases alone, and what looks like regions says nothing of the scene.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    layers: tuple[str, ...] = Field(min_length=1)
+    regions: int = Field(ge=1, le=10_000, description="N, per layer")
+    steps: tuple[float, ...]
+    unit_features: bool
+    projection: int | None = Field(default=None, ge=1)
+    least_contrast: float = Field(default=2.0, ge=0, le=255, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _one_step_a_layer(self) -> FeatureDefinition:
+        if len(self.steps) != len(self.layers) or not all(0 < step < float("inf") for step in self.steps):
+            raise ValueError("each layer needs one positive quantisation step")
+        if self.projection is not None and not self.unit_features:
+            raise ValueError("projected features are of unit length")
+        return self
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """The layers that the backbone must return: first those whose regions are fused."""
+        return self.layers
+
+    def projected(self) -> dict[str, int]:
+        """How many values of each layer's projection are in use."""
+        return {} if self.projection is None else dict.fromkeys(self.layers, self.projection)
+
+
+class FeatureExtractor:
+    """Frames to regions of interest with their features, T x K.
+
+    Args:
+        projections: by layer; as many as the definition asks for.
+
+    Raises:
+        InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or short.
+    """
+
+    def __init__(
+        self, backbone: Backbone, definition: FeatureDefinition, projections: Mapping[str, Projection] | None = None
+    ) -> None:
+        if backbone.outputs != definition.outputs:
+            raise InvalidModel(f"the backbone returns {backbone.outputs}, the encoder needs {definition.outputs}.")
+        keep_numpy_single_threaded()
+        self.backbone, self.definition = backbone, definition
+        self.compute()
+        self.projections = dict(projections or {})
+        for layer, values in definition.projected().items():
+            if layer not in self.projections or self.projections[layer].matrix.shape[1] < values:
+                raise InvalidModel(f"the encoder needs a projection of {layer} to {values} values.")
+        parts: dict[str, Any] = {
+            "network": backbone.describe(),
+            "weights": tensors_digest(backbone.weights()),
+            "features": content_of(definition, set(FeatureDefinition.model_fields)),
+        }
+        if definition.projected():
+            parts["projections"] = tensors_digest(projection_tensors(self.projections))
+        self.origin = json_digest(parts)
+        """Identity of the features: what a vocabulary must have been trained on."""
+
+    def compute(self, precision: Precision = "float32", device: Device = "cpu") -> None:
+        """Let forward passes be computed so from now on; a plugged network computes as it does itself.
+
+        Raises:
+            InvalidModel: this machine cannot.
+        """
+        network = self.backbone
+        self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
+        """The network as it is computed here: B x 3 x H x W to one B x K x X x Y for each output, float32 all."""
+        if isinstance(network, ShallowNetwork):
+            made = CudaPass(network) if device == "cuda" else fused_pass(network, precision)
+            if made is None and precision != "float32":
+                raise InvalidModel(f"this build of torch cannot compute {network.definition.name} in {precision}.")
+            self.forward = made or network
+        elif (precision, device) != ("float32", "cpu"):
+            raise InvalidModel("a plugged network runs on the CPU in float32, unless it takes itself elsewhere.")
+
+    def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
+        """For each frame the rectified maps of each output, float32 [X, Y, K], as :meth:`maps` gives them for all."""
+        maps = self.maps(frames, masks)
+        return [[layer[index] for layer in maps] for index in range(len(frames))]
+
+    def maps(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[Array]:
+        """Of each output the rectified maps of all frames, float32 [B, X, Y, K]; zeros for a blank frame.
+
+        Args:
+            masks: of each frame what not to see: the network is shown its mean colour there, and cells that
+                are covered by half or more stay zero, so that they bear no region and no local descriptor.
+        """
+        hidden = [None] * len(frames) if masks is None else masks
+        shown = self.backbone.input
+        batch, blank = np.empty((len(frames), shown.height, shown.width, 3), np.float32), []
+        for image, frame, mask in zip(batch, frames, hidden, strict=True):
+            prepare(frame, shown, image)
+            if mask is not None:
+                image[mask.covered(shown.height, shown.width)] = 0
+            blank.append(contrast(frame, mask) < self.definition.least_contrast)
+        with torch.inference_mode():
+            outputs = self.forward(torch.from_numpy(batch).permute(0, 3, 1, 2))  # channels last in memory
+        maps = [output.permute(0, 2, 3, 1).contiguous().numpy() for output in outputs]  # B x X x Y x K
+        for index, mask in enumerate(hidden):
+            for layer in maps:
+                if blank[index]:
+                    layer[index] = 0
+                elif mask is not None:
+                    layer[index][mask.covered(*layer.shape[1:3])] = 0
+        return maps
+
+    def products(self, activations: Sequence[Array]) -> dict[str, Array]:
+        """Of each projected layer what its projection makes of its cells; float32 [..., X, Y, d] by layer.
+
+        Args:
+            activations: of each output, of one frame or of several, float32 [..., X, Y, K].
+        """
+        maps = zip(self.definition.outputs, activations, strict=True)
+        used = self.definition.projected()
+        return {
+            name: self.projections[name].products(_cells(layer)).reshape(*layer.shape[:-1], -1)
+            for name, layer in maps
+            if name in used
+        }
+
+    def regions(self, activations: Sequence[Array], products: Mapping[str, Array] | None = None) -> Regions:
+        """The regions of all layers of one frame, fused (eqs. 4.4, 4.5).
+
+        Args:
+            products: as :meth:`products` gives them, if they are known.
+        """
+        definition = self.definition
+        fused = activations[: len(definition.layers)]
+        if definition.projection is not None:
+            found = find_regions(fused, definition.steps, definition.regions)
+            features = self._projected(found, fused, products or self.products(activations), definition.projection)
+            return replace(found, features=features)
+        found = extract_regions(fused, definition.steps, definition.regions)
+        return replace(found, features=unit_length(found.features)) if definition.unit_features else found
+
+    def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
+        """The regional features projected, float32 [T, values]."""
+        features = np.empty((len(found), values), np.float32)
+        parts = found.parts(len(fused))
+        for name, layer, part in zip(self.definition.layers, fused, parts, strict=True):
+            projection = self.projections[name]
+            projected_box_sums(layer, products[name], found.boxes[part], projection.shift, features[part])
+        return features
+
+    def projected_cells(
+        self, activations: Sequence[Array], products: Mapping[str, Array], layers: Sequence[str], values: int
+    ) -> list[Array]:
+        """The projected local descriptors D^L of some layers of one frame, float32 [C, values] each."""
+        maps = dict(zip(self.definition.outputs, activations, strict=True))
+        return [self.projections[name].finish(_cells(products[name]), _cells(maps[name]), values) for name in layers]
+
+    def layer_grids(self) -> dict[str, tuple[int, int]]:
+        """Cells (rows, columns) of each layer's maps at the network's input size."""
+        shown = self.backbone.input
+        blank = np.zeros((shown.height, shown.width, 3), np.uint8)
+        maps = self.activations([blank])[0]
+        return {name: layer.shape[:2] for name, layer in zip(self.definition.outputs, maps, strict=True)}
+
+
+def _cells(layer: Array) -> Array:
+    """Maps, float32 [..., X, Y, K], as local descriptors, [n, K]."""
+    return layer.reshape(-1, layer.shape[-1])
+
+
+def content_of(definition: BaseModel, fields: set[str] | None = None) -> dict[str, Any]:
+    """What a definition says; choices that came with later versions are left out where not made."""
+    return definition.model_dump(mode="json", include=fields, exclude_none=True)
+
+
+def projection_tensors(projections: Mapping[str, Projection]) -> dict[str, torch.Tensor]:
+    """``<layer>.mean`` and ``<layer>.matrix`` of each."""
+    tensors: dict[str, torch.Tensor] = {}
+    for layer, projection in projections.items():
+        tensors[f"{layer}.mean"] = torch.from_numpy(projection.mean)
+        tensors[f"{layer}.matrix"] = torch.from_numpy(projection.matrix)
+    return tensors

@@ -1,0 +1,119 @@
+"""A linear view of a feature in which the same spot looks alike under any light, and different spots do not.
+
+Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
+The differences between a cell's feature and that of the same cell under other conditions span what does not
+matter; features are whitened by their covariance, and of what is then left the directions of most spread are kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from core.kernels.products import ConstantMatrix
+
+Array = NDArray[np.float32]
+
+SHRINKAGE = 0.5
+"""Share of the mean variance added to every direction's, so that quiet directions are not blown up into noise."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """From a feature of K values to one of fewer.
+
+    mean: float32 [K], of unit-length features.
+    matrix: float32 [K, d], columns by falling importance, so that the first ones are a projection too.
+    """
+
+    mean: Array
+    matrix: Array
+
+    def __call__(self, features: Array, values: int) -> Array:
+        """Unit-length projections of n features, float32 [n, K] to [n, values]; zero stays zero."""
+        return self.finish(self.products(features), features, values)
+
+    def products(self, features: Array) -> Array:
+        """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
+        return self._product(features)
+
+    @cached_property
+    def _product(self) -> ConstantMatrix:
+        return ConstantMatrix(self.matrix)
+
+    @cached_property
+    def shift(self) -> Array:
+        """m W, float32 [d]."""
+        return np.asarray(self.mean @ self.matrix, np.float32)
+
+    def finish(self, products: Array, features: Array, values: int) -> Array:
+        """Unit-length projections of n features whose products are known; float32 [n, values].
+
+        (f/|f| - m) W = f W / |f| - m W.
+
+        Args:
+            products: float32 [n, d].
+            features: float32 [n, K].
+        """
+        projected = np.empty((len(features), values), np.float32)
+        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
+        return projected
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def squared_length(feature):  # type: ignore[no-untyped-def]
+    """|f|²; float32 [K]."""
+    square = np.float32(0)
+    for k in range(len(feature)):
+        square += feature[k] * feature[k]
+    return square
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def finish_row(products, square, shift, projected):  # type: ignore[no-untyped-def]
+    """One row of :meth:`Projection.finish`; float32 [d], |f|² and float32 [d] to float32 [values]."""
+    inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
+    square = np.float32(0)
+    for d in range(len(projected)):
+        value = products[d] * inverse - shift[d]
+        projected[d] = value
+        square += value * value
+    again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
+    for d in range(len(projected)):
+        projected[d] *= again
+
+
+@numba.njit(cache=True, nogil=True)
+def _finish(products, features, shift, projected):  # type: ignore[no-untyped-def]
+    """Row by row, as :meth:`Projection.finish`, into ``projected``, float32 [n, values]."""
+    for i in range(len(features)):
+        finish_row(products[i], squared_length(features[i]), shift, projected[i])
+
+
+def fit_projection(clear: Array, changed: Array, values: int) -> Projection:
+    """The projection under which pairs agree best in relation to all features' spread.
+
+    Args:
+        clear, changed: float32 [n, K], unit-length features of the same n cells under two conditions.
+        values: d, how many directions to keep, at most K.
+
+    Raises:
+        ValueError: the arrays differ in shape, hold fewer than two pairs, or K < d.
+    """
+    if clear.shape != changed.shape or len(clear) < 2 or not 1 <= values <= clear.shape[1]:
+        raise ValueError(f"{values} directions from pairs of shape {clear.shape} and {changed.shape}")
+    a, b = clear.astype(np.float64), changed.astype(np.float64)
+    mean = (a.mean(axis=0) + b.mean(axis=0)) / 2
+    difference, centred = a - b, np.concatenate([a, b]) - mean
+    within = difference.T @ difference / (2 * len(a))  # S_w
+    total = centred.T @ centred / len(centred)  # S_t
+    within[np.diag_indices_from(within)] += SHRINKAGE * np.trace(within) / len(within) + 1e-12
+    variances, directions = np.linalg.eigh(within)
+    whitening = directions / np.sqrt(variances)
+    importance, rotation = np.linalg.eigh(whitening.T @ total @ whitening)
+    kept = np.argsort(-importance)[:values]
+    return Projection(mean.astype(np.float32), np.ascontiguousarray(whitening @ rotation[:, kept], np.float32))

@@ -1,0 +1,180 @@
+"""Regions of interest: connected cells of like activation, and what lies in their boxes.
+
+Thesis, equations 3.1–3.4 (one layer) and 4.1–4.5 (several layers).  A region is an 8-connected
+group of cells of one feature map whose activations have the same quantised level
+``floor(activation / step)``; level 0 and below is background.
+
+The pass is pruned without changing its result: division and floor are monotonic, so every cell of
+a higher level exceeds every cell of a lower one, and so do the means of their regions.  Only the
+cells at or above the level where ``count`` regions are complete are ever labelled (``components.py``).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.kernels.boxes import projected_within, sums_within
+from core.kernels.components import DOUBLES, INTEGERS, SINGLES, bits_shape, strongest
+
+Activations = NDArray[np.float32]
+
+SHAPES = 8
+"""Shapes of layers for which a thread keeps room to work in."""
+
+
+@dataclass(frozen=True)
+class Regions:
+    """T regions of one frame: layer by layer, by falling energy within a layer.
+
+    boxes: int32 [T, 4], top, left, bottom, right in cells of the layer's grid, half-open.
+    energies: float32 [T], mean activation inside the region (eq. 3.2).
+    channels: int32 [T], the feature map of each region.
+    layers: int32 [T], index of the layer among those fused.
+    features: float32 [T, K], regional features (eq. 3.4).
+    """
+
+    boxes: NDArray[np.int32]
+    energies: NDArray[np.float32]
+    channels: NDArray[np.int32]
+    layers: NDArray[np.int32]
+    features: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.energies)
+
+    def parts(self, layers: int) -> list[slice]:
+        """Where the regions of each of so many layers stand."""
+        ends = np.searchsorted(self.layers, np.arange(layers + 1)).tolist()
+        return [slice(start, stop) for start, stop in pairwise(ends)]
+
+
+@dataclass(frozen=True)
+class _Room:
+    """What a pass over a layer works in; fresh pages would cost as much as the pass itself."""
+
+    cells: NDArray[np.int32]
+    singles: NDArray[np.float32]
+    doubles: NDArray[np.float64]
+    bits: NDArray[np.uint64]
+    firsts: NDArray[np.int32]
+    table: NDArray[np.float64]
+
+
+class _Workspace(threading.local):
+    """The rooms of one thread, by the shape of the layer; an encoder has few."""
+
+    def __init__(self) -> None:
+        self._rooms: dict[tuple[int, ...], _Room] = {}
+
+    def room(self, shape: tuple[int, ...]) -> _Room:
+        """The room for activations of this shape."""
+        found = self._rooms.get(shape)
+        if found is None:
+            if len(self._rooms) >= SHAPES:
+                self._rooms.clear()
+            height, width, channels = shape
+            values = height * width * channels
+            found = _Room(
+                cells=np.empty((INTEGERS, values), np.int32),
+                singles=np.empty((SINGLES, values), np.float32),
+                doubles=np.empty((DOUBLES, values), np.float64),
+                bits=np.zeros(bits_shape(height, width, channels), np.uint64),
+                firsts=np.zeros(bits_shape(height, width, channels), np.int32),
+                table=np.zeros((height + 1, width + 1, channels), np.float64),
+            )
+            self._rooms[shape] = found
+        return found
+
+
+_workspace = _Workspace()
+
+
+def find_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
+    """As :func:`extract_regions`, but without the features: float32 [T, 0]."""
+    if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
+        raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
+    room = count * len(layers)
+    boxes, energies = np.empty((room, 4), np.int32), np.empty(room, np.float32)
+    channels, owners = np.empty(room, np.int32), np.empty(room, np.int32)
+    end = 0
+    for index, (layer, step) in enumerate(zip(layers, steps, strict=True)):
+        work = _workspace.room(layer.shape)
+        start, stop = end, end + count
+        end += strongest(
+            np.ascontiguousarray(layer, np.float32),
+            np.float32(step),
+            work.cells,
+            work.singles,
+            work.doubles,
+            work.bits,
+            work.firsts,
+            boxes[start:stop],
+            energies[start:stop],
+            channels[start:stop],
+        )
+        owners[start:end] = index
+    return Regions(boxes[:end], energies[:end], channels[:end], owners[:end], np.empty((end, 0), np.float32))
+
+
+def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
+    """The ``count`` strongest regions of each layer and their features, fused (eqs. 3.1–3.4, 4.1–4.5).
+
+    Args:
+        layers: of one frame, each float32 [X, Y, K], rectified and finite, channels last; K is the
+            same for all, X and Y need not be.
+        steps: quantisation step q > 0 of each layer, in units of its activations.
+        count: N, per layer; fewer are returned where a layer has fewer.
+
+    Returns:
+        At most N regions a layer; none for a blank frame.
+
+    Raises:
+        ValueError: a step or ``count`` is not positive, an array is not 3-D, or K differs.
+    """
+    found = find_regions(layers, steps, count)
+    if len({layer.shape[2] for layer in layers}) != 1:
+        raise ValueError("the layers that are fused have the same number of channels")
+    features = np.empty((len(found), layers[0].shape[2]), np.float32)
+    for layer, part in zip(layers, found.parts(len(layers)), strict=True):
+        box_sums(layer, found.boxes[part], features[part])
+    return Regions(found.boxes, found.energies, found.channels, found.layers, features)
+
+
+def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | None = None) -> NDArray[np.float32]:
+    """The sum of a layer's local descriptors, float32 [X, Y, K], in each box, int32 [T, 4]; float32 [T, K].
+
+    Args:
+        out: where to put them, float32 [T, K]; None: a new array.
+    """
+    if out is None:
+        out = np.empty((len(boxes), grid.shape[2]), np.float32)
+    sums_within(np.ascontiguousarray(grid, np.float32), boxes, _workspace.room(grid.shape).table, out)
+    return out
+
+
+def projected_box_sums(
+    layer: Activations, products: Activations, boxes: NDArray[np.int32], shift: NDArray[np.float32], out: Activations
+) -> None:
+    """Put unit-length projections of the sums of :func:`box_sums` into ``out``, float32 [T, values].
+
+    A projection of sums is a sum of projections, so that only the length is needed of the sums themselves.
+
+    Args:
+        layer: float32 [X, Y, K].
+        products: of its cells with a projection's matrix, float32 [X, Y, d].
+        shift: of the mean, float32 [d].
+    """
+    tables = _workspace.room(layer.shape).table, _workspace.room(products.shape).table
+    projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, *tables, shift, out)
+
+
+def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Each row of float32 [T, K] divided by its length; a zero row stays zero."""
+    lengths = np.sqrt(np.einsum("tk,tk->t", features, features))[:, None]
+    return np.divide(features, lengths, out=np.zeros_like(features), where=lengths > 0)

@@ -1,0 +1,1 @@
+"""Networks: definitions, forward passes, identities, and the import of files that others have trained."""

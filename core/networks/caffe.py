@@ -1,0 +1,288 @@
+"""Networks as Caffe stores them (Jia et al., 2014), turned into ours without changing a weight.
+
+Of a network its convolutional trunk is taken: from the input through convolutions, rectifiers, pooling and
+local response normalization to the last of them that no inner product comes before.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic import ValidationError
+from torch import Tensor, nn
+
+from core.errors import InvalidModel
+from core.frames.preprocessing import InputDefinition
+from core.networks.caffemodel import CaffeLayer, CaffeNetwork, read_caffemodel, read_mean
+from core.networks.network import Convolution, Layer, NetworkDefinition, Normalization, Pooling, Relu
+from core.networks.protobuf import Message
+
+_TRUNK = {"Convolution", "ReLU", "Pooling", "LRN"}
+_PASSED = {"Dropout", "Split"}  # change nothing when a network is run
+_HEADS = {
+    "Accuracy", "ArgMax", "Flatten", "HDF5Output", "InnerProduct", "Reshape", "Silence", "Softmax",
+}  # fmt: skip
+
+_LAYER_NAME = re.compile(r"[A-Za-z0-9_/+-]{1,64}")
+MAX_SIDE = 4096
+"""Of an input, a kernel, a stride or a border, in pixels."""
+
+MAX_CHANNELS = 65_536
+
+
+def import_caffe(
+    model: Path,
+    mean: Path | tuple[float, float, float] | None = None,
+    *,
+    name: str | None = None,
+    input_size: tuple[int, int] | None = None,
+) -> tuple[NetworkDefinition, dict[str, Tensor]]:
+    """The convolutional trunk of a Caffe network in our format.
+
+    Layers, their order and all their parameters are taken from the model's own description, its input
+    size too (``input_param``, ``input_shape``, ``input_dim``, else the crop size of its training data).
+
+    Args:
+        model: the ``.caffemodel``.
+        mean: its mean file, ``.npy`` or ``.binaryproto``, or the mean of each channel as the network sees them;
+            without one the model must name its mean values.
+        name: of the definition; without one made of the file's name.
+        input_size: height and width in pixels, if the model does not say them or others are wanted.
+
+    Returns:
+        The definition, and ``<convolution>.weight`` (K x C/groups x h x w) and ``<convolution>.bias`` (K),
+        float32, for each of its convolutions.
+
+    Raises:
+        InvalidModel: a file cannot be read, or the network has something that our format cannot say exactly.
+    """
+    network = read_caffemodel(model)
+    trunk = _find_trunk(network)
+    height, width = _input_size(network) if input_size is None else input_size
+    means = _named_mean(network.layers) if mean is None else read_mean(mean) if isinstance(mean, Path) else mean
+    try:
+        shown = InputDefinition(height=height, width=width, mean=means, scale=(_named_scale(network.layers),) * 3)
+        definition = NetworkDefinition(
+            name=_network_name(model) if name is None else name,
+            input=shown,
+            layers=tuple(_translate(layer) for layer in trunk),
+        )
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        raise InvalidModel(f"{model.name} makes no network of ours: {where} {problem['msg']}.") from error
+    _check_sizes(definition)
+    return definition, _read_weights(definition, trunk)
+
+
+# Which layers
+
+
+def _is_head(layer: CaffeLayer) -> bool:
+    """Whether what a layer makes is no map of activations any more, or is of use in training only."""
+    whole_map = layer.type == "Pooling" and layer.part("pooling").integer(12) != 0
+    return layer.type in _HEADS or layer.type.endswith("Loss") or whole_map
+
+
+def _find_trunk(network: CaffeNetwork) -> list[CaffeLayer]:
+    """The chain of layers from the input on; what hangs on it behind an inner product or a loss is left out.
+
+    Raises:
+        InvalidModel: the chain has a layer of a type that our format does not know, or forks and goes on.
+    """
+    trunk: list[CaffeLayer] = []
+    present = set() if network.input is None else {network.input}  # names of the blob at the trunk's end
+    past: set[str] = set()  # blobs of the trunk before it
+    aside: set[str] = set()  # blobs that are no part of it
+    for layer in network.layers:
+        if not layer.bottoms and layer.type not in _TRUNK:  # data
+            present.update(layer.tops[:1])
+            aside.update(layer.tops[1:])
+        elif _is_head(layer) or aside.intersection(layer.bottoms):
+            aside.update(layer.tops)
+        elif layer.type in _PASSED:
+            (past if layer.bottoms[0] in past else present).update(layer.tops)
+        elif layer.type not in _TRUNK:
+            raise InvalidModel(f"The network's {layer} is of a type that cannot be imported.")
+        elif len(layer.bottoms) != 1 or len(layer.tops) != 1:
+            raise InvalidModel(f"The network's {layer} has not one input and one output.")
+        elif present and layer.bottoms[0] not in present:
+            raise InvalidModel(f"The network's {layer} does not follow the layer before it: the network forks.")
+        else:
+            trunk.append(layer)
+            past = (past | present) - set(layer.tops)
+            present = set(layer.tops)
+    return trunk
+
+
+def _network_name(model: Path) -> str:
+    return re.sub(r"[^a-z0-9._-]", "-", model.stem.lower()).lstrip("._-")[:64] or "caffe"
+
+
+# What goes in
+
+
+def _input_size(network: CaffeNetwork) -> tuple[int, int]:
+    """Height and width; the deployed network's own input comes before the crops it was trained on."""
+    layers = network.layers
+    shapes = [message.integers(1) for layer in layers for message in layer.part("input").messages(1)]
+    for shape in (*shapes, network.input_shape):
+        if shape:
+            if len(shape) != 4 or shape[1] != 3:
+                raise InvalidModel(f"The network's input is {tuple(shape[:8])}, not of 3 channels, height and width.")
+            return shape[2], shape[3]
+    crops = [layer.part("transform").integer(3) for layer in layers]
+    crops += [layer.part(key).integer(5) for layer in layers for key in ("data", "image_data")]
+    crop = next((crop for crop in crops if crop), None)
+    if crop is None:
+        raise InvalidModel("The model does not say its input size; give it.")
+    return crop, crop
+
+
+def _named_mean(layers: Sequence[CaffeLayer]) -> tuple[float, float, float]:
+    found = next((values for layer in layers if len(values := layer.part("transform").floats(5))), None)
+    if found is None:
+        raise InvalidModel("The model does not name the mean of its channels; give its mean file.")
+    if len(found) not in (1, 3):
+        raise InvalidModel(f"The model names a mean of {len(found)} channels, not 3.")
+    blue, green, red = np.broadcast_to(found, 3).tolist()
+    return blue, green, red
+
+
+def _named_scale(layers: Sequence[CaffeLayer]) -> float:
+    parts = [(layer.part("transform"), 1) for layer in layers]
+    parts += [(layer.part(key), 2) for layer in layers for key in ("data", "image_data")]
+    return next((part.float(number, 1.0) for part, number in parts if number in part), 1.0)
+
+
+# Each layer
+
+
+def _translate(layer: CaffeLayer) -> Layer:
+    """The layer in our words, with Caffe's default for each parameter that it leaves out."""
+    if not _LAYER_NAME.fullmatch(layer.name) or hasattr(nn.ModuleDict(), layer.name):
+        raise InvalidModel(f"The network's {layer} has a name that our format cannot bear.")
+    match layer.type:
+        case "Convolution":
+            return _translate_convolution(layer)
+        case "ReLU":
+            return Relu(name=layer.name, negative_slope=_finite(layer, layer.part("relu").float(1, 0.0)))
+        case "Pooling":
+            return _translate_pooling(layer)
+        case _:
+            return _translate_normalization(layer)
+
+
+def _translate_convolution(layer: CaffeLayer) -> Convolution:
+    part = layer.part("convolution")
+    if _side(layer, part, "dilation", (18,), 1) != 1:
+        raise InvalidModel(f"The network's {layer} is dilated.")
+    if part.integer(16, 1) != 1:
+        raise InvalidModel(f"The network's {layer} does not run over the channels.")
+    channels, groups = part.integer(1), part.integer(5, 1)
+    if channels > MAX_CHANNELS or not 0 < groups <= MAX_CHANNELS or channels % groups:
+        raise InvalidModel(f"The network's {layer} has {channels} channels in {groups} groups.")
+    return Convolution(
+        name=layer.name,
+        channels=channels,
+        kernel=_side(layer, part, "kernel", (4, 11, 12)),
+        stride=_side(layer, part, "stride", (6, 13, 14), 1),
+        pad=_side(layer, part, "pad", (3, 9, 10), 0),
+        groups=groups,
+    )
+
+
+def _translate_pooling(layer: CaffeLayer) -> Pooling:
+    part = layer.part("pooling")
+    method, rounding = part.integer(1), part.integer(13)
+    if method > 1 or rounding > 1:
+        raise InvalidModel(f"The network's {layer} pools in a way that cannot be imported.")
+    pooling = Pooling(
+        name=layer.name,
+        method="average" if method else "max",
+        kernel=_side(layer, part, "kernel", (2, 5, 6)),
+        stride=_side(layer, part, "stride", (3, 7, 8), 1),
+        pad=_side(layer, part, "pad", (4, 9, 10), 0),
+        ceil=not rounding,
+    )
+    if pooling.stride > pooling.kernel or 2 * pooling.pad > pooling.kernel:
+        raise InvalidModel(f"The network's {layer} has windows that see nothing of the map.")
+    return pooling
+
+
+def _translate_normalization(layer: CaffeLayer) -> Normalization:
+    part = layer.part("normalization")
+    if part.integer(4):
+        raise InvalidModel(f"The network's {layer} normalizes within a channel, not across channels.")
+    size = part.integer(1, 5)
+    if size % 2 == 0 or size > MAX_CHANNELS:
+        raise InvalidModel(f"The network's {layer} normalizes over {size} channels; an odd number is needed.")
+    alpha, beta, k = (_finite(layer, part.float(*default)) for default in ((2, 1.0), (3, 0.75), (5, 1.0)))
+    return Normalization(name=layer.name, size=size, alpha=alpha, beta=beta, k=k)
+
+
+def _finite(layer: CaffeLayer, value: float) -> float:
+    if not math.isfinite(value):
+        raise InvalidModel(f"The network's {layer} has a parameter that is not finite.")
+    return value
+
+
+def _side(layer: CaffeLayer, part: Message, what: str, numbers: Sequence[int], default: int | None = None) -> int:
+    """A length in pixels, the same for height and width, given once, for each axis, or as ``_h`` and ``_w``."""
+    whole, *axes = numbers
+    found = part.integers(whole)
+    if any(number in part for number in axes):
+        found = [*found, *(part.integer(number) for number in axes)]
+    if not found and default is not None:
+        return default
+    if len(set(found)) != 1 or found[0] > MAX_SIDE:
+        raise InvalidModel(f"The network's {layer} has the {what} {found}; one for both axes is needed.")
+    return found[0]
+
+
+def _check_sizes(definition: NetworkDefinition) -> None:
+    """Refuse a network whose maps shrink to nothing."""
+    for axis in ("height", "width"):
+        size: int = getattr(definition.input, axis)
+        for layer in definition.layers:
+            if not isinstance(layer, Convolution | Pooling):
+                continue
+            room = size + 2 * layer.pad - layer.kernel
+            if room < 0:
+                raise InvalidModel(f"The layer {layer.name!r} is larger than the map that it sees.")
+            steps = room // layer.stride
+            if isinstance(layer, Pooling) and layer.ceil and room % layer.stride:
+                # One window more, unless it would begin in the border behind the map.
+                steps += (steps + 1) * layer.stride < size + layer.pad
+            size = steps + 1
+
+
+# Weights
+
+
+def _read_weights(definition: NetworkDefinition, trunk: Sequence[CaffeLayer]) -> dict[str, Tensor]:
+    weights: dict[str, Tensor] = {}
+    channels = 3
+    for layer, source in zip(definition.layers, trunk, strict=True):
+        if not isinstance(layer, Convolution):
+            continue
+        biased = source.part("convolution").integer(2, 1) != 0
+        arrays = source.arrays()
+        if len(arrays) != 1 + biased:
+            raise InvalidModel(f"The network's {source} has {len(arrays)} arrays of weights, not {1 + biased}.")
+        weight, bias = arrays if biased else (arrays[0], np.zeros(layer.channels, np.float32))
+        wanted = (layer.channels, channels // layer.groups, layer.kernel, layer.kernel)
+        if weight.shape != wanted or channels % layer.groups or bias.size != layer.channels:
+            raise InvalidModel(
+                f"The network's {source} has weights of the shape {weight.shape} and {bias.size} biases; "
+                f"{wanted} and {layer.channels} are needed."
+            )
+        weights[f"{layer.name}.weight"] = torch.from_numpy(weight)
+        weights[f"{layer.name}.bias"] = torch.from_numpy(bias.reshape(-1))
+        channels = layer.channels
+    return weights

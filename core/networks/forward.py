@@ -1,0 +1,162 @@
+"""The forward pass of a shallow network at the processor's best: each convolution and its rectifier in one step.
+
+torch's own pass puts the weights into the order that the processor's kernel wants at every call, and walks over
+each map once more to rectify it.  Here both are done once and for all, or within the convolution (oneDNN), and a
+max-pooling walks over channels-last maps without keeping where each maximum came from.  Kernels of 3 x 3 and 5 x 5
+are done with half the multiplications (``winograd.py``), which rounds otherwise than torch's own sums.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Literal
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+from core.errors import InvalidModel
+from core.networks.convolution import LAST, FusedConvolution
+from core.networks.network import Convolution, Pooling, Relu, ShallowNetwork
+from core.networks.winograd import fast_convolution
+
+Precision = Literal["float32", "bfloat16"]
+Device = Literal["cpu", "cuda"]
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+AGREEMENT = 1e-4
+"""How far a fused float32 pass may be from torch's own, as a share of the largest activation."""
+
+
+class FusedPass:
+    """A :class:`ShallowNetwork` as one chain of fused steps; called as the network is.
+
+    Args:
+        network: whose weights are copied; what becomes of it later does not matter.
+        precision: of weights and activations; the outputs are float32 in any.
+
+    Raises:
+        RuntimeError: this build of torch or this processor lacks the fused convolution.
+    """
+
+    def __init__(self, network: ShallowNetwork, precision: Precision = "float32") -> None:
+        self.outputs, self.precision = network.outputs, precision
+        self._dtype = DTYPES[precision]
+        self._steps: list[tuple[str, Callable[[Tensor], Tensor]]] = []
+        layers = network.definition.layers
+        for layer, following in zip(layers, [*layers[1:], None], strict=True):
+            module = network.stages[layer.name]
+            if isinstance(layer, Convolution):
+                rectified = isinstance(following, Relu) and following.negative_slope == 0
+                fast = fast_convolution(module, rectified) if precision == "float32" else None
+                self._steps.append((layer.name, fast or FusedConvolution.of(module, rectified, self._dtype)))
+                if isinstance(following, Relu) and not rectified:
+                    self._steps.append((layer.name, network.stages[following.name]))
+            elif isinstance(layer, Pooling):
+                plain = layer.method == "max" and layer.pad == 0 and precision == "float32"
+                self._steps.append((layer.name, MaxPooling(layer) if plain else module))
+            elif not isinstance(layer, Relu):
+                self._steps.append((layer.name, module))
+
+    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
+        """B x 3 x H x W float32 to one B x K x X x Y float32 tensor for each output, channels last in memory."""
+        found: dict[str, Tensor] = {}
+        x = images.to(self._dtype)
+        for name, step in self._steps:
+            x = step(x)
+            if name in self.outputs:
+                found[name] = x
+        return tuple(found[name].float().contiguous(memory_format=LAST) for name in self.outputs)
+
+
+class MaxPooling:
+    """Max-pooling without padding of float32 maps that are channels last in memory."""
+
+    def __init__(self, layer: Pooling) -> None:
+        self._kernel, self._stride, self._ceil = layer.kernel, layer.stride, layer.ceil
+
+    def _size(self, cells: int) -> int:
+        """Rows or columns of the output; every window starts within the map."""
+        over = cells - self._kernel
+        size = 1 + (-(-over // self._stride) if self._ceil else over // self._stride)
+        return size - 1 if (size - 1) * self._stride >= cells else size
+
+    def __call__(self, x: Tensor) -> Tensor:
+        maps = x.permute(0, 2, 3, 1).contiguous().numpy()
+        count, height, width, channels = maps.shape
+        pooled = np.empty((count, self._size(height), self._size(width), channels), np.float32)
+        _max_pooled(maps, self._kernel, self._stride, pooled)
+        return torch.from_numpy(pooled).permute(0, 3, 1, 2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _max_pooled(maps, kernel, stride, pooled):  # type: ignore[no-untyped-def]
+    """Maxima over windows that are cut off at the lower and right edge; float32 [B, X, Y, K] both."""
+    count, height, width, channels = maps.shape
+    for b in range(count):
+        for y in range(pooled.shape[1]):
+            top, bottom = y * stride, min(height, y * stride + kernel)
+            for x in range(pooled.shape[2]):
+                left, right = x * stride, min(width, x * stride + kernel)
+                row = pooled[b, y, x]
+                if bottom - top == 3 and right - left == 3:  # CaffeNet's windows, all at once
+                    for k in range(channels):
+                        upper = max(max(maps[b, top, left, k], maps[b, top, left + 1, k]), maps[b, top, left + 2, k])
+                        v = top + 1
+                        middle = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
+                        v = top + 2
+                        lower = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
+                        row[k] = max(max(upper, middle), lower)
+                else:
+                    row[:] = maps[b, top, left]
+                    for v in range(top, bottom):
+                        for u in range(left, right):
+                            for k in range(channels):
+                                row[k] = max(row[k], maps[b, v, u, k])
+
+
+def fused_pass(network: ShallowNetwork, precision: Precision = "float32") -> FusedPass | None:
+    """The fused pass of a network, tried once; None where this machine lacks it or it comes to other values.
+
+    Args:
+        precision: of bfloat16 nothing is checked but that it runs: its user holds the descriptors against float32's.
+    """
+    shown = network.input
+    image = torch.rand(1, 3, shown.height, shown.width, generator=torch.Generator().manual_seed(0)) - 0.5
+    image = image.contiguous(memory_format=LAST)
+    try:
+        with torch.inference_mode():
+            made = FusedPass(network, precision)
+            pairs = list(zip(made(image), network(image), strict=True))
+    except (RuntimeError, AttributeError):  # the operator is not in this build, or refuses the type
+        return None
+    near = all(float((a - b).abs().max()) <= AGREEMENT * float(b.abs().max()) for a, b in pairs)
+    return made if near or precision != "float32" else None
+
+
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16, twice as fast as float32; elsewhere it would only be imitated."""
+    supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return supported is not None and bool(supported())
+
+
+class CudaPass:
+    """A network on the first CUDA device, in float32 proper; called as the network is, with the outputs on the CPU.
+
+    Raises:
+        InvalidModel: torch finds no CUDA device.
+    """
+
+    def __init__(self, network: ShallowNetwork) -> None:
+        if not torch.cuda.is_available():
+            raise InvalidModel("torch finds no CUDA device on this machine; use the device cpu.")
+        # torch allows cuDNN a mantissa of ten bits, under which regions change.
+        torch.backends.cudnn.allow_tf32 = False
+        copied = copy.deepcopy(network)
+        self._network = copied.to("cuda", memory_format=LAST)  # type: ignore[call-overload]
+
+    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
+        """B x 3 x H x W float32 to one B x K x X x Y float32 tensor for each output."""
+        return tuple(output.cpu() for output in self._network(images.to("cuda")))

@@ -1,0 +1,299 @@
+"""The shallow CaffeNet-family backbone: its definition, its layers, its forward pass.
+
+A network is described by data (:class:`NetworkDefinition`), so that HybridNet, AMOSNet, CaffeNet,
+AlexNet365 and our own distilled network are five descriptions of one module.  Only the layers up
+to the deepest one in use are built, and only their weights are loaded (thesis, section 4.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from core.errors import InvalidModel
+from core.frames.preprocessing import InputDefinition
+
+NAME = r"^[a-z0-9][a-z0-9._-]{0,63}$"
+FORMAT = "placerec-network/1"
+
+
+class _Layer(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+
+
+class Convolution(_Layer):
+    """A grouped 2-D convolution with a bias."""
+
+    type: Literal["convolution"] = "convolution"
+    channels: int = Field(gt=0)
+    kernel: int = Field(gt=0)
+    stride: int = Field(default=1, gt=0)
+    pad: int = Field(default=0, ge=0)
+    groups: int = Field(default=1, gt=0)
+
+
+class Relu(_Layer):
+    """max(x, slope·x).  Caffe runs it in place: the layer before it is seen rectified."""
+
+    type: Literal["relu"] = "relu"
+    negative_slope: float = 0.0
+
+
+class Pooling(_Layer):
+    """Spatial pooling; Caffe rounds the output size up (``ceil``), torch's default rounds down."""
+
+    type: Literal["pooling"] = "pooling"
+    method: Literal["max", "average"] = "max"
+    kernel: int = Field(gt=0)
+    stride: int = Field(gt=0)
+    pad: int = Field(default=0, ge=0)
+    ceil: bool = True
+
+
+class Normalization(_Layer):
+    """Local response normalization across channels (Krizhevsky et al., 2012, section 3.3)."""
+
+    type: Literal["normalization"] = "normalization"
+    size: int = Field(default=5, gt=0)
+    alpha: float = 1e-4
+    beta: float = 0.75
+    k: float = 1.0
+
+
+Layer = Convolution | Relu | Pooling | Normalization
+
+
+class NetworkDefinition(BaseModel):
+    """Everything that turns colour pixels into activations, apart from the weights."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=NAME)
+    input: InputDefinition
+    layers: tuple[Annotated[Layer, Field(discriminator="type")], ...]
+
+    @model_validator(mode="after")
+    def _names_are_unique(self) -> NetworkDefinition:
+        names = [layer.name for layer in self.layers]
+        if len(set(names)) != len(names):
+            raise ValueError("layer names are not unique")
+        if not any(isinstance(layer, Convolution) for layer in self.layers):
+            raise ValueError("a network needs at least one convolution")
+        return self
+
+    def convolutions(self) -> tuple[Convolution, ...]:
+        """The convolutions, shallowest first."""
+        return tuple(layer for layer in self.layers if isinstance(layer, Convolution))
+
+    def truncated(self, names: Iterable[str]) -> NetworkDefinition:
+        """This network cut after the deepest of the convolutions (and its rectifier) or poolings ``names``.
+
+        Raises:
+            InvalidModel: a name is not that of a convolution or pooling of this network.
+        """
+        wanted = set(names)
+        offered = [layer.name for layer in self.layers if isinstance(layer, Convolution | Pooling)]
+        missing = wanted - set(offered)
+        if missing or not wanted:
+            raise InvalidModel(
+                f"network {self.name!r} has no convolution or pooling named "
+                f"{', '.join(sorted(missing)) or '(none given)'}; it has {', '.join(offered)}"
+            )
+        last = max(i for i, layer in enumerate(self.layers) if layer.name in wanted)
+        if last + 1 < len(self.layers) and isinstance(self.layers[last + 1], Relu):
+            last += 1
+        return self.model_copy(update={"layers": self.layers[: last + 1]})
+
+
+def caffenet_definition(
+    name: str,
+    *,
+    normalize: bool = True,
+    norm_before_pool: bool = False,
+    depth: int = 5,
+    scale: float = 1.0,
+) -> NetworkDefinition:
+    """The CaffeNet layout (Jia et al., 2014): conv1 96 · conv2 256 · conv3 384 · conv4 384 · conv5 256.
+
+    Args:
+        normalize: with the two local response normalizations (our distilled network has none).
+        norm_before_pool: AlexNet's order instead of CaffeNet's.
+        depth: how many of the five convolutions to keep.
+        scale: factor on the mean-subtracted 0–255 pixels.
+    """
+    convolutions = (
+        Convolution(name="conv1", channels=96, kernel=11, stride=4),
+        Convolution(name="conv2", channels=256, kernel=5, pad=2, groups=2),
+        Convolution(name="conv3", channels=384, kernel=3, pad=1),
+        Convolution(name="conv4", channels=384, kernel=3, pad=1, groups=2),
+        Convolution(name="conv5", channels=256, kernel=3, pad=1, groups=2),
+    )
+    layers: list[Layer] = []
+    for number, convolution in enumerate(convolutions[:depth], start=1):
+        layers += [convolution, Relu(name=f"relu{number}")]
+        if number <= 2:
+            shrink: list[Layer] = [Pooling(name=f"pool{number}", kernel=3, stride=2)]
+            if normalize:
+                shrink.insert(0 if norm_before_pool else 1, Normalization(name=f"norm{number}"))
+            layers += shrink
+    shown = InputDefinition(height=227, width=227, mean=(104.0, 117.0, 123.0), scale=(scale,) * 3)
+    return NetworkDefinition(name=name, input=shown, layers=tuple(layers))
+
+
+class LocalResponseNormalization(nn.Module):
+    """x / (k + α/n · Σ x²)^β over n neighbouring channels, as Caffe computes it.
+
+    torch's own layer divides α by n just so, so this only fixes the parameter names.
+    """
+
+    def __init__(self, layer: Normalization) -> None:
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x: Tensor) -> Tensor:
+        layer = self.layer
+        return nn.functional.local_response_norm(x, layer.size, layer.alpha, layer.beta, layer.k)
+
+
+def build_layer(layer: Layer, channels: int) -> nn.Module:
+    """The torch module of one layer that receives ``channels`` input channels."""
+    match layer:
+        case Convolution():
+            return nn.Conv2d(channels, layer.channels, layer.kernel, layer.stride, layer.pad, groups=layer.groups)
+        case Relu(negative_slope=0.0):
+            return nn.ReLU(inplace=True)
+        case Relu():
+            return nn.LeakyReLU(layer.negative_slope, inplace=True)
+        case Pooling(method="max"):
+            return nn.MaxPool2d(layer.kernel, layer.stride, layer.pad, ceil_mode=layer.ceil)
+        case Pooling():
+            return nn.AvgPool2d(layer.kernel, layer.stride, layer.pad, ceil_mode=layer.ceil)
+        case Normalization():
+            return LocalResponseNormalization(layer)
+
+
+class ShallowNetwork(nn.Module):
+    """A sequential network whose rectified convolutions and poolings can be read by name.
+
+    Args:
+        definition: the layers; cut it with :meth:`NetworkDefinition.truncated` first.
+        outputs: the convolutions and poolings to return, in the order wanted.
+
+    Raises:
+        InvalidModel: an output is not a convolution or pooling of the definition.
+    """
+
+    def __init__(self, definition: NetworkDefinition, outputs: Iterable[str]) -> None:
+        super().__init__()
+        self.outputs = tuple(outputs)
+        self.definition = definition.truncated(self.outputs)
+        self.stages = nn.ModuleDict()
+        channels = 3
+        try:
+            for layer in self.definition.layers:
+                self.stages[layer.name] = build_layer(layer, channels)
+                channels = layer.channels if isinstance(layer, Convolution) else channels
+        except (KeyError, ValueError) as error:
+            raise InvalidModel(f"layer {layer.name} of {self.definition.name!r} cannot be built: {error}") from error
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:  # B x 3 x H x W
+        """Activations of the named convolutions after their rectifier, and of the poolings, each B x K x X x Y."""
+        found: dict[str, Tensor] = {}
+        x, open_name = images, ""
+        for layer in self.definition.layers:
+            if open_name and not isinstance(layer, Relu):
+                found[open_name], open_name = x, ""
+            x = self.stages[layer.name](x)
+            if isinstance(layer, Convolution):
+                open_name = layer.name
+            elif isinstance(layer, Pooling) and layer.name in self.outputs:
+                found[layer.name] = x
+        if open_name:
+            found[open_name] = x
+        return tuple(found[name] for name in self.outputs)
+
+    @property
+    def input(self) -> InputDefinition:
+        """What the network wants to see."""
+        return self.definition.input
+
+    def describe(self) -> dict[str, Any]:
+        """Everything besides the weights that can change an activation; the name cannot."""
+        return self.definition.model_dump(mode="json", exclude={"name"}) | {"outputs": list(self.outputs)}
+
+    def weights(self) -> dict[str, Tensor]:
+        """``<layer>.weight`` and ``<layer>.bias`` of each convolution in use."""
+        return {key.removeprefix("stages."): tensor for key, tensor in self.state_dict().items()}
+
+    def load_weights(self, weights: Mapping[str, Tensor]) -> None:
+        """Take ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use; ignore deeper ones.
+
+        Raises:
+            InvalidModel: a tensor is missing, has another shape, or is not finite.
+        """
+        for layer in self.definition.convolutions():
+            module = self.stages[layer.name]
+            for kind in ("weight", "bias"):
+                key = f"{layer.name}.{kind}"
+                target: Tensor = getattr(module, kind)
+                if key not in weights:
+                    raise InvalidModel(f"the weights of {self.definition.name!r} lack {key}")
+                tensor = weights[key]
+                if tensor.shape != target.shape:
+                    raise InvalidModel(
+                        f"{key} has shape {tuple(tensor.shape)}, the network needs {tuple(target.shape)}"
+                    )
+                if not torch.isfinite(tensor).all():
+                    raise InvalidModel(f"{key} holds values that are not finite")
+                with torch.no_grad():
+                    target.copy_(tensor.to(target.dtype))
+
+
+def save_network(path: Path, definition: NetworkDefinition, weights: Mapping[str, Tensor]) -> None:
+    """Write definition and weights to one safetensors file."""
+    metadata = {"format": FORMAT, "definition": definition.model_dump_json()}
+    save_file({name: tensor.contiguous() for name, tensor in weights.items()}, path, metadata)
+    path.chmod(0o644)
+
+
+def read_definition(path: Path) -> NetworkDefinition:
+    """The definition in a network file; no weights are read.
+
+    Raises:
+        InvalidModel: the file is missing, damaged or of another format.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+        if metadata.get("format") != FORMAT:
+            raise InvalidModel(f"{path.name} is not a {FORMAT} file.")
+        return NetworkDefinition.model_validate_json(metadata["definition"])
+    except (OSError, SafetensorError, KeyError, ValidationError) as error:
+        raise InvalidModel(f"{path.name} is not a readable network file: {error}") from error
+
+
+def load_network(path: Path, outputs: Iterable[str]) -> ShallowNetwork:
+    """Build the network of a file as deep as ``outputs`` needs, with just those weights read.
+
+    Raises:
+        InvalidModel: the file or an output name is not usable.
+    """
+    network = ShallowNetwork(read_definition(path), outputs)
+    try:
+        with safe_open(path, "pt") as file:
+            wanted = {f"{c.name}.{kind}" for c in network.definition.convolutions() for kind in ("weight", "bias")}
+            weights = {name: file.get_tensor(name) for name in wanted & set(file.keys())}
+    except (OSError, SafetensorError) as error:
+        raise InvalidModel(f"{path.name} cannot be read: {error}") from error
+    network.load_weights(weights)
+    # Frames arrive channels last, and the region pass reads the maps that way.
+    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

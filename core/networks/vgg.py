@@ -1,0 +1,76 @@
+"""VGG-16 up to conv5_3 (Simonyan and Zisserman, 2015), on which several of the compared systems stand.
+
+Thirteen 3 x 3 convolutions in five blocks, a 2 x 2 pooling between blocks.  Channel counts are those of the
+weights, 64 · 128 · 256 · 512 · 512 in the published networks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from core.errors import InvalidModel
+from core.frames.preprocessing import InputDefinition, Pixels, prepare
+from core.networks.network import Convolution, Layer, NetworkDefinition, Pooling, Relu, ShallowNetwork
+
+BLOCKS = (2, 2, 3, 3, 3)
+CONVOLUTIONS = tuple(f"conv{block}_{place}" for block, count in enumerate(BLOCKS, 1) for place in range(1, count + 1))
+LAST = CONVOLUTIONS[-1]
+
+IMAGENET_BGR = (103.939, 116.779, 123.68)
+"""The mean that the network was trained with."""
+
+
+def torchvision_indices() -> dict[str, int]:
+    """Where torchvision's ``vgg16().features`` has each convolution: rectifiers and poolings count too."""
+    indices: dict[str, int] = {}
+    place = 0
+    for block, count in enumerate(BLOCKS, 1):
+        for convolution in range(1, count + 1):
+            indices[f"conv{block}_{convolution}"] = place
+            place += 2  # itself and its rectifier
+        place += 1  # the pooling
+    return indices
+
+
+def load_vgg16(
+    weights: Mapping[str, Tensor],
+    shown: InputDefinition,
+    *,
+    outputs: tuple[str, ...] = (LAST,),
+    rectified: bool,
+    ceil: bool = False,
+) -> ShallowNetwork:
+    """The network as deep as conv5_3.
+
+    Args:
+        weights: ``conv1_1.weight`` (K x C x 3 x 3), ``conv1_1.bias`` (K) and so on.
+        outputs: convolutions to return, rectified all but perhaps the last.
+        rectified: whether conv5_3 is rectified; NetVLAD reads it before.
+        ceil: Caffe's rounding of pooled sizes; of sizes that are multiples of 16 it changes nothing.
+
+    Raises:
+        InvalidModel: a tensor is missing, of another shape, or not finite.
+    """
+    layers: list[Layer] = []
+    for name in CONVOLUTIONS:
+        weight = weights.get(f"{name}.weight")
+        if weight is None or weight.ndim != 4 or not weight.shape[0]:
+            raise InvalidModel(f"The file has no weights of VGG-16's {name}.")
+        if name.endswith("_1") and layers:
+            layers.append(Pooling(name=f"pool{name[4]}", kernel=2, stride=2, ceil=ceil))
+        layers.append(Convolution(name=name, channels=weight.shape[0], kernel=3, pad=1))
+        if rectified or name != LAST:
+            layers.append(Relu(name=name.replace("conv", "relu")))
+    network = ShallowNetwork(NetworkDefinition(name="vgg16", input=shown, layers=tuple(layers)), outputs)
+    network.load_weights(weights)
+    return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def forward(network: ShallowNetwork, pixels: Pixels) -> tuple[Tensor, ...]:
+    """The maps of the network's outputs of one frame, each float32 [K, X, Y]."""
+    image = torch.from_numpy(np.ascontiguousarray(prepare(pixels, network.input))).permute(2, 0, 1)[None]
+    return tuple(maps[0] for maps in network(image))

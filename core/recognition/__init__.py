@@ -1,0 +1,1 @@
+"""The whole path from a frame to an answer, without HTTP."""

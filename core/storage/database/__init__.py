@@ -1,0 +1,1 @@
+"""A map's SQLite database: its tables, its statements, its log."""

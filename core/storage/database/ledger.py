@@ -1,0 +1,377 @@
+"""The statements that read and write a map's places, sequences, pictures and record.
+
+Every function takes the connection that its caller holds: a reader's, or that of the transaction
+of which it becomes a part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sqlite3
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from core.errors import InvalidField, UnknownPlace
+from core.places import Place, PlaceFields, Pose
+from core.storage.database import row_checksums as seals
+from core.storage.database.row_checksums import SEALED
+from core.storage.database.schema import NO_SEQUENCE
+from core.storage.files.disk import Damage
+from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
+
+DEEPEST_METADATA = 64
+"""Levels of nesting; what is deeper could be stored but not be sent."""
+
+_POSE = ("x", "y", "z", "latitude", "longitude", "heading")
+
+_COLUMNS = SEALED["places"]
+_PLACE = (
+    f"SELECT {', '.join(f'p.{name}' for name in _COLUMNS)}, p.seal, s.name"
+    " FROM places p JOIN sequences s ON s.code = p.sequence "
+)
+
+
+@dataclass(frozen=True)
+class StoredPlace:
+    """A place and where its descriptor is."""
+
+    number: int
+    row: int
+    digest: bytes
+    sequence: int
+    ordinal: int
+    place: Place
+
+
+def _stored(values: tuple[Any, ...]) -> StoredPlace:
+    *sealed, seal, sequence = values
+    columns = dict(zip(_COLUMNS, sealed, strict=True))
+    if not seals.is_sound(sealed, seal):
+        raise Damage(f"map.sqlite: place {columns['id']!r} does not match its checksum")
+    pose = {name: columns[name] for name in _POSE if columns[name] is not None}
+    try:
+        place = Place(
+            id=columns["id"],
+            regions=columns["regions"],
+            picture=columns["picture"],
+            pose=Pose(**pose) if pose else None,
+            timestamp=columns["timestamp"],
+            sequence=sequence,
+            camera=columns["camera"],
+            metadata=json.loads(columns["metadata"]),
+            created_at=columns["created_at"],
+            updated_at=columns["updated_at"],
+        )
+    except ValueError as error:
+        raise Damage(f"map.sqlite: place {columns['id']!r} makes no sense") from error
+    return StoredPlace(
+        columns["number"], columns["row"], columns["digest"], columns["sequence"], columns["ordinal"], place
+    )
+
+
+def moment_text(moment: datetime) -> str:
+    """An instant in UTC as text that sorts by time."""
+    return moment.isoformat(timespec="microseconds")
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(DEEPEST_METADATA):
+        level = [
+            inner
+            for outer in level
+            if isinstance(outer, dict | list | tuple)
+            for inner in (outer.values() if isinstance(outer, dict) else outer)
+        ]
+    return bool(level)
+
+
+def metadata_text(metadata: dict[str, Any]) -> str:
+    """Metadata as canonical JSON: the same content is always the same text.
+
+    Raises:
+        InvalidField: JSON cannot say it (not-a-number, infinity, other types), or it is nested too deeply.
+    """
+    if _is_deep(metadata):
+        raise InvalidField(f"The metadata is nested more than {DEEPEST_METADATA} levels deep.")
+    try:
+        return json.dumps(metadata, allow_nan=False, sort_keys=True, separators=(",", ":"))
+    except (TypeError, ValueError) as error:
+        raise InvalidField(f"The metadata cannot be written as JSON: {error}.") from error
+
+
+def field_columns(fields: PlaceFields) -> dict[str, Any]:
+    """The columns of ``places`` that hold a place's fields, its sequence left out.
+
+    Raises:
+        InvalidField: the metadata cannot be written as JSON.
+    """
+    columns: dict[str, Any] = {name: getattr(fields.pose, name) if fields.pose else None for name in _POSE}
+    columns["timestamp"] = moment_text(fields.timestamp) if fields.timestamp else None
+    columns["camera"] = fields.camera
+    columns["metadata"] = metadata_text(fields.metadata)
+    return columns
+
+
+def same_fields(a: PlaceFields, b: PlaceFields) -> bool:
+    """Whether two sets of fields are stored alike (unlike Python, JSON tells 1 from true)."""
+    return a.sequence == b.sequence and field_columns(a) == field_columns(b)
+
+
+# Reading
+
+
+def find(connection: sqlite3.Connection, place_id: str) -> StoredPlace | None:
+    """The place of this id."""
+    values = connection.execute(_PLACE + "WHERE p.id = ?", (place_id,)).fetchone()
+    return None if values is None else _stored(values)
+
+
+def expect(connection: sqlite3.Connection, place_id: str) -> StoredPlace:
+    """The place of this id.
+
+    Raises:
+        UnknownPlace: there is none.
+    """
+    stored = find(connection, place_id)
+    if stored is None:
+        raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
+    return stored
+
+
+def places_after(connection: sqlite3.Connection, after: int, limit: int, sequence: str | None) -> list[StoredPlace]:
+    """Up to ``limit`` places in the order of their enrolment, of one sequence or of all."""
+    condition, values = ("AND s.name = ? ", [sequence]) if sequence is not None else ("", [])
+    query = f"{_PLACE}WHERE p.number > ? {condition}ORDER BY p.number LIMIT ?"
+    return [_stored(row) for row in connection.execute(query, (after, *values, limit)).fetchall()]
+
+
+def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int, Place]:
+    """The places whose descriptors are in ``rows`` now."""
+    query = _PLACE + "WHERE p.row IN (SELECT value FROM json_each(?))"
+    found = (_stored(values) for values in connection.execute(query, (json.dumps(rows),)).fetchall())
+    return {stored.row: stored.place for stored in found}
+
+
+def rows_of_places(connection: sqlite3.Connection, place_ids: list[str]) -> dict[str, int]:
+    """The descriptor rows of those of the places that there are."""
+    query = "SELECT id, row FROM places WHERE id IN (SELECT value FROM json_each(?))"
+    return dict(connection.execute(query, (json.dumps(place_ids),)).fetchall())
+
+
+def sequences_after(connection: sqlite3.Connection, after: str, limit: int) -> list[SequenceSummary]:
+    """Up to ``limit`` sequences by name."""
+    query = (
+        "SELECT s.name, count(*), min(p.timestamp), max(p.timestamp) FROM sequences s"
+        " JOIN places p ON p.sequence = s.code WHERE s.name > ? GROUP BY s.name ORDER BY s.name LIMIT ?"
+    )
+    return [
+        SequenceSummary(name=name, places=places, first_at=first, last_at=last)
+        for name, places, first, last in connection.execute(query, (after, limit)).fetchall()
+    ]
+
+
+def rows_of_sequence(connection: sqlite3.Connection, name: str) -> list[int]:
+    """The descriptor rows of a sequence's places."""
+    query = "SELECT p.row FROM places p JOIN sequences s ON s.code = p.sequence WHERE s.name = ?"
+    return [row for (row,) in connection.execute(query, (name,)).fetchall()]
+
+
+def picture(connection: sqlite3.Connection, number: int) -> tuple[bytes, bytes] | None:
+    """What is kept of a place's frame, and its SHA-256."""
+    found = connection.execute("SELECT bytes, digest FROM pictures WHERE place = ?", (number,)).fetchone()
+    return None if found is None else (found[0], found[1])
+
+
+# Writing
+
+
+def _sequence_code(connection: sqlite3.Connection, name: str | None) -> int:
+    if name is None:
+        return NO_SEQUENCE
+    found = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
+    if found is not None:
+        return int(found[0])
+    code = connection.execute("INSERT INTO sequences (name, next_ordinal) VALUES (?, 0)", (name,)).lastrowid
+    assert code is not None
+    return code
+
+
+def _next_ordinal(connection: sqlite3.Connection, code: int) -> int:
+    query = "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE code = ? RETURNING next_ordinal - 1"
+    ((ordinal,),) = connection.execute(query, (code,)).fetchall()
+    return int(ordinal)
+
+
+def _drop_if_empty(connection: sqlite3.Connection, code: int) -> None:
+    query = (
+        "DELETE FROM sequences WHERE code = ?1 AND name IS NOT NULL"
+        " AND NOT EXISTS (SELECT 1 FROM places WHERE sequence = ?1)"
+    )
+    connection.execute(query, (code,))
+
+
+def _picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
+    """What is kept of a frame, and its bytes."""
+    if keep == "image" and item.image is not None:
+        return keep, item.image
+    if keep != "none" and item.thumbnail is not None:
+        return "thumbnail", item.thumbnail
+    return "none", None
+
+
+def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | None) -> None:
+    """Of a place that has none."""
+    if content is not None:
+        digest = hashlib.sha256(content).digest()
+        connection.execute("INSERT INTO pictures VALUES (?, ?, ?)", (number, digest, content))
+
+
+def insert(
+    connection: sqlite3.Connection, item: Enrolment, row: int, checksum: int, keep: Keep, now: datetime
+) -> StoredPlace:
+    """A new place, at the end of its sequence."""
+    code = _sequence_code(connection, item.fields.sequence)
+    picture, content = _picture_of(item, keep)
+    columns = {
+        "id": item.id,
+        "row": row,
+        "checksum": checksum,
+        "digest": item.digest,
+        "regions": item.regions,
+        "picture": picture,
+        "sequence": code,
+        "ordinal": _next_ordinal(connection, code),
+        "created_at": moment_text(now),
+        "updated_at": moment_text(now),
+        **field_columns(item.fields),
+    }
+    names, marks = ", ".join(columns), ", ".join("?" * len(columns))
+    cursor = connection.execute(f"INSERT INTO places ({names}) VALUES ({marks})", tuple(columns.values()))
+    assert cursor.lastrowid is not None
+    _put_picture(connection, cursor.lastrowid, content)
+    seals.seal(connection, "places", "number = ?", cursor.lastrowid)
+    return expect(connection, item.id)
+
+
+def _set(connection: sqlite3.Connection, number: int, **columns: Any) -> None:
+    assignments = ", ".join(f"{name} = ?" for name in columns)
+    connection.execute(f"UPDATE places SET {assignments} WHERE number = ?", (*columns.values(), number))
+    seals.seal(connection, "places", "number = ?", number)
+
+
+def replace_descriptor(
+    connection: sqlite3.Connection,
+    stored: StoredPlace,
+    item: Enrolment,
+    row: int,
+    checksum: int,
+    keep: Keep,
+) -> None:
+    """Another frame for a place: its descriptor is in another row from now on."""
+    picture, content = _picture_of(item, keep)
+    connection.execute("DELETE FROM pictures WHERE place = ?", (stored.number,))
+    _put_picture(connection, stored.number, content)
+    _set(
+        connection,
+        stored.number,
+        row=row,
+        checksum=checksum,
+        digest=item.digest,
+        regions=item.regions,
+        picture=picture,
+    )
+
+
+def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: PlaceFields, now: datetime) -> StoredPlace:
+    """Other fields for a place.  It keeps its place in its sequence unless that is another one."""
+    columns = field_columns(fields)
+    if fields.sequence != stored.place.sequence:
+        columns["sequence"] = _sequence_code(connection, fields.sequence)
+        columns["ordinal"] = _next_ordinal(connection, columns["sequence"])
+    _set(connection, stored.number, updated_at=moment_text(now), **columns)
+    if "sequence" in columns:
+        _drop_if_empty(connection, stored.sequence)
+    return expect(connection, stored.place.id)
+
+
+def set_history(connection: sqlite3.Connection, place_id: str, history: History) -> StoredPlace:
+    """When a place was made and changed, and its order in its sequence, as they were elsewhere."""
+    stored = expect(connection, place_id)
+    moments = {"created_at": moment_text(history.created_at), "updated_at": moment_text(history.updated_at)}
+    ordinal = stored.ordinal if history.ordinal is None else history.ordinal
+    _set(connection, stored.number, ordinal=ordinal, **moments)
+    connection.execute(
+        "UPDATE sequences SET next_ordinal = max(next_ordinal, ?) WHERE code = ?", (ordinal + 1, stored.sequence)
+    )
+    return expect(connection, place_id)
+
+
+def delete(connection: sqlite3.Connection, stored: StoredPlace) -> None:
+    """Forget a place, its picture too."""
+    connection.execute("DELETE FROM places WHERE number = ?", (stored.number,))
+    _drop_if_empty(connection, stored.sequence)
+
+
+def delete_sequence(connection: sqlite3.Connection, name: str) -> None:
+    """Forget the places of a sequence, and it."""
+    (code,) = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
+    connection.execute("DELETE FROM places WHERE sequence = ?", (code,))
+    _drop_if_empty(connection, int(code))
+
+
+def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
+    """Say that a segment file holds so many rows, whose checksums have this checksum."""
+    statement = "INSERT OR REPLACE INTO segments (number, rows, checksum) VALUES (?, ?, ?)"
+    connection.execute(statement, (segment, rows, checksum))
+
+
+# The map's own record
+
+
+def insert_record(connection: sqlite3.Connection, record: MapRecord, rows_per_segment: int) -> None:
+    """The one row of a new map."""
+    columns = {"only": 1, "rows_per_segment": rows_per_segment, **_record_columns(record)}
+    names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
+    connection.execute(f"INSERT INTO map ({names}) VALUES ({marks})", tuple(columns.values()))
+    seals.seal(connection, "map")
+
+
+def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
+    """Put ``record`` in the place of the map's own."""
+    columns = _record_columns(record)
+    assignments = ", ".join(f'"{name}" = ?' for name in columns)
+    connection.execute(f"UPDATE map SET {assignments}", tuple(columns.values()))
+    seals.seal(connection, "map")
+
+
+def _record_columns(record: MapRecord) -> dict[str, Any]:
+    columns = record.model_dump(exclude={"calibration"})
+    columns["calibration"] = None if record.calibration is None else record.calibration.model_dump_json()
+    columns["created_at"] = moment_text(record.created_at)
+    columns["updated_at"] = moment_text(record.updated_at)
+    return columns
+
+
+def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
+    """The map's record and the rows of each of its full segments.
+
+    Raises:
+        ValueError: the row is missing or makes no sense.
+    """
+    cursor = connection.execute("SELECT * FROM map")
+    values = cursor.fetchone()
+    if values is None:
+        raise ValueError("the map's own record is missing")
+    columns = {description[0]: value for description, value in zip(cursor.description, values, strict=True)}
+    if not seals.is_sound([columns[name] for name in SEALED["map"]], columns.pop("seal")):
+        raise ValueError("it does not match its checksum")
+    rows_per_segment = columns.pop("rows_per_segment")
+    if not isinstance(rows_per_segment, int):
+        raise ValueError("it does not say how many rows a segment has")
+    del columns["only"]
+    if columns["calibration"] is not None:
+        columns["calibration"] = json.loads(columns["calibration"])
+    return MapRecord.model_validate(columns), rows_per_segment

@@ -1,0 +1,264 @@
+"""The tables of ``map.sqlite`` and how older files become newer ones.
+
+A file carries our application id and, as ``user_version``, the number of migrations it has had.
+Every migration is a list of statements; all that a file lacks are applied in one transaction.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from core.errors import DataDirectoryTooNew
+from core.storage.database import row_checksums as seals
+from core.storage.files.disk import Damage
+
+APPLICATION_ID = 0x504C5243  # "PLRC"
+
+Migration = Sequence[str]
+
+T = TypeVar("T")
+
+NO_SEQUENCE = -1
+"""Code of the places that belong to no sequence."""
+
+_FIRST: Migration = (
+    """CREATE TABLE map (
+        only INTEGER PRIMARY KEY CHECK (only = 1),
+        id TEXT NOT NULL,
+        encoder TEXT NOT NULL,
+        dimension INTEGER NOT NULL CHECK (dimension > 0),
+        rows_per_segment INTEGER NOT NULL CHECK (rows_per_segment > 0),
+        description TEXT NOT NULL,
+        keep TEXT NOT NULL,
+        same_place_radius REAL NOT NULL,
+        same_place_frames INTEGER NOT NULL,
+        calibration TEXT,
+        revision INTEGER NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    # Codes are never used again, so that an old snapshot cannot confuse two sequences.
+    """CREATE TABLE sequences (
+        code INTEGER PRIMARY KEY AUTOINCREMENT,
+        name TEXT UNIQUE,
+        next_ordinal INTEGER NOT NULL
+    ) STRICT""",
+    f"INSERT INTO sequences VALUES ({NO_SEQUENCE}, NULL, 0)",
+    # What is named of each segment file: so many rows, whose checksums have this checksum.
+    """CREATE TABLE segments (
+        number INTEGER PRIMARY KEY,
+        rows INTEGER NOT NULL CHECK (rows > 0),
+        checksum INTEGER NOT NULL
+    ) STRICT""",
+    """CREATE TABLE places (
+        number INTEGER PRIMARY KEY AUTOINCREMENT,
+        id TEXT NOT NULL UNIQUE,
+        row INTEGER NOT NULL UNIQUE CHECK (row >= 0),
+        checksum INTEGER NOT NULL,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        regions INTEGER NOT NULL CHECK (regions >= 0),
+        picture TEXT NOT NULL CHECK (picture IN ('none', 'thumbnail', 'image')),
+        x REAL, y REAL, z REAL, latitude REAL, longitude REAL, heading REAL,
+        timestamp TEXT,
+        sequence INTEGER NOT NULL REFERENCES sequences (code),
+        ordinal INTEGER NOT NULL,
+        metadata TEXT NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    "CREATE INDEX places_of_sequence ON places (sequence, number)",
+    # Apart from the places, so that a listing does not read past the pictures.
+    """CREATE TABLE pictures (
+        place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        bytes BLOB NOT NULL
+    ) STRICT""",
+)
+
+# Shape of the local descriptors behind each descriptor; none in the maps that were there before.
+_LOCAL: Migration = (
+    "ALTER TABLE map ADD COLUMN local_cells INTEGER NOT NULL DEFAULT 0 CHECK (local_cells >= 0)",
+    "ALTER TABLE map ADD COLUMN local_values INTEGER NOT NULL DEFAULT 0 CHECK (local_values >= 0)",
+)
+
+# Which camera took a frame, and what is ignored in the frames of each.
+_CAMERAS: Migration = (
+    """CREATE TABLE cameras (
+        name TEXT PRIMARY KEY,
+        mask TEXT,
+        updated_at TEXT NOT NULL
+    ) STRICT""",
+    "ALTER TABLE places ADD COLUMN camera TEXT",
+)
+
+LONGEST_INDEXED = 512
+"""Characters of a text in a place's metadata by which places can be found; longer ones are kept all the same."""
+
+
+def _values_of(place: str) -> str:
+    """Rows of ``place_values`` for the top-level scalars of a place's metadata."""
+    return (
+        "SELECT key, CASE type WHEN 'true' THEN 'boolean' WHEN 'false' THEN 'boolean'"
+        " WHEN 'integer' THEN 'number' WHEN 'real' THEN 'number' ELSE type END,"
+        f" coalesce(atom, 0), {place}.row FROM {{source}}json_each({place}.metadata)"
+        f" WHERE type NOT IN ('object', 'array') AND (type <> 'text' OR length(atom) <= {LONGEST_INDEXED})"
+    )
+
+
+_FILL_VALUES = (
+    f"INSERT OR IGNORE INTO place_values {_values_of('p').format(source='places p, ')} AND json_valid(p.metadata)"
+)
+_INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(source='')}"
+_DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
+
+# By which metadata places are found.  Triggers keep it in step, whatever writes a place.
+_VALUES: Migration = (
+    # The kind tells true from 1; as ANY, 1 and 1.0 are equal.
+    """CREATE TABLE place_values (
+        key TEXT NOT NULL,
+        kind TEXT NOT NULL,
+        value ANY NOT NULL,
+        row INTEGER NOT NULL,
+        PRIMARY KEY (key, kind, value, row)
+    ) STRICT, WITHOUT ROWID""",
+    _FILL_VALUES,
+    f"CREATE TRIGGER place_values_made AFTER INSERT ON places BEGIN {_INSERT_VALUES}; END",
+    "CREATE TRIGGER place_values_changed AFTER UPDATE OF row, metadata ON places"
+    " WHEN old.row <> new.row OR old.metadata <> new.metadata"
+    f" BEGIN {_DELETE_VALUES}; {_INSERT_VALUES}; END",
+    f"CREATE TRIGGER place_values_gone AFTER DELETE ON places BEGIN {_DELETE_VALUES}; END",
+    "CREATE INDEX places_in_order ON places (sequence, ordinal)",
+)
+
+# How the map is searched, and how its descriptors are kept; "full" in the maps that were there before.
+_TIERS: Migration = (
+    "ALTER TABLE map ADD COLUMN \"index\" TEXT NOT NULL DEFAULT 'auto'",
+    "ALTER TABLE map ADD COLUMN precision TEXT NOT NULL DEFAULT 'full'",
+)
+
+# A checksum in each row that nothing else vouches for.
+_SEALS: Migration = seals.statements()
+
+# Segments of which no place is left, and whose files are gone (:mod:`core.storage.reclaiming`).
+_REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
+
+MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)
+
+
+def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
+    """The columns of each of the file's own tables."""
+    tables = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
+    return {
+        name: {column for (column,) in connection.execute("SELECT name FROM pragma_table_info(?)", (name,))}
+        for (name,) in tables.fetchall()
+    }
+
+
+def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS, create: bool = False) -> int:
+    """Bring a file, an empty one only with ``create``, to the last of ``migrations``; all at once or not at all.
+
+    Returns:
+        How many were applied.
+
+    Raises:
+        DataDirectoryTooNew: a later version of placerec wrote the file.
+        Damage: it is a database, but not one of ours; or it has the tables of today and another version.
+        sqlite3.Error: a statement failed; the file is as it was.
+    """
+    version: int = connection.execute("PRAGMA user_version").fetchone()[0]
+    (owner,) = connection.execute("PRAGMA application_id").fetchone()
+    is_empty = (version, owner) == (0, 0) and not _columns(connection)
+    if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
+        raise Damage("map.sqlite is not one of placerec's databases")
+    if version > len(migrations):
+        if _statements(connection) == _expected(migrations, _statements):
+            raise Damage(f"map.sqlite says that it is of schema {version}, but its tables are of {len(migrations)}")
+        raise DataDirectoryTooNew(
+            f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
+        )
+    if version < len(migrations):
+        seals.teach(connection)
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            for migration in migrations[version:]:
+                for statement in migration:
+                    connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {len(migrations)}")
+            connection.execute("COMMIT")
+        except BaseException:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+    return len(migrations) - version
+
+
+def _statements(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
+    """All that the file was made of: its tables, indexes and triggers, each with the statement that makes it."""
+    return set(connection.execute("SELECT type, name, sql FROM sqlite_schema WHERE name NOT LIKE 'sqlite_%'"))
+
+
+def _expected(migrations: Sequence[Migration], told: Callable[[sqlite3.Connection], T]) -> T:
+    """What is told of a file as ``migrations`` make it."""
+    wanted = sqlite3.connect(":memory:", isolation_level=None)
+    try:
+        migrate(wanted, migrations, create=True)
+        return told(wanted)
+    finally:
+        wanted.close()
+
+
+def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS) -> None:
+    """Compare a file's tables and columns with those that ``migrations`` make.
+
+    Raises:
+        Damage: something is missing.
+    """
+    found = _columns(connection)
+    for table, columns in _expected(migrations, _columns).items():
+        if missing := columns - found.get(table, set()):
+            raise Damage(f"map.sqlite lacks {', '.join(sorted(missing))} of its table {table!r}")
+
+
+def contradictions(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """Where the tables do not follow from the places: the values by which they are found, the ends of sequences."""
+    return misfiled(connection, limit) + cut_sequences(connection, limit)
+
+
+def misfiled(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """Where the values by which places are found do not follow from their metadata; :func:`refile` mends it."""
+    told = []
+    found, due = "SELECT key, kind, value, row FROM place_values", _values_of("p").format(source="places p, ")
+    for some, others in ((found, due), (due, found)):
+        query = f"SELECT row, key FROM ({some} EXCEPT {others}) LIMIT {limit}"
+        for row, key in connection.execute(query).fetchall():
+            told.append(f"row {row} is not found by its metadata {key!r} as it must be")
+    return told
+
+
+def refile(connection: sqlite3.Connection) -> None:
+    """Make the values by which places are found anew, in one transaction.
+
+    Raises:
+        sqlite3.Error: the disk refuses; all is as it was.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        connection.execute("DELETE FROM place_values")
+        connection.execute(_FILL_VALUES)
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def cut_sequences(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """The sequences whose next place would not come behind their last."""
+    query = (
+        "SELECT s.name FROM sequences s JOIN places p ON p.sequence = s.code WHERE s.name IS NOT NULL GROUP BY s.code"
+        f" HAVING s.next_ordinal <= max(p.ordinal) LIMIT {limit}"
+    )
+    return [f"sequence {name!r} ends before its last place" for (name,) in connection.execute(query).fetchall()]

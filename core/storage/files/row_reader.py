@@ -1,0 +1,147 @@
+"""Rows read from the segment files when they are wanted, each checked as it is read.
+
+A map whose codes are in memory keeps its descriptors here only.  They are read by position and not through memory maps,
+although only the pages that are touched are read either way: a file that was cut under us is then damage with a name,
+not the end of the process, and what the system keeps of the files counts as its cache, not as our memory.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.storage.files.disk import Damage, missing
+from core.storage.files.row_formats import FULL, Local, inner_products
+from core.storage.files.segment_files import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
+
+Rows = NDArray[np.int64]
+Checksums = NDArray[np.uint32]
+"""Of rows, as SQLite names them; 0 for rows that no place names."""
+
+
+class Shelf:
+    """The records of a map.  Any thread may read; rows behind those that are acknowledged are the caller's to avoid.
+
+    Every method that reads may raise Damage (a file is missing, short, or a row fails its checksum or is not the one
+    named) and OSError (the disk refuses).
+    """
+
+    def __init__(self, folder: Path, layout: Layout) -> None:
+        """Of the map in ``folder``; no file is opened yet."""
+        self._folder, self._path = folder, os.path.join(folder, "")
+        self._layout = layout
+        record = layout.record
+        assert record.fields is not None
+        offsets = {name: described[1] for name, described in record.fields.items()}
+        # In version 3 descriptor, sums and local descriptors follow one another, and each end is read with the sums.
+        is_split = layout.precision != FULL
+        self._first = self._part(0, offsets["local"]) if is_split else self._part(0, record.itemsize)
+        self._last = self._part(offsets["row"] if is_split else 0, record.itemsize)
+
+    def _part(self, start: int, stop: int) -> tuple[int, np.dtype[np.void]]:
+        """The fields of a record that lie within bytes start … stop of it."""
+        record = self._layout.record
+        assert record.fields is not None and record.names is not None
+        chosen = [name for name in record.names if start <= record.fields[name][1] < stop]
+        fields = {
+            "names": chosen,
+            "formats": [record.fields[name][0] for name in chosen],
+            "offsets": [record.fields[name][1] - start for name in chosen],
+            "itemsize": stop - start,
+        }
+        return start, np.dtype(fields)  # type: ignore[call-overload]
+
+    def check(self, number: int, rows: int) -> None:
+        """Is the file of a segment there, with its header, and long enough for so many rows?"""
+        file = self._open(number)
+        try:
+            check_header(self._folder / segment_name(number), os.pread(file, HEADER_BYTES, 0), self._layout, number)
+            found = (os.fstat(file).st_size - HEADER_BYTES) // self._layout.record.itemsize
+        finally:
+            os.close(file)
+        if found < rows:
+            raise Damage(f"{segment_name(number)}: the file ends after {found} of {rows} rows")
+
+    def descriptors(self, rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D]."""
+        return self._layout.descriptors_of(self._first_parts(rows, checksums))
+
+    def inner_products(self, queries: NDArray[np.float32], rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
+        """Of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
+        kept = self._first_parts(rows, checksums)["descriptor"]
+        return inner_products(queries, kept, self._layout.precision)
+
+    def locals(self, rows: Rows, checksums: Checksums) -> Local:
+        """The local descriptors of rows: int8 [k, C, L]."""
+        if self._layout.local_shape == NO_LOCAL:
+            return np.empty((len(rows), *NO_LOCAL), np.int8)
+        return self._layout.locals_of(self._checked(self._last, rows, checksums, "local"))
+
+    def _first_parts(self, rows: Rows, checksums: Checksums) -> NDArray[np.void]:
+        return self._checked(self._first, rows, checksums, "descriptor")
+
+    def _checked(
+        self, part: tuple[int, np.dtype[np.void]], rows: Rows, checksums: Checksums, name: str
+    ) -> NDArray[np.void]:
+        """Parts of records, each that of its row, whole, and of the frame that SQLite names."""
+        found = self._read(rows, *part)
+        whole = self._sound(found, rows, name)
+        stated = found["checksum"].tolist()
+        for row, named, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
+            if not sound or (named and named != checksum):
+                where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
+                raise Damage(f"{where} {'is of another frame' if sound else 'does not match its checksum'}")
+        return found
+
+    def _sound(self, found: NDArray[np.void], rows: Rows, name: str) -> list[bool]:
+        """Whether each is that of its row and passes its checksums, as far as they are of ``name``."""
+        if self._layout.precision == FULL:
+            return [self._layout.is_sound(part, row) for part, row in zip(found, rows.tolist(), strict=True)]
+        fields = found.dtype.fields
+        assert fields is not None
+        part, row, sums = (fields[field][1] for field in (name, "row", "of_descriptor"))
+        size, length = found.dtype.itemsize, found.dtype[name].itemsize
+        content = found.view(np.uint8).reshape(-1).data
+        own, both = found[f"of_{name}"].tolist(), found["checksum"].tolist()
+        sound = []
+        for i, stated in enumerate((found["row"] == rows).tolist()):
+            record = content[i * size : (i + 1) * size]
+            its = zlib.crc32(record[row : row + 8], zlib.crc32(record[part : part + length]))
+            sound.append(stated and its == own[i] and zlib.crc32(record[sums : sums + 8]) == both[i])
+        return sound
+
+    def _read(self, rows: Rows, start: int, dtype: np.dtype[Any]) -> NDArray[np.void]:
+        """Bytes start … of the records of rows, in the order of the rows."""
+        layout, order = self._layout, np.argsort(rows, kind="stable").tolist()
+        found = np.empty(len(rows), dtype)
+        size, stride = dtype.itemsize, layout.record.itemsize
+        content = found.view(np.uint8).reshape(-1).data
+        places = [(position, *divmod(int(rows[position]), layout.rows_per_segment)) for position in order]
+        for number, group in groupby(places, key=lambda place: place[1]):
+            wanted = [(position * size, HEADER_BYTES + offset * stride + start) for position, _, offset in group]
+            file = self._open(number)
+            try:
+                if len(wanted) > 1:
+                    for _, at in wanted:  # the disk may fetch all of them at once
+                        os.posix_fadvise(file, at, size, os.POSIX_FADV_WILLNEED)
+                for to, at in wanted:
+                    if os.preadv(file, [content[to : to + size]], at) < size:
+                        row = int(rows[to // size])
+                        raise Damage(f"{segment_name(number)}: the file ends before row {row}")
+            finally:
+                os.close(file)
+        return found
+
+    def _open(self, number: int) -> int:
+        """The file of a segment; to be closed."""
+        path = f"{self._path}{segment_name(number)}"
+        try:
+            return os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError as error:
+            raise missing(Path(path), error) from error

@@ -1,0 +1,294 @@
+"""Segment files: the descriptors of a map, append-only, every row with a checksum of its own.
+
+Little-endian throughout.  A file is a header of 4 096 bytes followed by records (see `Layout.record`):
+
+    header   magic, version, how descriptors are kept, dimension, rows of a full segment, first row, length of
+             the encoder identity; from version 2 on the cells and the values a cell of the local descriptors;
+             the identity, zeros, CRC-32 of all before it
+    record   versions 1, 2: descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
+             CRC-32 of descriptors and row (uint32), zeros (uint32)
+             version 3: descriptor at rest, row (uint64), checksum of the record (uint32), CRC-32 of descriptor
+             and row (uint32), CRC-32 of local descriptors and row (uint32), zeros (uint32), local descriptors
+             at rest
+
+Maps that were made before there was version 3 go on in theirs: 1 where their encoder has no second stage, which is
+2 without local descriptors.  In version 3 the checksum of a record is the CRC-32 of its two others, so that the
+descriptor can be read and checked without its neighbour, and its neighbour without it; how both are kept is the
+map's precision (:data:`Precision`).
+
+Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  Only as many
+records count as SQLite names; what stands behind them was never acknowledged and is overwritten.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.storage.files.disk import Damage, missing, sync_folder, write_at
+from core.storage.files.row_formats import (
+    FULL,
+    Descriptor,
+    Local,
+    Precision,
+    pack_descriptors,
+    pack_local,
+    resting_types,
+    unpack_descriptors,
+    unpack_local,
+)
+
+NO_LOCAL = (0, 0)
+"""Shape of the local descriptors of an encoder that has none."""
+
+ROWS_PER_SEGMENT = 1024
+"""Rows of a full segment of a new map: 64 MB of the default encoder's descriptors, a thousand files at a million."""
+
+HEADER_BYTES = 4096
+_HEADER = struct.Struct("<8sI8sIIQH")
+_LOCAL_SHAPE = struct.Struct("<II")
+_MAGIC = b"PLRCSEG\x00"
+_FIRST_VERSION, _LOCAL_VERSION, _LATEST_VERSION = 1, 2, 3
+_KEPT: dict[Precision, bytes] = {"full": b"<f4", "half": b"<f2", "compressed": b"6 bits"}
+_IDENTITY_BYTES = 1024
+_CHUNK_BYTES = 8 << 20
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What all segment files of a map have in common; ``local_shape`` is (C, L)."""
+
+    dimension: int
+    identity: str
+    rows_per_segment: int
+    local_shape: tuple[int, int] = NO_LOCAL
+    precision: Precision = FULL
+
+    def __post_init__(self) -> None:
+        if len(self.identity.encode()) > _IDENTITY_BYTES:
+            raise ValueError(f"an encoder identity has at most {_IDENTITY_BYTES} bytes")
+        if self.local_shape != NO_LOCAL and min(self.local_shape) < 1:
+            raise ValueError(f"local descriptors of {self.local_shape} cells and values make no sense")
+
+    @property
+    def version(self) -> int:
+        """Of the segment files."""
+        if self.precision != FULL:
+            return _LATEST_VERSION
+        return _FIRST_VERSION if self.local_shape == NO_LOCAL else _LOCAL_VERSION
+
+    @cached_property
+    def record(self) -> np.dtype[np.void]:
+        """The structured type of one record."""
+        descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
+        row, last = ("row", "<u8"), ("reserved", "<u4")
+        if self.version < _LATEST_VERSION:
+            return np.dtype([("descriptor", *descriptor), ("local", *local), row, ("checksum", "<u4"), last])
+        sums = [("checksum", "<u4"), ("of_descriptor", "<u4"), ("of_local", "<u4")]
+        return np.dtype([("descriptor", *descriptor), row, *sums, last, ("local", *local)])
+
+    def header(self, number: int) -> bytes:
+        """The first 4 096 bytes of segment ``number``."""
+        identity = self.identity.encode()
+        first_row = number * self.rows_per_segment
+        fixed = _HEADER.pack(
+            _MAGIC, self.version, _KEPT[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
+        )
+        shape = b"" if self.version == _FIRST_VERSION else _LOCAL_SHAPE.pack(*self.local_shape)
+        content = (fixed + shape + identity).ljust(HEADER_BYTES - 4, b"\x00")
+        return content + struct.pack("<I", zlib.crc32(content))
+
+    def packed(self, descriptors: Sequence[Descriptor], local: Sequence[Local], first_row: int) -> NDArray[np.void]:
+        """Frames as records for the rows from ``first_row`` on, checksums included.
+
+        Args:
+            descriptors, local: of the same n frames, float32 [D] and int8 [C, L] each.
+        """
+        frames = list(zip(descriptors, local, strict=True))
+        records = np.zeros(len(frames), dtype=self.record)
+        for i, (descriptor, cells) in enumerate(frames):
+            self.pack(records[i], descriptor, cells, first_row + i)
+        return records
+
+    def pack(self, record: np.void, descriptor: Descriptor, local: Local, row: int) -> None:
+        """Make a frame, float32 [D] and int8 [C, L], the content of a record of zeros, checksums included."""
+        record["descriptor"] = pack_descriptors(descriptor[np.newaxis], self.precision)[0]
+        record["local"] = pack_local(local[np.newaxis], self.precision)[0]
+        self._seal(record, row)
+
+    @cached_property
+    def frame(self) -> np.dtype[np.void]:
+        """The structured type of a frame at rest without the row and the checksums that a record adds to it."""
+        descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
+        return np.dtype([("descriptor", *descriptor), ("local", *local)])
+
+    def sealed(self, frames: NDArray[np.void], first_row: int) -> NDArray[np.void]:
+        """Frames at rest (:attr:`frame`) as records for the rows from ``first_row`` on, checksums included."""
+        records = np.zeros(len(frames), dtype=self.record)
+        for name in ("descriptor", "local"):
+            records[name] = frames[name]
+        for row, record in enumerate(records, start=first_row):
+            self._seal(record, row)
+        return records
+
+    def _seal(self, record: np.void, row: int) -> None:
+        record["row"] = row
+        if self.version == _LATEST_VERSION:
+            record["of_descriptor"], record["of_local"] = self.part_checksums(record, row)
+        record["checksum"] = self.row_checksum(record, row)
+
+    def part_checksums(self, record: np.void, row: int) -> tuple[int, int]:
+        """CRC-32 of the descriptor and the row, and of the local descriptors and the row, of what is in ``record``."""
+        place = struct.pack("<Q", row)
+        descriptor, local = (np.ascontiguousarray(record[name]).tobytes() for name in ("descriptor", "local"))
+        return zlib.crc32(place, zlib.crc32(descriptor)), zlib.crc32(place, zlib.crc32(local))
+
+    def row_checksum(self, record: np.void, row: int) -> int:
+        """The checksum of what ``record`` holds, if it is that of ``row``: in the wrong place it does not pass."""
+        if self.version == _LATEST_VERSION:
+            return zlib.crc32(struct.pack("<II", *self.part_checksums(record, row)))
+        running = zlib.crc32(record["descriptor"].tobytes())
+        return zlib.crc32(struct.pack("<Q", row), zlib.crc32(record["local"].tobytes(), running))
+
+    def is_sound(self, record: np.void, row: int) -> bool:
+        """Whether a record is that of ``row`` and passes its checksums."""
+        if record["row"] != row or record["checksum"] != self.row_checksum(record, row):
+            return False
+        if self.version < _LATEST_VERSION:
+            return True
+        return (int(record["of_descriptor"]), int(record["of_local"])) == self.part_checksums(record, row)
+
+    def descriptors_of(self, records: NDArray[np.void]) -> NDArray[np.float32]:
+        """What is searched: float32 [n, D]."""
+        return unpack_descriptors(records["descriptor"], self.precision, self.dimension)
+
+    def locals_of(self, records: NDArray[np.void]) -> Local:
+        """What the second stage compares: int8 [n, C, L]."""
+        return unpack_local(records["local"], self.precision, self.local_shape)
+
+
+def segment_name(number: int) -> str:
+    """File name of segment ``number``, counted from 0."""
+    return f"descriptors-{number + 1:06d}.seg"
+
+
+def chain(checksums: ArrayLike, before: int = 0) -> int:
+    """The checksum of a segment: CRC-32 over those of its rows, continued from ``before``."""
+    return zlib.crc32(np.asarray(checksums, dtype="<u4").tobytes(), before)
+
+
+def check_header(path: Path, found: bytes, layout: Layout, number: int) -> None:
+    """Raise Damage unless the first bytes of a segment file are what they must be."""
+    if found == layout.header(number):
+        return
+    if len(found) < HEADER_BYTES:
+        raise Damage(f"{path.name}: the file ends within its header")
+    if struct.unpack("<I", found[-4:])[0] != zlib.crc32(found[:-4]):
+        raise Damage(f"{path.name}: the header does not match its checksum")
+    raise Damage(f"{path.name}: the header is that of another map, encoder, segment or version")
+
+
+def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterator[NDArray[np.void]]:
+    """The first ``rows`` records of a segment, a few megabytes at a time; not yet checked.
+
+    Raises:
+        Damage: the file is missing, too short, or its header is not what it must be.
+        OSError: the disk refuses.
+    """
+    path = folder / segment_name(number)
+    try:
+        file = path.open("rb", buffering=0)
+    except FileNotFoundError as error:
+        raise missing(path, error) from error
+    with file:
+        check_header(path, file.read(HEADER_BYTES), layout, number)
+        step = max(1, _CHUNK_BYTES // layout.record.itemsize)
+        for start in range(0, rows, step):
+            records = np.empty(min(step, rows - start), dtype=layout.record)
+            view = records.view(np.uint8).data
+            filled = 0
+            while filled < len(view):
+                got = file.readinto(view[filled:])
+                if not got:
+                    whole = start + filled // layout.record.itemsize
+                    raise Damage(f"{path.name}: the file ends after {whole} of {rows} rows")
+                filled += got
+            yield records
+
+
+def damaged_rows(layout: Layout, records: NDArray[np.void], first_row: int) -> list[int]:
+    """Those of consecutive records, the first of which is ``first_row``, that fail their checksum."""
+    return [row for row, record in enumerate(records, start=first_row) if not layout.is_sound(record, row)]
+
+
+def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum: int) -> Iterator[NDArray[np.void]]:
+    """Like :func:`read_records`, every record checked, and the segment as a whole at the end.
+
+    Raises:
+        Damage: a row fails its checksum, or all pass but they are not those that were named.
+    """
+    row, running = number * layout.rows_per_segment, 0
+    for records in read_records(folder, layout, number, rows):
+        if damaged := damaged_rows(layout, records, row):
+            raise Damage(f"{segment_name(number)}: row {damaged[0]} does not match its checksum")
+        running = chain(records["checksum"], running)
+        row += len(records)
+        yield records
+    if running != checksum:
+        raise Damage(f"{segment_name(number)}: the rows are not those that map.sqlite names")
+
+
+def append(folder: Path, layout: Layout, first_row: int, records: NDArray[np.void]) -> None:
+    """Write records (:meth:`Layout.packed`) behind the ``first_row`` rows there are; sync files and folders touched.
+
+    Raises:
+        OSError: the disk refuses; what it holds behind ``first_row`` is then unknown (:func:`rewind`).
+    """
+    done = 0
+    while done < len(records):
+        number, offset = divmod(first_row + done, layout.rows_per_segment)
+        batch = records[done : done + layout.rows_per_segment - offset]
+        _write(folder / segment_name(number), layout, number, offset, batch)
+        done += len(batch)
+
+
+def _write(path: Path, layout: Layout, number: int, offset: int, records: NDArray[np.void]) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    try:
+        if offset == 0:
+            write_at(descriptor, layout.header(number), 0)
+        write_at(descriptor, records.view(np.uint8).data, HEADER_BYTES + offset * layout.record.itemsize)
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    if offset == 0:
+        sync_folder(path.parent)
+
+
+def rewind(folder: Path, layout: Layout, rows: int) -> None:
+    """Leave nothing behind the first ``rows`` rows: cut the last segment, remove those that follow it.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    number, offset = divmod(rows, layout.rows_per_segment)
+    for name in os.listdir(folder):
+        found = re.fullmatch(r"descriptors-(\d{6,})\.seg", name)
+        if found and int(found[1]) - 1 >= number + (offset > 0):
+            (folder / name).unlink()
+    if offset:
+        end = HEADER_BYTES + offset * layout.record.itemsize
+        with suppress(FileNotFoundError), (folder / segment_name(number)).open("r+b") as file:
+            if os.fstat(file.fileno()).st_size > end:
+                file.truncate(end)
+                os.fsync(file.fileno())

@@ -1,0 +1,180 @@
+"""Consecutive rows of a map: where their places are and, in a map that is searched exactly, their descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+from core.index.exact import Rows, compare
+from core.judgement.verdict import Whereabouts
+from core.storage.files.row_formats import Descriptor, Local
+from core.storage.search.spots import Spot, joined, memory_of, whereabouts_of
+
+_SMALLEST_TAIL = 8
+
+
+def flat_index(capacity: int, dimension: int, halves: bool = False) -> faiss.IndexFlatCodes:
+    """An inner-product index with room for ``capacity`` rows, all zero, to be filled through :func:`vectors`.
+
+    Args:
+        halves: the rows are kept in half precision; their values have to be such that nothing is lost by it.
+    """
+    index: faiss.IndexFlatCodes = faiss.IndexFlatIP(dimension)
+    if halves:
+        index = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
+        index.is_trained = True  # there is nothing to learn
+    index.codes.resize(capacity * index.code_size)
+    index.ntotal = capacity
+    return index
+
+
+def vectors(index: faiss.IndexFlatCodes) -> Rows:
+    """The rows of an index itself, not a copy: float32 or float16 [capacity, D], valid as long as the index is."""
+    size = index.ntotal * index.code_size
+    flat = faiss.rev_swig_ptr(index.codes.data(), size) if size else np.empty(0, np.uint8)
+    rows: Rows = flat.view(np.float16) if index.code_size == 2 * index.d else flat.view(np.float32)
+    return rows.reshape(index.ntotal, index.d)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Descriptors of a segment in memory.
+
+    index: holds the segment's rows, and behind them room that nobody reads.
+    local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room behind them.
+    """
+
+    index: faiss.IndexFlatCodes
+    local: Local
+
+    @cached_property
+    def rows(self) -> Rows:
+        """The descriptors in the index itself."""
+        return vectors(self.index)
+
+    @classmethod
+    def nothing(cls, dimension: int, local_shape: tuple[int, int], halves: bool = False) -> Held:
+        """Of a segment without rows."""
+        return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
+
+    def appended(
+        self, n: int, descriptors: Sequence[Descriptor] | Rows, local: Sequence[Local] | Local, largest: int
+    ) -> Held:
+        """With more rows behind the first ``n``, in memory that is shared where it suffices."""
+        index, cells, end = self.index, self.local, n + len(descriptors)
+        if end > index.ntotal:
+            # Doubling: over a segment's life each row is copied about once.
+            capacity = min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL))
+            index = flat_index(capacity, self.index.d, self.rows.dtype == np.float16)
+            cells = np.zeros((capacity, *cells.shape[1:]), np.int8)
+            vectors(index)[:n], cells[:n] = self.rows[:n], self.local[:n]
+        if len(descriptors):
+            vectors(index)[n:end] = descriptors
+        if len(local):
+            cells[n:end] = local
+        return Held(index, cells)
+
+
+class Reading:
+    """As long as this lives, the file of a segment may be read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Segment:
+    """Consecutive rows of a map.
+
+    held: their descriptors, or None: they are on the shelf (:class:`core.storage.files.row_reader.Shelf`).
+    first_row: the map's row that is row 0 here.
+    alive: bool [n], False for the rows of places that were forgotten or got another frame.
+    checksums: uint32 [n], what SQLite names of each row; 0 where it names none.
+    reading: is shared by all states of the segment in which its file may be read.
+    removed: no row is alive, and there are no descriptors any more, in memory or on the shelf.
+    """
+
+    held: Held | None
+    first_row: int
+    whereabouts: Whereabouts
+    alive: NDArray[np.bool_]
+    checksums: NDArray[np.uint32]
+    reading: Reading = field(default_factory=Reading)
+    removed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.alive)
+
+    @property
+    def index(self) -> faiss.IndexFlatCodes:
+        """Of a segment that holds its descriptors."""
+        assert self.held is not None
+        return self.held.index
+
+    @property
+    def local(self) -> Local:
+        """Of a segment that holds its descriptors: int8 [capacity, C, L]."""
+        assert self.held is not None
+        return self.held.local
+
+    @property
+    def memory(self) -> int:
+        """Bytes that the segment takes."""
+        held = 0 if self.held is None else vectors(self.index).nbytes + self.local.nbytes
+        return held + memory_of(self.whereabouts) + self.alive.nbytes + self.checksums.nbytes
+
+    def appended(
+        self,
+        descriptors: Sequence[Descriptor] | Rows,
+        spots: Sequence[Spot],
+        local: Sequence[Local] | Local,
+        checksums: Sequence[int],
+        largest: int,
+    ) -> Segment:
+        """With more rows.  Only on the newest segment, by one thread: the room behind it is shared."""
+        return replace(
+            self,
+            held=None if self.held is None else self.held.appended(len(self), descriptors, local, largest),
+            whereabouts=joined([self.whereabouts, whereabouts_of(spots)]),
+            alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
+            checksums=np.concatenate([self.checksums, np.array(checksums, dtype=np.uint32)]),
+        )
+
+    def moved(self, spots: Mapping[int, Spot]) -> Segment:
+        """With some of the map's rows somewhere else."""
+        old = self.whereabouts
+        new = old.take(np.arange(len(old)))
+        for row, spot in spots.items():
+            offset = row - self.first_row
+            new.kind[offset], new.position[offset] = spot.kind, spot.position
+            new.sequence[offset], new.ordinal[offset] = spot.sequence, spot.ordinal
+            new.heading[offset], new.timestamp[offset] = spot.heading, spot.timestamp
+        return replace(self, whereabouts=new)
+
+    def without(self, rows: Sequence[int]) -> Segment:
+        """With some of the map's rows dead."""
+        dead = np.asarray(rows, dtype=np.int64) - self.first_row
+        alive, checksums = self.alive.copy(), self.checksums.copy()
+        alive[dead], checksums[dead] = False, 0
+        return replace(self, alive=alive, checksums=checksums)
+
+    @cached_property
+    def living(self) -> int:
+        """How many rows are alive."""
+        return int(np.count_nonzero(self.alive))
+
+    @property
+    def has_life(self) -> bool:
+        """Whether any row is alive."""
+        return self.living > 0
+
+    def without_rows(self) -> Segment:
+        """Removed: without descriptors, and without a hold on its file."""
+        return replace(self, held=None, reading=Reading(), removed=True)
+
+    def search(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The inner products of ``queries`` [B, D] with some of the map's rows [k] that are held: float32 [B, k]."""
+        assert self.held is not None
+        return compare(queries, self.held.rows, rows - self.first_row)

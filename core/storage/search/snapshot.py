@@ -1,0 +1,384 @@
+"""What is searched: an immutable view of a map.
+
+A map's rows lie in segments of a fixed size; the last one, the tail, still grows.  A write makes a
+new snapshot that shares all descriptors and codes with the one before: rows are put behind those
+that older snapshots see, and only the few bytes per row that say where a place is, and whether it is
+still alive, are copied, for the segments that the write touches.
+
+A small map holds its descriptors in memory and ranks every place (the tier ``exact``).  A larger one
+holds codes of them (``compact``), by nearest centre too in the largest maps (``inverted``): the codes
+name the few places that are worth an exact comparison, whose descriptors are read from the shelf.
+Rows that have no code yet are compared exactly, so that what is searched is always the whole map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import UnknownPlace
+from core.index import Codes, CodeTable, InvertedLists
+from core.index.exact import Rows
+from core.index.ranking import ranked
+from core.judgement.verdict import Whereabouts
+from core.method.cells import ScatteredCells
+from core.storage.files.row_formats import Descriptor, Local
+from core.storage.files.row_reader import Shelf
+from core.storage.files.segment_files import NO_LOCAL
+from core.storage.search.parallel import threads, together
+from core.storage.search.segment import Held, Segment, vectors
+from core.storage.search.spots import Spot, joined, whereabouts_of
+
+__all__ = ["SHORTLIST", "Ranking", "Segment", "Snapshot", "Spot"]
+
+Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
+"""Rows, best first, and their inner products."""
+
+SHORTLIST = 100
+"""Places of a coded map whose descriptors are compared exactly; its rankings are of these."""
+
+_PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
+_SHARE = 2  # one of two cores takes nearly all of the memory's speed, and the other has frames to encode
+_PART_ROWS = 25  # that one thread reads from the shelf at a time
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Rows of a segment, and where among all that are compared they stand."""
+
+    segment: Segment
+    rows: NDArray[np.int64]
+    at: slice
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's.
+
+    shelf: the descriptors of segments that hold none in memory.
+    table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
+    lists: the same rows by nearest centre; None in all but the largest maps.
+    holds: whether new rows are held in memory.
+    halves: their descriptors are held in half precision, which says all of what is stored.
+    guard: entered around everything that reads from the shelf; names what the disk refuses.
+    """
+
+    dimension: int
+    rows_per_segment: int
+    segments: tuple[Segment, ...] = ()
+    local_shape: tuple[int, int] = NO_LOCAL
+    shelf: Shelf | None = None
+    table: CodeTable | None = None
+    lists: InvertedLists | None = None
+    holds: bool = True
+    halves: bool = False
+    guard: Callable[[], AbstractContextManager[None]] = nullcontext
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> int:
+        """Rows ever written, those of forgotten places included."""
+        return self.segments[-1].first_row + len(self.segments[-1]) if self.segments else 0
+
+    @property
+    def coded(self) -> int:
+        """Rows that have a code."""
+        return 0 if self.table is None else len(self.table)
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """By row, dead rows included: take the rows that :meth:`search` returns."""
+        return joined([segment.whereabouts for segment in self.segments])
+
+    def whereabouts_at(self, rows: NDArray[np.int64]) -> Whereabouts:
+        """The same as ``whereabouts.take(rows)``, without putting all rows of a large map together for it."""
+        if len(rows) * 8 > self.rows:
+            return self.whereabouts.take(rows)
+        numbers, offsets = np.divmod(rows, self.rows_per_segment)
+        parts = [
+            self.segments[number].whereabouts.take(offsets[numbers == number]) for number in np.unique(numbers).tolist()
+        ]
+        by_segment = np.argsort(numbers, kind="stable")
+        return joined(parts).take(np.argsort(by_segment))
+
+    @cached_property
+    def alive(self) -> NDArray[np.bool_]:
+        """By row, whether a place is there: bool [rows]."""
+        parts = [segment.alive for segment in self.segments]
+        return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
+
+    @cached_property
+    def _count(self) -> int:
+        """How many places are alive; counted anew only in the segments that a write touched."""
+        return sum(segment.living for segment in self.segments)
+
+    @cached_property
+    def _held(self) -> NDArray[np.bool_]:
+        """By row, whether its descriptor is not on the shelf, but in memory or removed: bool [rows]."""
+        return np.repeat(
+            np.array([segment.held is not None or segment.removed for segment in self.segments], np.bool_),
+            np.array([len(segment) for segment in self.segments], np.int64),
+        )
+
+    @property
+    def memory(self) -> int:
+        """Bytes that the segments and the codes take."""
+        codes = 0 if self.table is None else self.table.coder.bytes_per_place * len(self.table)
+        lists = 0 if self.lists is None else sum(array.nbytes for array in self.lists.tensors().values())
+        return sum(segment.memory for segment in self.segments) + codes + lists
+
+    @cached_property
+    def _in_memory(self) -> NDArray[np.int64]:
+        """The rows that are compared where they are held: the living ones, ascending."""
+        return np.flatnonzero(self.alive & self._held)
+
+    @cached_property
+    def _parts(self) -> list[_Part]:
+        """All of them, in parts."""
+        return self._parts_of(self._in_memory)
+
+    def _parts_of(self, rows: NDArray[np.int64]) -> list[_Part]:
+        """Rows in memory, in parts of about equal size within a segment; segments without any are left out."""
+        parts, most = [], max(1, _PART_BYTES // (self.dimension * (2 if self.halves else 4)))
+        bounds = np.searchsorted(rows, np.arange(len(self.segments) + 1) * self.rows_per_segment).tolist()
+        for segment, (first, end) in zip(self.segments, pairwise(bounds), strict=True):
+            count = -(-(end - first) // most)
+            ends = [first + (end - first) * i // count for i in range(count + 1)] if count else []
+            parts += [_Part(segment, rows[start:stop], slice(start, stop)) for start, stop in pairwise(ends)]
+        return parts
+
+    def search(self, descriptor: Descriptor, allowed: NDArray[np.bool_] | None = None) -> Ranking:
+        """The living places, best first; equal ones by row.
+
+        Args:
+            descriptor: float32 [D], finite.
+            allowed: bool [rows], the rows to choose from, of which only the living count; None: all.
+
+        Returns:
+            rows int64 [n] and inner products float32 [n] with what is stored: of all that are allowed, or, in a map
+            with codes, of those at least ``SHORTLIST`` that the codes chose.
+        """
+        return self.search_batch(descriptor[np.newaxis], allowed)[0]
+
+    def search_batch(self, descriptors: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> list[Ranking]:
+        """The same for each of ``descriptors``, float32 [B, D].
+
+        Places in memory are read once for all of them, not B times.
+        """
+        queries = np.ascontiguousarray(descriptors, dtype=np.float32)
+        if queries.ndim != 2 or queries.shape[1] != self.dimension or not np.isfinite(queries).all():
+            raise ValueError(f"a query is {self.dimension} finite values")
+        if allowed is not None and allowed.shape != (self.rows,):
+            raise ValueError(f"the map has {self.rows} rows to allow")
+        rows, products = self._compare_held(queries, allowed)
+        if self.shelf is None or self._held.all():
+            return [ranked(rows, found) for found in products]
+        with self.guard():
+            return self._with_shelf(queries, allowed, rows, products)
+
+    def _compare_held(
+        self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """The rows that are in memory, alive and allowed, ascending, and their inner products float32 [B, n]."""
+        rows, parts = self._in_memory, self._parts
+        if allowed is not None:
+            parts = self._parts_of(rows := rows[allowed[rows]])
+        products = np.empty((len(queries), len(rows)), dtype=np.float32)
+
+        def compare(part: _Part) -> None:
+            products[:, part.at] = part.segment.search(queries, part.rows)
+
+        together(compare, parts, _SHARE)
+        return rows, products
+
+    def _with_shelf(
+        self,
+        queries: NDArray[np.float32],
+        allowed: NDArray[np.bool_] | None,
+        held: NDArray[np.int64],
+        products: NDArray[np.float32],
+    ) -> list[Ranking]:
+        """The rankings once the rows on the shelf are looked at too."""
+        chosen = self.alive & ~self._held
+        if allowed is not None:
+            chosen &= allowed
+        by_code = chosen[: self.coded]
+        if int(np.count_nonzero(by_code)) <= SHORTLIST:
+            by_code = np.zeros(self.coded, np.bool_)  # so few that all are compared exactly
+        tail = np.flatnonzero(np.concatenate([chosen[: self.coded] & ~by_code, chosen[self.coded :]]))
+        exact, exact_products = np.concatenate([held, tail]), np.hstack([products, self._compared(queries, tail)])
+        rankings = []
+        for query, found in zip(queries, exact_products, strict=True):
+            rows, found = _best(exact, found, SHORTLIST if by_code.any() else len(exact))
+            if by_code.any():
+                short = self._shortlist(query, by_code)
+                rows = np.concatenate([rows, short])
+                found = np.concatenate([found, self._compared(query[np.newaxis], short)[0]])
+            rankings.append(ranked(rows, found))
+        return rankings
+
+    def _shortlist(self, query: NDArray[np.float32], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """The rows that the codes choose among those allowed, bool [coded]; ascending."""
+        assert self.table is not None
+        every = None if allowed.all() else allowed
+        coded = self.table.coder.query(query)
+        found = self.table.shortlist(coded, SHORTLIST, every, self.lists, threads()[0])
+        return np.sort(found.rows)
+
+    def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Inner products of queries with rows on the shelf, float32 [B, k]."""
+        assert self.shelf is not None
+        shelf, products = self.shelf, np.empty((len(queries), len(rows)), np.float32)
+
+        def compare(part: slice) -> None:
+            products[:, part] = shelf.inner_products(queries, rows[part], self._checksums(rows[part]))
+
+        parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
+        if parts:
+            together(compare, parts)
+        return products
+
+    def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
+        """What SQLite names of rows."""
+        segments = [(self.segments[row // self.rows_per_segment], row) for row in rows.tolist()]
+        return np.array([segment.checksums[row - segment.first_row] for segment, row in segments], np.uint32)
+
+    def _check_rows(self, rows: NDArray[np.int64]) -> None:
+        if len(rows) and not 0 <= rows.min() <= rows.max() < self.rows:
+            raise IndexError(f"the map has rows 0 to {self.rows - 1}")
+        for number in set((rows // self.rows_per_segment).tolist()):
+            if self.segments[number].removed:
+                raise UnknownPlace("A place was deleted while it was looked at.")
+
+    def locals_at(self, rows: NDArray[np.int64]) -> Local:
+        """The local descriptors of rows, as :meth:`search` returns them: int8 [k, C, L], a copy.
+
+        Raises:
+            IndexError: there is no such row.
+            UnknownPlace: it is of a place that was deleted, and its segment was removed.
+        """
+        return self.locals_in_place(rows).together()
+
+    def locals_in_place(self, rows: NDArray[np.int64]) -> ScatteredCells:
+        """The same where they are held, as nobody will change them; those on the shelf are read."""
+        self._check_rows(rows)
+        numbers, offsets = np.divmod(rows, self.rows_per_segment)
+        used = sorted(set(numbers.tolist()))
+        held = [number for number in used if self.segments[number].held is not None]
+        blocks = [self.segments[number].local for number in held]
+        block = np.searchsorted(held, numbers)
+        if len(held) < len(used) or not used:
+            on_shelf = np.flatnonzero(~np.isin(numbers, held))
+            blocks.append(self._locals_on_shelf(rows[on_shelf]))
+            block[on_shelf], offsets[on_shelf] = len(held), np.arange(len(on_shelf))
+        return ScatteredCells(tuple(blocks), block, offsets)
+
+    def _locals_on_shelf(self, rows: NDArray[np.int64]) -> Local:
+        if not len(rows):
+            return np.empty((0, *self.local_shape), np.int8)
+        assert self.shelf is not None
+        with self.guard():
+            return self.shelf.locals(rows, self._checksums(rows))
+
+    def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D], a copy.
+
+        Raises:
+            IndexError: there is no such row.
+            UnknownPlace: it is of a place that was deleted, and its segment was removed.
+        """
+        self._check_rows(rows)
+        found = np.empty((len(rows), self.dimension), np.float32)
+        held = self._held[rows]
+        for position in np.flatnonzero(held).tolist():
+            segment = self.segments[int(rows[position]) // self.rows_per_segment]
+            found[position] = vectors(segment.index)[int(rows[position]) - segment.first_row]
+        if not held.all():
+            assert self.shelf is not None
+            wanted = rows[~held]
+            with self.guard():
+                found[~held] = self.shelf.descriptors(wanted, self._checksums(wanted))
+        return found
+
+    def appended(
+        self,
+        descriptors: Sequence[Descriptor] | Rows,
+        spots: Sequence[Spot],
+        local: Sequence[Local] | Local = (),
+        checksums: Sequence[int] | None = None,
+    ) -> Snapshot:
+        """With further places.  Only on the newest snapshot, by one thread at a time.
+
+        Args:
+            descriptors, spots, local: one of each a place, float32 [D] (or float16, in a map that holds halves) and
+                int8 [C, L]; ``local`` may be left out where the map has no local descriptors.
+            checksums: what SQLite names of the rows; None: nothing.
+        """
+        if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
+            raise ValueError("every place of this map has local descriptors")
+        named = [0] * len(descriptors) if checksums is None else checksums
+        segments, done = list(self.segments), 0
+        while done < len(descriptors):
+            if not segments or len(segments[-1]) == self.rows_per_segment:
+                row = sum(len(segment) for segment in segments)
+                nobody, nothing = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
+                held = Held.nothing(self.dimension, self.local_shape, self.halves) if self.holds else None
+                segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
+            stop = done + self.rows_per_segment - len(segments[-1])
+            segments[-1] = segments[-1].appended(
+                descriptors[done:stop], spots[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
+            )
+            done = min(stop, len(descriptors))
+        table = self.table
+        if table is not None and len(table) == self.rows and len(descriptors):
+            table = table.appended(table.coder.encode(np.asarray(descriptors, np.float32)))
+        return replace(self, segments=tuple(segments), table=table)
+
+    def moved(self, spots: Mapping[int, Spot]) -> Snapshot:
+        """With the places of some rows somewhere else."""
+        segments = list(self.segments)
+        for number, rows in self._by_segment(list(spots)).items():
+            segments[number] = segments[number].moved({row: spots[row] for row in rows})
+        return replace(self, segments=tuple(segments))
+
+    def without(self, rows: Sequence[int]) -> Snapshot:
+        """With some rows dead."""
+        segments = list(self.segments)
+        for number, dead in self._by_segment(rows).items():
+            segments[number] = segments[number].without(dead)
+        return replace(self, segments=tuple(segments))
+
+    def _by_segment(self, rows: Sequence[int]) -> dict[int, list[int]]:
+        groups: dict[int, list[int]] = {}
+        for row in rows:
+            groups.setdefault(row // self.rows_per_segment, []).append(row)
+        return groups
+
+    def with_codes(self, codes: Codes) -> Snapshot:
+        """With codes of the rows behind those that have one.  Only on the newest snapshot, by one thread at a time."""
+        assert self.table is not None
+        return replace(self, table=self.table.appended(codes))
+
+    def holding(self, number: int, held: Held | None) -> Snapshot:
+        """With the descriptors of a segment in memory, or on the shelf only; one that was removed has none."""
+        segments = list(self.segments)
+        if segments[number].removed:
+            return self
+        segments[number] = replace(segments[number], held=held)
+        return replace(self, segments=tuple(segments))
+
+
+def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) -> Ranking:
+    """At most ``count`` of rows, those with the largest products, ascending by row."""
+    if len(rows) <= count:
+        return rows, products
+    chosen = np.sort(np.argpartition(-products, count)[:count])
+    return rows[chosen], products[chosen]

@@ -1,0 +1,122 @@
+"""How a map is searched: chosen by its size, or by its owner."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.storage.files.row_formats import Precision
+
+Tier = Literal["exact", "compact", "inverted"]
+TierSetting = Literal["auto", "exact", "compact", "inverted"]
+
+COMPACT_FROM = 4096
+"""Places from which on codes pay: 270 MB of the default encoder's descriptors would be held in memory otherwise."""
+
+INVERTED_FROM = 250_000
+"""Places from which on reading every code takes longer than lists are worth."""
+
+_ORDER: tuple[Tier, ...] = ("exact", "compact", "inverted")
+
+
+def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
+    """The tier that a map of so many places is to have.
+
+    A map that shrinks goes back at half the number at which it went on, so that one that is about that size is not
+    built again and again.
+
+    Args:
+        present: the tier that it has.
+    """
+    if setting != "auto":
+        return setting if places else "exact"
+    for tier, least in (("inverted", INVERTED_FROM), ("compact", COMPACT_FROM)):
+        chosen: Tier = "inverted" if tier == "inverted" else "compact"
+        if places >= (least // 2 if _ORDER.index(present) >= _ORDER.index(chosen) else least):
+            return chosen
+    return "exact"
+
+
+class Recall(BaseModel):
+    """How often the place that an exact search finds first is found first by way of the codes."""
+
+    model_config = ConfigDict(frozen=True)
+
+    at_1: float = Field(ge=0, le=1, description="Share of the queries for which it is.")
+    queries: int = Field(
+        ge=1,
+        description="Stored places looked for by descriptors of which a third is theirs and the rest another place's.",
+    )
+    shortlist: int = Field(ge=1, description="Places that the codes choose and that are then compared exactly.")
+    places: int = Field(ge=1, description="Places that the map had when this was measured.")
+
+
+class IndexStatus(BaseModel):
+    """How a map is searched now, and how it will be."""
+
+    model_config = ConfigDict(frozen=True)
+
+    setting: TierSetting = Field(description="What its owner chose.")
+    tier: Tier = Field(description="exact: every place compared; compact: codes first; inverted: lists of codes first.")
+    wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
+    state: Literal["ready", "building", "unopened"] = Field(
+        description="Searches are answered in all; unopened: not used since the start, read from disk at its next use."
+    )
+    progress: float = Field(ge=0, le=1, description="Of what is being built; 1 when ready.")
+    rows_indexed: int = Field(ge=0, description="Rows with a code; the others are compared exactly.")
+    recall: Recall | None = Field(description="Against exact search; null in the tier exact and until it is measured.")
+    bytes_in_memory: int = Field(ge=0, description="Descriptors or codes, and where the places are.")
+    problem: str | None = Field(
+        default=None, description="Why the last attempt to build came to no end; it is tried again with the next write."
+    )
+
+
+def unopened(setting: TierSetting, places: int) -> IndexStatus:
+    """Of a map that was not read from disk yet."""
+    tier = tier_for(setting, places, "exact")
+    return IndexStatus(
+        setting=setting,
+        tier=tier,
+        wanted=tier,
+        state="unopened",
+        progress=0,
+        rows_indexed=0,
+        recall=None,
+        bytes_in_memory=0,
+    )
+
+
+class StorageStatus(BaseModel):
+    """What a map takes on disk."""
+
+    model_config = ConfigDict(frozen=True)
+
+    precision: str = Field(description="How descriptors are kept: half precision; full in maps made before there was.")
+    bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
+    descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
+    index: int = Field(ge=0, description="Bytes of codes and lists, which can be made again.")
+    database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata and pictures.")
+
+
+def storage_of(folder: Path, precision: Precision, places: int) -> StorageStatus:
+    """What the files of a map take; one that vanishes meanwhile takes nothing.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    sizes = {".seg": 0, ".index": 0, "": 0}
+    for entry in os.scandir(folder):
+        with suppress(FileNotFoundError):
+            kind = Path(entry.name).suffix
+            sizes[kind if kind in sizes else ""] += entry.stat().st_size
+    return StorageStatus(
+        precision=precision,
+        bytes_per_place=round(sum(sizes.values()) / places) if places else 0,
+        descriptors=sizes[".seg"],
+        index=sizes[".index"],
+        database=sizes[""],
+    )

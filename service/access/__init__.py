@@ -1,0 +1,1 @@
+"""Who may do what: keys, roles, rates, the audit trail."""

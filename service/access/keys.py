@@ -1,0 +1,315 @@
+"""Keys as they are stored: one small SQLite file in the data directory, apart from the maps and not under their lock.
+
+A key reads ``placerec_<id>_<secret>``.  Kept of it is its SHA-256 alone: a slow hash protects secrets that somebody
+chose and others can guess; 256 random bits cannot be guessed however fast each guess is checked.
+
+The file fails closed.  That it is there means that keys are demanded, whatever it holds; each row carries a checksum;
+a file that is empty, damaged, of a later version, or that others may write to, lets nobody in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import secrets
+import sqlite3
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from core.places import check_map_id
+from service.access.roles import LEVELS, Role
+from service.errors.faults import InvalidRequest, KeysUnreadable
+
+FILE = "keys.sqlite"
+APPLICATION = 0x706C6B79  # "plky"
+VERSION = 1
+MODE = 0o600
+BUSY_SECONDS = 5.0
+
+ID = re.compile(r"[0-9a-f]{12}")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
+RESERVED = frozenset({"anonymous", "owner"})
+SECRET_BYTES = 32
+
+_TABLE = """CREATE TABLE keys (
+    id TEXT PRIMARY KEY,
+    name TEXT NOT NULL,
+    role TEXT NOT NULL,
+    maps TEXT,
+    digest BLOB NOT NULL,
+    created_at TEXT NOT NULL,
+    expires_at TEXT,
+    revoked_at TEXT,
+    seal BLOB NOT NULL,
+    last_used_at TEXT
+) STRICT"""
+_COLUMNS = "id, name, role, maps, digest, created_at, expires_at, revoked_at, seal, last_used_at"
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key without its secret.
+
+    maps: that it is limited to; None: all.
+    digest: SHA-256 of the whole key, as its holder sends it.
+    expires_at: None: never.
+    last_used_at: some time after its last use; written now and then only.
+    """
+
+    id: str
+    name: str
+    role: Role
+    maps: frozenset[str] | None
+    digest: bytes
+    created_at: datetime
+    expires_at: datetime | None = None
+    revoked_at: datetime | None = None
+    last_used_at: datetime | None = None
+
+    def seal(self) -> bytes:
+        """Checksum over all but the last use."""
+        values = [
+            self.id,
+            self.name,
+            self.role,
+            None if self.maps is None else sorted(self.maps),
+            self.digest.hex(),
+            *(_text(moment) for moment in (self.created_at, self.expires_at, self.revoked_at)),
+        ]
+        return hashlib.sha256(json.dumps(values).encode()).digest()
+
+
+def digest_of(token: bytes) -> bytes:
+    """What is kept of a key."""
+    return hashlib.sha256(token).digest()
+
+
+class KeyStore:
+    """The keys of a data directory; each method opens the file anew, so processes may share it.
+
+    All methods may raise KeysUnreadable: the file is damaged, of a later version, unsafe, or the disk refuses.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / FILE
+
+    def exists(self) -> bool:
+        """Whether keys are demanded: one was created at some time."""
+        try:
+            self.path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise KeysUnreadable(f"{self.path} cannot be looked at: {error.strerror}.") from error
+        return True
+
+    def create(
+        self, name: str, role: Role, maps: Iterable[str] | None = None, expires_at: datetime | None = None
+    ) -> tuple[Key, str]:
+        """A new key, on disk when this returns, and its text, which is kept nowhere.
+
+        Raises:
+            InvalidRequest: the name, the role or the expiry cannot be used, or another key in force has the name.
+            InvalidIdentifier: a map's id is none.
+        """
+        if not NAME.fullmatch(name) or ID.fullmatch(name) or name in RESERVED:
+            raise InvalidRequest(f"{name[:80]!r} cannot name a key: letters, digits and . _ @ -, at most 64.")
+        if LEVELS.get(role, 0) < 1:
+            raise InvalidRequest(f"{role!r} is no role of a key: query, enrol or admin.")
+        limits = None if maps is None else frozenset(check_map_id(map_id) for map_id in maps)
+        now = datetime.now(UTC)
+        if expires_at is not None and expires_at <= now:
+            raise InvalidRequest("The key would have expired already.")
+        if not self.exists():
+            self._make()
+        identity = secrets.token_hex(6)
+        token = f"placerec_{identity}_{secrets.token_urlsafe(SECRET_BYTES)}"
+        key = Key(identity, name, role, limits, digest_of(token.encode()), now, expires_at)
+        with self.changing() as connection:
+            if any(other.name == name and in_force(other, now) for other in read_keys(connection)):
+                raise InvalidRequest(f"There is a key {name!r} already; revoke it first, or choose another name.")
+            _put(connection, key)
+        return key, token
+
+    def all(self) -> list[Key]:
+        """Every key that was ever created, the oldest first."""
+        if not self.exists():
+            return []
+        with closing(self.open()) as connection, _refusals(self.path):
+            return read_keys(connection)
+
+    def revoke(self, id_or_name: str) -> Key:
+        """Let nobody in with a key any more; done already is no error.
+
+        Raises:
+            InvalidRequest: there is none, or several had the name.
+        """
+        now = datetime.now(UTC)
+        if not self.exists():
+            raise InvalidRequest("No key was ever created here.")
+        with self.changing() as connection:
+            keys = read_keys(connection)
+            found = [key for key in keys if key.id == id_or_name]
+            found = found or [key for key in keys if key.name == id_or_name and key.revoked_at is None]
+            found = found or [key for key in keys if key.name == id_or_name]
+            if len(found) != 1:
+                many = "Several keys have this name: give the id of one" if found else "There is no such key"
+                raise InvalidRequest(f"{many} ({id_or_name[:80]!r}).")
+            key = found[0] if found[0].revoked_at is not None else replace(found[0], revoked_at=now)
+            _put(connection, key)
+        return key
+
+    def note_uses(self, moments: dict[str, datetime]) -> None:
+        """Write down when keys were last used; a moment never goes back."""
+        with self.changing() as connection:
+            connection.executemany(
+                "UPDATE keys SET last_used_at = max(coalesce(last_used_at, ''), ?) WHERE id = ?",
+                [(_text(moment), identity) for identity, moment in moments.items()],
+            )
+
+    def open(self) -> sqlite3.Connection:
+        """A connection to the file, which is checked to be whole and ours."""
+        with _refusals(self.path):
+            status = self.path.stat()
+            if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                raise KeysUnreadable(f"Others may write to {self.path}: chmod 600 it, then look whose keys it holds.")
+            connection = sqlite3.connect(
+                f"{self.path.absolute().as_uri()}?mode=rw",
+                uri=True,
+                timeout=BUSY_SECONDS,
+                isolation_level=None,
+                check_same_thread=False,
+            )
+            try:
+                _check(connection, self.path)
+            except BaseException:
+                connection.close()
+                raise
+        return connection
+
+    @contextmanager
+    def changing(self) -> Iterator[sqlite3.Connection]:
+        """A connection within a transaction, which is on disk when the block ends."""
+        with closing(self.open()) as connection, _refusals(self.path):
+            # A rollback journal: the file is all there is of the keys.  EXTRA syncs the folder too, or a power
+            # cut could bring the journal back, and with it a key that was revoked.
+            connection.execute("PRAGMA synchronous = EXTRA")
+            connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield connection
+                connection.execute("COMMIT")
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    connection.execute("ROLLBACK")
+                raise
+
+    def _make(self) -> None:
+        """The file, whole or not at all: one without its tables would be taken for damage."""
+        from core.storage.files.disk import sync_folder  # with it come the index and its compiler, which take a second
+
+        temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
+        with _refusals(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
+                with closing(sqlite3.connect(temporary, isolation_level=None)) as connection:
+                    connection.execute("PRAGMA synchronous = EXTRA")
+                    connection.execute("BEGIN IMMEDIATE")
+                    connection.execute(_TABLE)
+                    connection.execute(f"PRAGMA application_id = {APPLICATION}")
+                    connection.execute(f"PRAGMA user_version = {VERSION}")
+                    connection.execute("COMMIT")
+                with suppress(FileExistsError):  # another process was quicker
+                    os.link(temporary, self.path)
+                sync_folder(self.path.parent)
+            finally:
+                with suppress(FileNotFoundError):
+                    temporary.unlink()
+
+
+def in_force(key: Key, now: datetime) -> bool:
+    """Whether a key would be let in at a moment, as the clock stands."""
+    return key.revoked_at is None and (key.expires_at is None or now < key.expires_at)
+
+
+def read_keys(connection: sqlite3.Connection) -> list[Key]:
+    """Every key of an open file, the oldest first.
+
+    Raises:
+        KeysUnreadable: a row is not what was written.
+    """
+    keys = []
+    for row in connection.execute(f"SELECT {_COLUMNS} FROM keys ORDER BY created_at, id").fetchall():
+        try:
+            key = _key(row)
+        except (ValueError, TypeError) as error:
+            raise KeysUnreadable(f"The file of the keys is damaged: a row cannot be read ({error}).") from error
+        if key.seal() != row[8]:
+            raise KeysUnreadable(f"The file of the keys is damaged: {key.id[:12]!r} does not match its checksum.")
+        keys.append(key)
+    return keys
+
+
+def _put(connection: sqlite3.Connection, key: Key) -> None:
+    connection.execute(
+        f"INSERT OR REPLACE INTO keys ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (
+            key.id,
+            key.name,
+            key.role,
+            None if key.maps is None else json.dumps(sorted(key.maps)),
+            key.digest,
+            _text(key.created_at),
+            _text(key.expires_at),
+            _text(key.revoked_at),
+            key.seal(),
+            _text(key.last_used_at),
+        ),
+    )
+
+
+def _key(row: tuple[object, ...]) -> Key:
+    identity, name, role, maps, digest, created, expires, revoked, _, used = row
+    if role not in LEVELS or not isinstance(digest, bytes):
+        raise ValueError("its role or digest is none")
+    return Key(
+        id=str(identity),
+        name=str(name),
+        role=role,  # one of the roles, looked at above
+        maps=None if maps is None else frozenset(json.loads(str(maps))),
+        digest=digest,
+        created_at=datetime.fromisoformat(str(created)),
+        expires_at=None if expires is None else datetime.fromisoformat(str(expires)),
+        revoked_at=None if revoked is None else datetime.fromisoformat(str(revoked)),
+        last_used_at=None if used is None else datetime.fromisoformat(str(used)),
+    )
+
+
+def _check(connection: sqlite3.Connection, path: Path) -> None:
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    if application != APPLICATION:
+        raise KeysUnreadable(f"{path} is not a file of keys, or it is damaged; nobody is let in. Restore it.")
+    if version != VERSION:
+        raise KeysUnreadable(f"{path} was written by a later version of placerec (schema {version}).")
+    for (line,) in connection.execute("PRAGMA quick_check").fetchall():
+        if line != "ok":
+            raise KeysUnreadable(f"{path} is damaged: {line}.")
+
+
+@contextmanager
+def _refusals(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, sqlite3.Error) as error:
+        raise KeysUnreadable(f"{path} cannot be used: {error}.") from error
+
+
+def _text(moment: datetime | None) -> str | None:
+    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")

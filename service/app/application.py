@@ -1,0 +1,165 @@
+"""The application: layers around it, routes in it, and what lives while it runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, nullcontext
+
+from anyio import to_thread
+from fastapi import FastAPI, Request
+from fastapi.routing import APIRoute
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket
+
+from service.access.audit import kept_in
+from service.access.gate import Access, Gate, tell_exposure, ways_of
+from service.access.keyring import Keyring
+from service.access.keys import KeyStore
+from service.access.rates import Rates
+from service.app.gauges import gauges
+from service.app.routers import ROUTERS
+from service.engine.engine import Engine
+from service.errors.problems import install_problems, problem_response
+from service.http.bodies import BodyLimit, UploadMemory
+from service.settings import Settings, read_settings
+from service.telemetry.metrics import Metrics
+from service.telemetry.requests import Telemetry
+
+SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
+DESCRIPTION = """\
+Enrol the frames of a traverse as the places of a map, then ask where another frame was taken.
+
+A frame travels as the raw body (`image/jpeg`, `image/png`, `image/webp`) with its parameters in the query \
+string, or as a `multipart/form-data` with one file part and the same parameters as fields. A 2xx on a write means \
+that it is on disk and found by every later query, so a request without an answer can simply be sent again.
+
+`X-Request-Id` is taken or made. `X-Request-Timeout` (seconds) drops a request that would come too late. \
+An answer with `Retry-After` asks to be tried again.
+
+As soon as a key was ever created, every request needs one: `Authorization: Bearer placerec_…`. \
+Each operation says what role its key needs: `query`, `enrol` (may also query) or `admin` (may do everything).
+"""
+TAGS = [
+    {"name": "maps", "description": "A map is one environment, bound for life to one encoder."},
+    {"name": "places", "description": "A place is one enrolled reference frame."},
+    {"name": "sequences", "description": "A sequence is one traverse: it is listed and deleted as a whole."},
+    {"name": "cameras", "description": "What of a camera's frames is to be ignored."},
+    {"name": "queries", "description": "A query is one frame, answered with ranked matches and a verdict."},
+    {"name": "calibration", "description": "When the answers of a map are to be believed, measured on the map itself."},
+    {"name": "sessions", "description": "A session is a robot's run: a belief over places, frame by frame."},
+    {"name": "frames", "description": "What the encoder makes of a frame, without a map."},
+    {"name": "upkeep", "description": "Making a map anew, its health, pruning, merging."},
+    {"name": "transfer", "description": "Maps as files: backup, restore, move."},
+    {"name": "jobs", "description": "Long work: it goes on in the background and is told as it does."},
+    {"name": "encoders", "description": "Models and vocabularies installed."},
+    {"name": "service", "description": "Health, counters, version."},
+]
+
+
+def _operation_id(route: APIRoute) -> str:
+    """An operation is called as the function that does it."""
+    return route.name
+
+
+class Published:
+    """ASGI layer that tells the application under which path a proxy publishes it.
+
+    Args:
+        root_path: such as /placerec; requests may come with it or, where the proxy takes it off, without.
+    """
+
+    def __init__(self, app: ASGIApp, root_path: str) -> None:
+        self.app, self.root_path = app, root_path
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket"):
+            path: str = scope["path"]
+            if not path.startswith(self.root_path + "/"):
+                path = self.root_path + path
+            scope = {**scope, "root_path": self.root_path, "path": path}
+        await self.app(scope, receive, send)
+
+
+async def _tell_methods(request: Request, _error: Exception) -> Response:
+    """405 with all the methods that the resource has; the framework names those of one route alone."""
+    path = request.scope["path"].removeprefix(request.scope["root_path"])
+    routes = [one for router in ROUTERS for one in router.routes if isinstance(one, APIRoute)]
+    found = [route for route in routes if route.path_regex.match(path)]
+    literal = [route for route in found if route.path == path]  # /v1/maps/import is no map
+    known = {method for route in literal or found for method in route.methods or ()}
+    known |= {"HEAD"} if "GET" in known else set()
+    allowed = ", ".join(sorted(known))
+    detail = f"{request.scope['method'][:20]} is not possible here; what is: {allowed}."
+    return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
+
+
+async def _tell_unknown(scope: Scope, receive: Receive, send: Send) -> None:
+    """404 for a path without a route; the framework would answer a WebSocket with an empty 403."""
+    error = HTTPException(404)
+    if scope["type"] != "websocket":
+        raise error
+    answer = problem_response(Request({**scope, "type": "http", "method": "GET"}), error)
+    await WebSocket(scope, receive, send).send_denial_response(answer)
+
+
+def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> FastAPI:
+    """The service; nothing is opened or loaded before it starts.
+
+    Args:
+        settings: from the environment if left out.
+        as_owner: for a caller in this process, who can read the disk and needs no key; never for a server.
+
+    Raises:
+        SettingsError: a setting is wrong, or would expose the service without keys.
+        KeysUnreadable: it cannot be told whether there are keys.
+    """
+    chosen = settings if settings is not None else read_settings()
+    store = KeyStore(chosen.data_dir)
+    chosen.check_exposure(has_keys=not as_owner and store.exists())
+    keyring = None if as_owner else Keyring(store)
+    metrics = Metrics()
+    gate = Gate(keyring, Rates(chosen.rate_per_key, chosen.rate_burst), chosen.is_loopback())
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
+        with kept_in(chosen.audit_file), keyring or nullcontext():
+            tell_exposure(gate, chosen)
+            engine = await to_thread.run_sync(Engine, chosen, metrics)
+            app.state.engine = engine
+            engine.start()
+            try:
+                with gauges(engine, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                    yield
+            finally:
+                await engine.close()
+
+    app = FastAPI(
+        title="placerec",
+        version=importlib.metadata.version("placerec"),
+        summary=SUMMARY,
+        description=DESCRIPTION,
+        openapi_tags=TAGS,
+        openapi_url=None,  # routes of our own: strict about nothing from elsewhere
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        generate_unique_id_function=_operation_id,
+        lifespan=lifespan,
+    )
+    install_problems(app)
+    app.add_exception_handler(405, _tell_methods)
+    for router in ROUTERS:
+        app.include_router(router)
+    app.router.default = _tell_unknown
+    app.state.gate = gate
+    app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
+    app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
+    app.add_middleware(Access, gate=gate, ways=ways_of(app.routes), metrics=metrics)
+    app.add_middleware(Telemetry, metrics=metrics)
+    if chosen.root_path:
+        app.add_middleware(Published, root_path=chosen.root_path)  # the outermost is added last
+    return app

@@ -1,0 +1,86 @@
+"""At the root: is it alive, is it ready, what does it count, what is it."""
+
+from __future__ import annotations
+
+import json
+import platform
+from functools import lru_cache
+
+import faiss
+import torch
+from fastapi import APIRouter, FastAPI, Request
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.responses import HTMLResponse, Response
+
+from service.app.documentation import SECURITY_POLICY, page
+from service.app.schemas import Health, Readiness, Version
+from service.engine.engine import in_thread
+from service.errors.faults import NotReady
+from service.errors.problems import problem_documentation
+from service.http import openapi
+from service.http.dependencies import EngineDep, PrincipalDep
+from service.maps.schemas import QuarantinedMap
+
+router = APIRouter(tags=["service"])
+
+
+@router.get("/livez")
+async def check_liveness() -> Health:
+    """Whether the process answers; cheap, for a supervisor that restarts it."""
+    return Health()
+
+
+@router.get("/readyz", responses=problem_documentation(NotReady))
+async def check_readiness(engine: EngineDep, principal: PrincipalDep) -> Readiness:
+    """Whether frames can be served: encoder loaded and true to its golden values, maps open, disk writable.
+
+    A damaged map does not make the service unready; it is named here to whoever may use it.
+    """
+    checks = await engine.check_readiness()
+    damaged = engine.atlas.quarantined().items()
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
+    return Readiness(checks=checks, encoder=engine.settings.encoder, quarantined=quarantined)
+
+
+@router.get(
+    "/metrics",
+    response_class=Response,
+    responses={200: {"description": "Prometheus's text format.", "content": {"text/plain": {}}}},
+)
+async def read_metrics(engine: EngineDep) -> Response:
+    """The counters for Prometheus."""
+    return Response(await in_thread(engine.metrics.expose), media_type=CONTENT_TYPE_LATEST)
+
+
+@router.get("/version")
+async def read_version(request: Request, engine: EngineDep) -> Version:
+    """What runs here."""
+    return Version(
+        version=request.app.version,
+        encoder=engine.settings.encoder,
+        python=platform.python_version(),
+        torch=torch.__version__,
+        faiss=faiss.__version__,
+    )
+
+
+@router.get("/openapi.json", include_in_schema=False)
+async def read_openapi(request: Request) -> Response:
+    """This interface, described for machines."""
+    return Response(_written(request.app), media_type="application/json")
+
+
+@router.get("/docs", include_in_schema=False)
+async def read_documentation(request: Request) -> Response:
+    """This interface, described for people; the page needs nothing from elsewhere."""
+    return HTMLResponse(_shown(request.app), headers={"Content-Security-Policy": SECURITY_POLICY})
+
+
+@lru_cache(1)  # everybody may ask, and making it anew takes as long as a query
+def _written(app: FastAPI) -> bytes:
+    return json.dumps(openapi.document(app), ensure_ascii=False, separators=(",", ":")).encode()
+
+
+@lru_cache(1)
+def _shown(app: FastAPI) -> bytes:
+    return page(openapi.document(app)).encode()

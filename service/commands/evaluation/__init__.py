@@ -1,0 +1,1 @@
+"""``placerec evaluate``."""

@@ -1,0 +1,266 @@
+"""``placerec evaluate``: systems recognize one traverse by another, in the figures of the thesis."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, TaskID
+
+from core.evaluation import Comparison
+from service.commands.console import progress, remark
+from service.commands.evaluation.saved import SavedOptions
+from service.commands.evaluation.systems import build_systems, parse_weights, show_list
+from service.commands.evaluation.tables import (
+    comparison_json,
+    remark_notes,
+    show_costs,
+    show_figures,
+    show_thresholds,
+    show_trends,
+    write_json,
+    write_results,
+)
+from service.commands.evaluation.traverses import TraverseOptions, TruthOptions, choose_training
+from service.commands.models import ModelsDir, load_image, open_catalogue
+
+if TYPE_CHECKING:
+    from core.evaluation.cache import EvaluationCache
+
+TRAVERSES, TRUTH, SYSTEMS, OUTPUT, FILES = (
+    "Traverses",
+    "What is true (one of the three, where no --dataset says it)",
+    "Systems",
+    "Output",
+    "Figures of results that others have saved",
+)
+
+
+def evaluate(
+    reference: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The traverse that is known.", rich_help_panel=TRAVERSES)
+    ] = None,
+    query: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="The traverse to recognize.", rich_help_panel=TRAVERSES)
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="A known data set instead; --list names them.", rich_help_panel=TRAVERSES),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the data set's traverses lie.", rich_help_panel=TRAVERSES),
+    ] = None,
+    reduced: Annotated[
+        bool,
+        typer.Option("--reduced", help="Keep only the thesis's number of references.", rich_help_panel=TRAVERSES),
+    ] = False,
+    limit_references: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Keep only the references whose indices stand here, one a line.",
+            rich_help_panel=TRAVERSES,
+        ),
+    ] = None,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Of reduced references, of what is learned and of disturbances.", rich_help_panel=TRAVERSES
+        ),
+    ] = 0,
+    tolerance: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=0, help="Query i is true at the references i-N to i+N.", rich_help_panel=TRUTH),
+    ] = None,
+    ground_truth: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="Rows query,reference; indices from 0.", rich_help_panel=TRUTH)
+    ] = None,
+    poses: Annotated[
+        bool,
+        typer.Option(
+            "--poses",
+            help="Poses of places.csv in both directories (as for enroll), of the files' names "
+            "(@easting@northing@…) or of their EXIF data.",
+            rich_help_panel=TRUTH,
+        ),
+    ] = False,
+    metres: Annotated[
+        float | None,
+        typer.Option(metavar="N", min=0, help="With --poses: true within so many metres.", rich_help_panel=TRUTH),
+    ] = None,
+    degrees: Annotated[
+        float | None,
+        typer.Option(
+            metavar="N", min=0, max=180, help="With --poses: and within so many degrees.", rich_help_panel=TRUTH
+        ),
+    ] = None,
+    encoder: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            help="Encoder by name or identity, or system by name; may be repeated. Default: the service's encoder.",
+            rich_help_panel=SYSTEMS,
+        ),
+    ] = None,
+    every: Annotated[
+        bool,
+        typer.Option("--all", help="All systems that need no file, or whose file is given.", rich_help_panel=SYSTEMS),
+    ] = False,
+    weights: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE", help="The weights file of a system; may be repeated.", rich_help_panel=SYSTEMS
+        ),
+    ] = None,
+    training: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Pictures, those below included, for systems that learn. Default: the kept references.",
+            rich_help_panel=SYSTEMS,
+        ),
+    ] = None,
+    models_dir: ModelsDir = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="List systems and data sets, and do nothing else.", rich_help_panel=SYSTEMS)
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="OUT.json", help="Write the figures.", rich_help_panel=OUTPUT)
+    ] = None,
+    results: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="OUT.csv",
+            help="Write a row per query; of further encoders to OUT.ENCODER.csv.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write an HTML page with curves and pictures.", rich_help_panel=OUTPUT),
+    ] = None,
+    scalability: Annotated[
+        bool,
+        typer.Option("--scalability", help="Measure growing traverses as well (Fig. 3.9).", rich_help_panel=OUTPUT),
+    ] = False,
+    severity: Annotated[
+        bool,
+        typer.Option("--severity", help="Measure disturbed queries as well, in steps.", rich_help_panel=OUTPUT),
+    ] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Where measurements are kept. Default: placerec/evaluations in the user's cache directory.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    no_cache: Annotated[
+        bool, typer.Option("--no-cache", help="Measure everything anew; keep nothing.", rich_help_panel=OUTPUT)
+    ] = False,
+    from_results: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="Rows query,retrieved,score,matched, with or without this header; may be repeated.",
+            rich_help_panel=FILES,
+        ),
+    ] = None,
+    from_similarity: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE.npy",
+            help="A matrix, a row a query, a column a reference; with --ground-truth or --tolerance; may be repeated.",
+            rich_help_panel=FILES,
+        ),
+    ] = None,
+    transposed: Annotated[
+        bool,
+        typer.Option("--transposed", help="The matrix has a row a reference instead.", rich_help_panel=FILES),
+    ] = False,
+) -> None:
+    """Evaluate place recognition on two traverses of the same places.
+
+    Images of a directory (not of its subfolders) are taken in natural order; one
+    that cannot be decoded stops the run. A query without a kept true reference is
+    a true negative. A second run computes only what it has not seen; times are
+    then those of the first.
+    """
+    truth = TruthOptions(tolerance, ground_truth, poses, metres, degrees)
+    if listed:
+        show_list(open_catalogue(models_dir))
+        return
+    if from_results or from_similarity:
+        saved = SavedOptions(from_results or [], from_similarity or [], transposed, truth, limit_references)
+        needs_pictures = {"reference": reference, "query": query, "dataset": dataset, "data": data, "reduced": reduced}
+        needs_systems = {"encoder": encoder, "all": every, "weights": weights, "training": training}
+        needs_both = {"report": report, "scalability": scalability, "severity": severity}
+        saved.check({**needs_pictures, **needs_systems, **needs_both}, results)
+        saved.show(json_file, results)
+        return
+    if transposed:
+        raise typer.BadParameter("--transposed goes with --from-similarity")
+    if no_cache and cache is not None:
+        raise typer.BadParameter("give --cache or --no-cache, not both")
+    options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed)
+    options.check()
+    files = parse_weights(weights or [])
+
+    # Imported here because they take a second.
+    from core.evaluation.cache import EvaluationCache, default_folder
+    from core.evaluation.run import Extras, compare_systems
+
+    pair = options.open()
+    lessons = choose_training(training, pair, seed)
+    systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
+    kept = EvaluationCache(None if no_cache else cache or default_folder())
+    with progress() as bar:
+        comparison = compare_systems(
+            systems, pair, lessons, load_image, kept, _Bar(bar), Extras(scalability, severity, seed)
+        )
+    _show(comparison, kept)
+    by_name = {run.about.name: run for run in comparison.runs}
+    runs = [by_name[system.about.name] for system in systems]  # as asked for
+    if json_file is not None:
+        write_json(json_file, comparison_json(comparison, runs))
+    if results is not None:
+        write_results(results, [(run.identity, run.outcomes) for run in runs])
+    if report is not None:
+        from core.evaluation.report import write_report
+
+        write_report(report, comparison)
+        remark(f"The report is written: {report / 'index.html'}")
+
+
+class _Bar:
+    """Tells a progress bar how far the evaluation is."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar = bar
+        self._task = TaskID(0)
+        self._steps = 0
+
+    def begin(self, system: str, steps: int) -> None:
+        self._steps = steps
+        self._task = self._bar.add_task(escape(system), total=steps)
+
+    def advance(self) -> None:
+        self._bar.advance(self._task)
+
+    def end(self) -> None:
+        self._bar.update(self._task, completed=self._steps)
+
+
+def _show(comparison: Comparison, cache: EvaluationCache) -> None:
+    figures = [run.evaluation for run in comparison.runs]
+    first = figures[0]
+    show_figures(figures, f"{comparison.name}: {first.queries} queries against {first.references} references")
+    show_costs(figures)
+    show_thresholds(figures)
+    show_trends(comparison)
+    remark_notes(figures, comparison.notes, [run.about.name for run in comparison.runs if run.cached])
+    if not cache.writable:
+        remark(f"Nothing was kept for a next run: {cache.folder} cannot be written; choose another with --cache.")

@@ -1,0 +1,144 @@
+"""``placerec evaluate``: which traverses, what is true of them, which pictures to learn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from core.frames.traverses import (
+    Truth,
+    find_images,
+    find_images_below,
+    read_ground_truth,
+    read_kept_references,
+    tolerance_truth,
+)
+
+if TYPE_CHECKING:
+    from core.evaluation.data.pairs import TraversePair
+    from core.evaluation.subjects import Training
+
+
+@dataclass(frozen=True)
+class TruthOptions:
+    """How it is told what a query shows; one of the three ways."""
+
+    tolerance: int | None
+    ground_truth: Path | None
+    poses: bool
+    metres: float | None
+    degrees: float | None
+
+    def check(self) -> None:
+        """See that exactly one way is chosen.
+
+        Raises:
+            typer.BadParameter: none is, or more than one.
+        """
+        given = [self.tolerance is not None, self.ground_truth is not None, self.poses]
+        if sum(given) != 1:
+            raise typer.BadParameter("give one of --tolerance, --ground-truth and --poses")
+        if not self.poses and (self.metres is not None or self.degrees is not None):
+            raise typer.BadParameter("--metres and --degrees go with --poses")
+        if self.poses and self.metres is None:
+            raise typer.BadParameter("--poses needs a distance: --metres N, and --degrees N where headings count")
+
+    def given(self) -> bool:
+        """Whether anything is said of the truth."""
+        chosen = (self.tolerance, self.ground_truth, self.metres, self.degrees)
+        return self.poses or any(value is not None for value in chosen)
+
+    def of_counts(self, queries: int, references: int) -> Truth:
+        """The truth where there are numbers of pictures, but no pictures."""
+        if self.ground_truth is not None:
+            return read_ground_truth(self.ground_truth, queries, references)
+        return tolerance_truth(queries, references, self.tolerance or 0)
+
+    def of_pictures(self, queries: list[Path], references: list[Path]) -> Truth:
+        """The truth of two traverses."""
+        if not self.poses:
+            return self.of_counts(len(queries), len(references))
+        from core.evaluation.data.poses import read_poses, within_truth
+
+        assert self.metres is not None, "checked"
+        return within_truth(read_poses(queries), read_poses(references), self.metres, self.degrees)
+
+
+@dataclass(frozen=True)
+class TraverseOptions:
+    """Two directories and their truth, or a data set in a directory."""
+
+    reference: Path | None
+    query: Path | None
+    truth: TruthOptions
+    dataset: str | None
+    data: Path | None
+    reduced: bool
+    limit_references: Path | None
+    seed: int
+
+    def check(self) -> None:
+        """See that they go together.
+
+        Raises:
+            typer.BadParameter: they do not.
+        """
+        if self.dataset is None:
+            if self.reference is None or self.query is None:
+                raise typer.BadParameter("give --reference and --query, or --dataset with --data")
+            if self.data is not None or self.reduced:
+                raise typer.BadParameter("--data and --reduced go with --dataset")
+            self.truth.check()
+        elif self.reference is not None or self.query is not None or self.truth.given():
+            raise typer.BadParameter("--dataset brings its own traverses and truth: give only --data with it")
+        elif self.data is None:
+            raise typer.BadParameter("--dataset needs --data, the directory that holds its traverses")
+        elif self.reduced and self.limit_references is not None:
+            raise typer.BadParameter("--reduced and --limit-references both choose the references to keep: give one")
+
+    def open(self) -> TraversePair:
+        """The traverses.
+
+        Raises:
+            InvalidTraverse, InvalidGroundTruth: something is missing or malformed.
+        """
+        from core.evaluation.data.datasets import find_dataset, open_dataset
+        from core.evaluation.data.pairs import TraversePair, all_references
+
+        if self.dataset is not None:
+            assert self.data is not None, "checked"
+            pair = open_dataset(find_dataset(self.dataset), self.data, self.reduced, self.seed)
+        else:
+            assert self.reference is not None and self.query is not None, "checked"
+            references, queries = find_images(self.reference), find_images(self.query)
+            truth, kept = self.truth.of_pictures(queries, references), all_references(references)
+            pair = TraversePair(name_pair(self.reference, self.query), references, queries, truth, kept)
+        if self.limit_references is None:
+            return pair
+        kept = read_kept_references(self.limit_references, len(pair.references))
+        return TraversePair(pair.name, pair.references, pair.queries, pair.truth, kept, pair.notes)
+
+
+def name_pair(reference: Path, query: Path) -> str:
+    """What two traverses are called: ``nordland, winter against summer`` if both lie in one folder, else without it."""
+    known, asked = reference.resolve(), query.resolve()
+    traverses = f"{asked.name} against {known.name}"
+    same = known.parent == asked.parent and known.parent.name
+    return f"{known.parent.name}, {traverses}" if same else traverses
+
+
+def choose_training(directory: Path | None, pair: TraversePair, seed: int) -> Training:
+    """The pictures to learn from: those of a directory, or else the references, which are known beforehand.
+
+    Raises:
+        InvalidTraverse: the directory holds no image.
+    """
+    from core.evaluation.subjects import Training
+
+    if directory is None:
+        return Training(pair.kept_references, "the kept references", seed)
+    pictures = find_images_below(directory)
+    return Training(pictures, f"{len(pictures)} pictures of {directory.resolve().name}", seed)

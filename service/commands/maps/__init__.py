@@ -1,0 +1,1 @@
+"""``placerec maps`` and ``placerec backup``."""

@@ -1,0 +1,250 @@
+"""``placerec backup``: all maps as files in a folder, checked, and brought back.
+
+DIR/index.json              which maps were saved, each with its file and the SHA-256 of that file's manifest
+DIR/<map>.<sha256…>.tar     a file is never written over: a new one gets its own name, then the index names it
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
+from service.commands.connection.downloads import PARTIAL, check_file, download, settle, upload
+from service.commands.console import Commands, Failure, complain, remark, show, table
+from service.commands.jobs import followed
+
+backup = typer.Typer(cls=Commands, help="Save all maps in a folder, check them, bring them back.", no_args_is_help=True)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the backup.", show_default=False)]
+Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this one; may be repeated.")]
+
+INDEX = "index.json"
+FORMAT = "placerec backup"
+
+
+class Entry(BaseModel):
+    """A map of a backup.  listed: the service had it when the backup was last made."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    id: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")
+    file: str = Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,100}$")
+    manifest_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    bytes: int
+    places: int
+    saved_at: datetime
+    listed: bool = True
+
+
+class Index(BaseModel):
+    """What is in a backup."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    format: str = FORMAT
+    version: int = 1
+    maps: list[Entry] = []
+
+    def find(self, map_id: str) -> Entry | None:
+        """The entry of a map."""
+        return next((entry for entry in self.maps if entry.id == map_id), None)
+
+
+def read_index(folder: Path) -> Index:
+    """The index of a backup.
+
+    Raises:
+        Failure: there is none, or it cannot be read.
+    """
+    path = folder / INDEX
+    try:
+        index = Index.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise Failure(f"{path} cannot be read: {error.strerror}.") from error
+    except ValidationError as error:
+        raise Failure(f"{path} is not the index of a backup, or is damaged.") from error
+    if (index.format, index.version) != (FORMAT, 1):
+        raise Failure(f"{path} was written by a later version of placerec.")
+    return index
+
+
+@backup.command("create")
+def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir = None) -> None:
+    """Save every map. One whose file is there, whole, and holds what the map holds is not written again.
+
+    Maps that are gone from the service stay in the folder until they are removed by hand.
+    """
+    with _held(folder):
+        index = read_index(folder) if (folder / INDEX).exists() else Index()
+
+        async def work() -> list[str]:
+            async with open_service(Target(url, data_dir)) as service:
+                return await _save_all(service, folder, index, only)
+
+        failed = run(work())
+        _remove_strays(folder, index)
+    if failed:
+        raise Failure(f"These maps could not be saved: {', '.join(failed)}.")
+
+
+async def _save_all(service: Service, folder: Path, index: Index, only: list[str] | None) -> list[str]:
+    """Save maps one after the other; returns those that could not be."""
+    pages = [page async for page in service.pages(path_of("maps"))]
+    there = [item["id"] for page in pages for item in page["items"]]
+    failed = [item["id"] for item in pages[0]["quarantined"] if only is None or item["id"] in only]
+    for map_id in failed:
+        complain(f"{map_id} is damaged and out of service; what was saved of it before stays.")
+    if missing := set(only or ()) - {*there, *failed}:
+        raise Failure(f"The service has no map {', '.join(sorted(missing))}.")
+    for entry in index.maps:
+        entry.listed = entry.id in there or entry.id in failed
+    for map_id in there:
+        if only is None or map_id in only:
+            try:
+                await _save(service, folder, index, map_id)
+            except Failure as failure:
+                complain(f"{map_id}: {failure}")
+                failed.append(map_id)
+    _write_index(folder, index)
+    return failed
+
+
+async def _save(service: Service, folder: Path, index: Index, map_id: str) -> None:
+    before = index.find(map_id)
+    known = None
+    if before is not None:
+        with suppress(Failure):  # one that is gone or damaged is written again
+            check_file(folder / before.file, before.manifest_sha256)
+            known = before.manifest_sha256
+    partial = folder / f"{map_id}{PARTIAL}"
+    tag = await download(service, map_id, partial, known)
+    if tag is None:
+        remark(f"{map_id}: unchanged.")
+        return
+    file = folder / f"{map_id}.{tag[:16]}.tar"
+    settle(partial, file)
+    archive = _manifest_of(file)
+    entry = Entry(
+        id=map_id,
+        file=file.name,
+        manifest_sha256=tag,
+        bytes=file.stat().st_size,
+        places=archive.places,
+        saved_at=datetime.now(UTC),
+    )
+    index.maps = sorted([*(one for one in index.maps if one.id != map_id), entry], key=lambda one: one.id)
+    _write_index(folder, index)
+    remark(f"{map_id}: {entry.places} places in {file.name}.")
+
+
+def _manifest_of(file: Path) -> Any:
+    from core.storage.archives.reading import Archive
+
+    with Archive(file) as archive:
+        return archive.manifest
+
+
+def _write_index(folder: Path, index: Index) -> None:
+    from core.storage.files.disk import write_file
+
+    text = json.dumps(index.model_dump(mode="json"), indent=2) + "\n"
+    try:
+        write_file(folder / INDEX, text.encode())
+    except OSError as error:
+        raise Failure(f"{folder / INDEX} cannot be written: {error.strerror}.") from error
+
+
+def _remove_strays(folder: Path, index: Index) -> None:
+    """Remove earlier files of maps, which the index does not name any more."""
+    named = {entry.file for entry in index.maps}
+    for entry in index.maps:
+        for path in folder.glob(f"{entry.id}.{'[0-9a-f]' * 16}.tar"):
+            if path.name not in named:
+                path.unlink(missing_ok=True)
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """The folder for this process alone."""
+    from core.errors import DataDirectoryLocked
+    from core.storage.files.disk import FolderLock
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(folder / "LOCK")
+    except DataDirectoryLocked as error:
+        raise Failure(f"Another process is writing to {folder}.") from error
+    except OSError as error:
+        raise Failure(f"{folder} cannot be written: {error.strerror}.") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@backup.command("verify")
+def verify(folder: Folder, only: Maps = None) -> None:
+    """Read every file of a backup and compare it with its checksums; needs no service."""
+    index, damaged = read_index(folder), []
+    shown = table("map", "#places", "#bytes", "saved", "state")
+    for entry in _chosen(index, only):
+        state = "good" if entry.listed else "good; gone from the service"
+        try:
+            check_file(folder / entry.file, entry.manifest_sha256)
+        except Failure as failure:
+            state = str(failure)
+            damaged.append(entry.id)
+        saved = entry.saved_at.isoformat(timespec="seconds")
+        shown.add_row(entry.id, str(entry.places), str(entry.bytes), saved, state)
+    show(shown)
+    if damaged:
+        raise Failure(f"Damaged: {', '.join(damaged)}.")
+
+
+@backup.command("restore")
+def restore(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir = None) -> None:
+    """Make maps of the files of a backup; those whose ids are taken are left as they are, and named.
+
+    Maps that were gone from the service when the backup was last made come back only if --map names them.
+    """
+    entries = [entry for entry in _chosen(read_index(folder), only) if entry.listed or only]
+
+    async def work() -> list[str]:
+        failed = []
+        async with open_service(Target(url, data_dir)) as service:
+            for entry in entries:
+                try:
+                    await _restore(service, folder, entry)
+                except Failure as failure:
+                    complain(f"{entry.id}: {failure}")
+                    failed.append(entry.id)
+        return failed
+
+    if failed := run(work()):
+        raise Failure(f"These maps were not restored: {', '.join(failed)}.")
+
+
+async def _restore(service: Service, folder: Path, entry: Entry) -> None:
+    file = folder / entry.file
+    check_file(file, entry.manifest_sha256)
+    job = await followed(service, await upload(service, file, entry.id))
+    if job["state"] != "succeeded":
+        problem = job["problem"] or {"detail": f"the job {job['id']} was {job['state']}", "status": 500}
+        raise Refused(problem["status"], "", problem["detail"])
+    remark(f"{entry.id}: {job['result']['places']} places.")
+
+
+def _chosen(index: Index, only: list[str] | None) -> list[Entry]:
+    if only is None:
+        return index.maps
+    if missing := [map_id for map_id in only if index.find(map_id) is None]:
+        raise Failure(f"The backup has no map {', '.join(missing)}.")
+    return [entry for entry in index.maps if entry.id in only]

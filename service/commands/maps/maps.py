@@ -1,0 +1,167 @@
+"""``placerec maps``: create, look after and delete maps."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import typer
+
+from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, open_service, path_of, run
+from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
+from service.commands.maps.places import places
+from service.commands.maps.sequences import sequences
+from service.commands.maps.transfers import export, import_
+from service.commands.maps.upkeep import health, merge, prune, rebuild, reencode
+
+maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
+maps.add_typer(places, name="places")
+maps.add_typer(sequences, name="sequences")
+for name, command in (
+    ("health", health),
+    ("re-encode", reencode),
+    ("prune", prune),
+    ("rebuild", rebuild),
+    ("merge", merge),
+    ("export", export),
+    ("import", import_),
+):
+    maps.command(name)(command)
+
+MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
+Description = Annotated[str | None, typer.Option(help="What the map is of.")]
+Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What is kept of each frame.")]
+Radius = Annotated[float | None, typer.Option(min=0, help="Metres within which two places are no rivals.")]
+Frames = Annotated[int | None, typer.Option(min=0, help="Without poses: frames within which they are no rivals.")]
+
+
+@maps.command("list")
+def list_maps(url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
+    """List all maps, the damaged ones too."""
+
+    async def work() -> list[dict[str, Any]]:
+        async with open_service(Target(url, data_dir)) as service:
+            return [page async for page in service.pages(path_of("maps"))]
+
+    pages = run(work())
+    items = [item for page in pages for item in page["items"]]
+    if as_json:
+        show_json({"items": items, "quarantined": pages[0]["quarantined"]})
+        return
+    shown = table("map", "#places", "encoder", "keeps", "description")
+    for item in items:
+        shown.add_row(item["id"], str(item["places"]), item["encoder"][:26], item["keep"], item["description"])
+    show(shown)
+    for item in pages[0]["quarantined"]:
+        remark(f"{item['id']} is damaged and out of service: {item['reason']}")
+
+
+@maps.command("show")
+def show_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
+    """Show one map."""
+    _show_map(ask(Target(url, data_dir), "GET", path_of("maps", map_id)).json(), as_json)
+
+
+@maps.command("create")
+def create_map(
+    map_id: MapId,
+    encoder: Annotated[str | None, typer.Option(help="Name or identity; default: the service's.")] = None,
+    description: Description = None,
+    keep: Keep = None,
+    same_place_radius: Radius = None,
+    same_place_frames: Frames = None,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Create a map, bound for life to one encoder."""
+    given = _given(description, keep, same_place_radius, same_place_frames)
+    body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
+    _show_map(ask(Target(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
+
+
+@maps.command("edit")
+def edit_map(
+    map_id: MapId,
+    description: Description = None,
+    keep: Keep = None,
+    same_place_radius: Radius = None,
+    same_place_frames: Frames = None,
+    threshold: Annotated[float | None, typer.Option(help="Least decision value that is believed.")] = None,
+    margin: Annotated[float | None, typer.Option(min=0, help="Least lead over the best rival.")] = None,
+    default_calibration: Annotated[
+        bool, typer.Option("--default-calibration", help="Go back to the encoder's threshold and margin.")
+    ] = False,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Change a map's settings; what is left out stays as it is."""
+    changes = _given(description, keep, same_place_radius, same_place_frames)
+    calibration = {"threshold": threshold, "margin": margin}
+    calibration = {name: value for name, value in calibration.items() if value is not None}
+    if calibration and default_calibration:
+        raise typer.BadParameter("--default-calibration goes without --threshold and --margin")
+    if calibration or default_calibration:
+        changes["calibration"] = calibration or None
+    if not changes:
+        raise typer.BadParameter("name something to change")
+
+    async def work() -> Any:
+        async with open_service(Target(url, data_dir)) as service:
+            # What was read is what is edited: a change by somebody else in between is refused.
+            seen = await service.request("GET", path_of("maps", map_id))
+            headers = {"If-Match": seen.headers["ETag"]}
+            return (await service.request("PATCH", path_of("maps", map_id), json=changes, headers=headers)).json()
+
+    _show_map(run(work()), as_json)
+
+
+@maps.command("delete")
+def delete_map(
+    map_id: MapId,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    url: Url = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Delete a map and all its places."""
+    if not yes:
+        typer.confirm(f"Delete the map {map_id} and all its places?", abort=True)
+    ask(Target(url, data_dir), "DELETE", path_of("maps", map_id))
+    remark(f"The map {map_id} is deleted.")
+
+
+@maps.command("verify")
+def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
+    """Read everything that is stored of a map again and check it; the exit status is 1 if it is damaged."""
+    report = ask(Target(url, data_dir), "POST", path_of("maps", map_id, "verify")).json()
+    if as_json:
+        show_json(report)
+    if not report["ok"]:
+        raise Failure(f"The map {map_id} is damaged: {' '.join(report['problems'])}")
+    if not as_json:
+        output.print(f"The map {map_id} is sound: {report['places']} places checked.", highlight=False)
+
+
+def _given(description: str | None, keep: str | None, radius: float | None, frames: int | None) -> dict[str, Any]:
+    settings = {
+        "description": description,
+        "keep": keep,
+        "same_place_radius": radius,
+        "same_place_frames": frames,
+    }
+    return {name: value for name, value in settings.items() if value is not None}
+
+
+def _show_map(found: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        show_json(found)
+        return
+    shown = table("field", "value", title=f"Map {found['id']}")
+    for name, value in found.items():
+        if name == "calibration" and value is not None:
+            shown.add_row(
+                name, f"{value['source']}: threshold {number(value['threshold'])}, margin {value['margin']:g}"
+            )
+        elif name != "id":
+            shown.add_row(name, "–" if value is None else str(value))
+    show(shown)

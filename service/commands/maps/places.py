@@ -1,0 +1,156 @@
+"""``placerec maps places``: the places of a map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, list_items, open_service, path_of, run
+from service.commands.console import Commands, Failure, remark, show, show_json, table
+
+places = typer.Typer(cls=Commands, help="List, read, edit and forget the places of a map.", no_args_is_help=True)
+
+MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
+PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
+COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
+
+
+@places.command("list")
+def list_places(
+    map_id: MapId,
+    sequence: Annotated[str | None, typer.Option(help="Only those of this traverse.")] = None,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """List a map's places in the order of their enrolment."""
+    params = {"sequence": sequence} if sequence is not None else None
+    found = list_items(Target(url, data_dir), path_of("maps", map_id, "places"), params)
+    if as_json:
+        show_json(found)
+        return
+    shown = table("place", "sequence", "pose", "timestamp", "#regions")
+    for place in found:
+        shown.add_row(*_cells(place))
+    show(shown)
+
+
+@places.command("show")
+def show_place(
+    map_id: MapId, place_id: PlaceId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
+) -> None:
+    """Show one place."""
+    _show_place(ask(Target(url, data_dir), "GET", path_of("maps", map_id, "places", place_id)).json(), as_json)
+
+
+@places.command("edit")
+def edit_place(
+    map_id: MapId,
+    place_id: PlaceId,
+    x: Annotated[float | None, typer.Option(help="Metres.")] = None,
+    y: Annotated[float | None, typer.Option(help="Metres.")] = None,
+    z: Annotated[float | None, typer.Option(help="Metres.")] = None,
+    latitude: Annotated[float | None, typer.Option(help="Degrees, WGS 84.")] = None,
+    longitude: Annotated[float | None, typer.Option(help="Degrees, WGS 84.")] = None,
+    heading: Annotated[float | None, typer.Option(help="Degrees.")] = None,
+    timestamp: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Name of the traverse.")] = None,
+    metadata: Annotated[str | None, typer.Option(metavar="JSON", help="Merged into what is there.")] = None,
+    clear: Annotated[
+        list[str] | None,
+        typer.Option(help="A field to empty first: pose, timestamp, sequence or metadata; may be repeated."),
+    ] = None,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Change what is known of a place; what is left out stays as it is."""
+    cleared = dict.fromkeys(clear or [])
+    if unknown := set(cleared) - {"pose", "timestamp", "sequence", "metadata"}:
+        raise typer.BadParameter(f"--clear knows no field {', '.join(sorted(unknown))}")
+    pose = dict(zip(COORDINATES, (x, y, z, latitude, longitude, heading), strict=True))
+    given: dict[str, Any] = {"timestamp": timestamp, "sequence": sequence}
+    given = {name: value for name, value in given.items() if value is not None}
+    if any(value is not None for value in pose.values()):
+        # A new pose in the other frame of reference takes the place of the old one.
+        kept = {name: value for name, value in pose.items() if value is not None}
+        given["pose"] = dict.fromkeys(COORDINATES) | kept if "pose" in cleared else kept
+    if metadata is not None:
+        given["metadata"] = _object(metadata)
+    changes = {**cleared, **given}
+    if not changes:
+        raise typer.BadParameter("name something to change")
+    path = path_of("maps", map_id, "places", place_id)
+    _show_place(ask(Target(url, data_dir), "PATCH", path, json=changes).json(), as_json)
+
+
+@places.command("forget")
+def forget_places(
+    map_id: MapId,
+    place_ids: Annotated[list[str], typer.Argument(metavar="PLACE…", help="Ids.", show_default=False)],
+    url: Url = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Forget places for good."""
+
+    async def work() -> None:
+        async with open_service(Target(url, data_dir)) as service:
+            for place_id in place_ids:
+                await service.request("DELETE", path_of("maps", map_id, "places", place_id))
+                remark(f"The place {place_id} is forgotten.")
+
+    run(work())
+
+
+@places.command("thumbnail")
+def save_thumbnail(
+    map_id: MapId,
+    place_id: PlaceId,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="JPEG file to write.", show_default=False)],
+    url: Url = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Save the picture that is kept of a place."""
+    picture = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
+    try:
+        file.write_bytes(picture)
+    except OSError as error:
+        raise Failure(f"{file} cannot be written: {error.strerror}.") from error
+
+
+def _object(text: str) -> dict[str, Any]:
+    try:
+        value = json.loads(text)
+    except ValueError as error:
+        raise Failure(f"--metadata is not JSON: {error}.") from error
+    if not isinstance(value, dict):
+        raise Failure("--metadata is not a JSON object.")
+    return value
+
+
+def _cells(place: dict[str, Any]) -> list[str]:
+    pose = place["pose"] or {}
+    shown_pose = " ".join(f"{name}={value:g}" for name, value in pose.items() if value is not None)
+    return [
+        place["id"],
+        place["sequence"] or "–",
+        shown_pose or "–",
+        place["timestamp"] or "–",
+        str(place["regions"]),
+    ]
+
+
+def _show_place(place: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        show_json(place)
+        return
+    shown = table("field", "value", title=f"Place {place['id']}")
+    _, sequence, pose, timestamp, regions = _cells(place)
+    for name, value in {"sequence": sequence, "pose": pose, "timestamp": timestamp, "regions": regions}.items():
+        shown.add_row(name, value)
+    for name in ("metadata", "picture", "created_at", "updated_at"):
+        shown.add_row(name, json.dumps(place[name], ensure_ascii=False) if name == "metadata" else str(place[name]))
+    show(shown)

@@ -1,0 +1,115 @@
+"""``placerec maps health``, ``prune``, ``merge``, ``re-encode``: looking after maps."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import typer
+
+from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, path_of
+from service.commands.console import number, output, remark, show, show_json, table
+from service.commands.jobs import Wait, submit, tell
+
+MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
+Yes = Annotated[bool, typer.Option("--yes", help="Do it; without this it is only reported what would be done.")]
+
+
+def health(
+    map_id: MapId,
+    limit: Annotated[int, typer.Option(min=1, max=1000, help="Most places, gaps and stretches to name each.")] = 20,
+    seconds: Annotated[float, typer.Option(min=0.1, max=20, help="Time to look at the map's frames.")] = 5.0,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say how a map does: what never matches, what matches everything, gaps, drift, and where to go again."""
+    asked = {"limit": limit, "seconds": seconds}
+    report = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "health"), params=asked).json()
+    if as_json:
+        show_json(report)
+        return
+    answers, aliasing = report["answers"], report["aliasing"]
+    facts = table("of", "what", title=f"Map {map_id}")
+    facts.add_row("places", str(report["places"]))
+    facts.add_row("queries", f"{answers['queries']}, of which {answers['recognized']} recognized")
+    silent = report["never_matched"]
+    if silent is not None:
+        chance = f"{silent['count']} ({silent['by_chance']:.1f} by chance): {', '.join(silent['places'])}"
+        facts.add_row("never matched", chance)
+    facts.add_row("hubs", ", ".join(f"{hub['place']} ({hub['count']}×)" for hub in aliasing["hubs"]) or "none")
+    pairs = ", ".join(f"{alias['place']}→{alias['other']}" for alias in aliasing["aliases"])
+    facts.add_row("taken for others", pairs or "none")
+    for name in ("score_trend", "unknown_trend"):
+        if (trend := answers[name]) is not None:
+            drifting = "drifts" if trend["significant"] else "does not drift"
+            facts.add_row(name.partition("_")[0], f"{drifting}: {trend['per_week']:+.4f} ± {trend['error']:.4f} a week")
+    show(facts)
+    again = table("sequence", "from", "to", "why", "#weight", title="Go again")
+    for stretch in report["retraverse"]:
+        why = ", ".join(stretch["reasons"])
+        again.add_row(stretch["sequence"], stretch["first"], stretch["last"], why, number(stretch["weight"], 1))
+    if report["retraverse"]:
+        show(again)
+    else:
+        output.print("Nowhere has to be gone again.", highlight=False)
+    if not report["complete"]:
+        remark("The time was up before all of the map was looked at; --seconds gives more.")
+
+
+def reencode(
+    map_id: MapId,
+    to: Annotated[str, typer.Argument(metavar="NEW", help="Id of the new map.", show_default=False)],
+    encoder: Annotated[str | None, typer.Option(help="Name or identity; default: the service's.")] = None,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a map that keeps its images anew, for another encoder, under another id."""
+    body = {"to": to, **({} if encoder is None else {"encoder": encoder})}
+    tell(submit(Target(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
+
+
+def rebuild(
+    map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
+) -> None:
+    """Make what a large map is searched by anew from its descriptors, while searches go on."""
+    tell(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+
+
+def prune(
+    map_id: MapId,
+    max_recall_loss: Annotated[float, typer.Option(min=0, max=1, help="What it may cost in recall.")] = 0.01,
+    similarity: Annotated[float | None, typer.Option(help="How alike frames must look, instead.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Only places of this traverse may go.")] = None,
+    queries: Annotated[str | None, typer.Option(help="Measure the cost with the frames of this traverse.")] = None,
+    yes: Yes = False,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Forget places that their neighbours stand in for; without --yes only say what that would cost."""
+    given = {"similarity": similarity, "sequence": sequence, "queries": queries}
+    body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    body |= {"max_recall_loss": max_recall_loss, "dry_run": not yes}
+    tell(submit(Target(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
+
+
+def merge(
+    map_id: MapId,
+    other: Annotated[str, typer.Argument(metavar="OTHER", help="The map whose places come.", show_default=False)],
+    on_conflict: Annotated[
+        Literal["refuse", "rename", "skip"], typer.Option(help="Where a name means something else in the two maps.")
+    ] = "refuse",
+    prefix: Annotated[str | None, typer.Option(help="For what is renamed; default: the other map's id.")] = None,
+    yes: Yes = False,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take the places of another map into this one; without --yes only say what would come."""
+    body: dict[str, Any] = {"from": other, "on_conflict": on_conflict, "dry_run": not yes}
+    body |= {} if prefix is None else {"prefix": prefix}
+    tell(submit(Target(url, data_dir), path_of("maps", map_id, "merge"), body, wait), as_json)

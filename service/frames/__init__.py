@@ -1,0 +1,1 @@
+"""Frames without a map: descriptors, regions, the score of two."""

@@ -1,0 +1,75 @@
+"""What a frame gives without a map: descriptor, regions, a score against another."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from service.http.fields import Milliseconds
+from service.queries.explanation_schemas import ExplanationView
+
+
+class Descriptor(BaseModel):
+    """A frame's descriptor."""
+
+    encoder: str
+    dimension: int
+    dtype: Literal["float32"] = "float32"
+    byte_order: Literal["little"] = "little"
+    descriptor: str = Field(description="The values, base64.")
+    regions: int
+    milliseconds: Milliseconds
+
+
+class Layer(BaseModel):
+    """One layer that regions come from."""
+
+    name: str
+    rows: int
+    columns: int
+
+
+class Box(BaseModel):
+    """Pixels of the upright frame; the whole frame is spread over the layer's cells."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+class Region(BaseModel):
+    """One region of interest."""
+
+    layer: str
+    channel: int
+    energy: float
+    cells: tuple[int, int, int, int] = Field(description="top, left, bottom, right in cells, half-open")
+    box: Box
+
+
+class RegionsView(BaseModel):
+    """A frame's regions of interest."""
+
+    encoder: str
+    width: int
+    height: int
+    layers: list[Layer]
+    found: int = Field(description="Regions of the frame; the list may be limited.")
+    regions: list[Region]
+    milliseconds: Milliseconds
+
+
+class MatchScore(BaseModel):
+    """How alike two frames are."""
+
+    score: float = Field(
+        description="As that of a query's match; with a second stage, as that of one that was examined."
+    )
+    encoder: str
+    regions: dict[str, int] = Field(description="Of each frame; one without regions scores 0.")
+    explanation: ExplanationView | None = Field(
+        default=None, description="With `explain`: why; a is the query, b the match."
+    )
+    milliseconds: Milliseconds

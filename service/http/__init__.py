@@ -1,0 +1,1 @@
+"""Between sockets and routes: connections, bodies, uploads, parameters, the OpenAPI document."""

@@ -1,0 +1,214 @@
+"""The bytes of request bodies: limited, counted and timed as they arrive; JSON read strictly."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any
+
+from fastapi.routing import APIRoute
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
+from service.settings import Settings
+
+PIECE_BYTES = 1 << 20
+"""Of a body that is written to disk as it arrives."""
+
+
+class UploadMemory:
+    """How many bytes of bodies are held by all requests together."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity, self.held = capacity, 0
+
+    def take(self, size: int) -> None:
+        """Count ``size`` bytes more.
+
+        Raises:
+            MemoryFull: there is no room for them.
+        """
+        self.check(size)
+        self.held += size
+
+    def check(self, size: int) -> None:
+        """Raise MemoryFull unless ``size`` bytes have room now."""
+        if self.held + size > self.capacity:
+            raise MemoryFull("Too many uploads are under way; send the request again in a moment.")
+
+    def release(self, size: int) -> None:
+        """The bytes are no longer held."""
+        self.held -= size
+
+
+class Intake:
+    """The receiving side of one request; stands in for its ``receive``.
+
+    ``limit`` and ``deadline`` (``time.monotonic``) may be changed by the resource before it reads.  ``idle`` is how
+    many seconds may go by without a byte.
+    """
+
+    def __init__(
+        self,
+        scope: Scope,
+        receive: Receive,
+        limit: int,
+        deadline: float,
+        memory: UploadMemory,
+        idle: float = math.inf,
+    ) -> None:
+        self.limit, self.deadline, self.idle = limit, deadline, idle
+        self.size, self.complete = 0, False
+        self.held = 0
+        """Bytes of it that count as held in memory."""
+        self._is_held = True
+        self._receive, self._memory = receive, memory
+        lengths = [value for name, value in scope["headers"] if name == b"content-length"]
+        self._announced = int(lengths[0]) if lengths and lengths[0].isdigit() else 0
+
+    async def __call__(self) -> Message:
+        """The next message.
+
+        Raises:
+            BodyTooLarge: the body is, or says it is, longer than the limit; nothing over it is read.
+            MemoryFull: the uploads under way leave no room for it.
+            DeadlineExceeded: it did not arrive in time.
+            ClientGone: it ended before its end.
+        """
+        if self.complete:
+            return await self._receive()
+        self._check(self._announced)
+        if self._is_held:
+            self._memory.check(max(0, self._announced - self.size))
+        left = self.deadline - time.monotonic()
+        try:
+            async with asyncio.timeout(min(left, self.idle)):
+                message = await self._receive()
+        except TimeoutError:
+            if self.idle < left:
+                raise DeadlineExceeded(f"Nothing of the body came for {self.idle:g} seconds.") from None
+            raise DeadlineExceeded("The body did not arrive in time.") from None
+        if message["type"] != "http.request":
+            raise ClientGone("The connection was closed before the end of the body.")
+        arrived = len(message.get("body", b""))
+        self._check(self.size + arrived)
+        if self._is_held:
+            self._memory.take(arrived)
+            self.held += arrived
+        self.size += arrived
+        self.complete = not message.get("more_body", False)
+        return message
+
+    def pass_on(self, limit: int, seconds: float) -> None:
+        """Take a longer body, which the resource writes to disk as it comes and does not hold.
+
+        Args:
+            limit: bytes.
+            seconds: from now on, within which all of it has to come; ``idle`` holds as well.
+        """
+        self.limit, self.deadline, self._is_held = limit, time.monotonic() + seconds, False
+
+    async def hung_up(self) -> None:
+        """Return when the caller has closed the connection; for when the body was read."""
+        while (await self())["type"] == "http.request":
+            pass
+
+    def _check(self, size: int) -> None:
+        if size > self.limit:
+            raise BodyTooLarge(f"The body has more than the {self.limit} bytes that are taken here.")
+
+
+class BodyLimit:
+    """ASGI layer that puts an :class:`Intake` before each request, with the limits of a JSON body."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, memory: UploadMemory) -> None:
+        self.app, self.settings, self.memory = app, settings, memory
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        state = scope["state"]
+        deadline = state["started"] + self.settings.request_timeout
+        idle = self.settings.read_timeout
+        intake = Intake(scope, receive, self.settings.max_json_bytes, deadline, self.memory, idle)
+        state["intake"] = intake
+        try:
+            await self.app(scope, intake, send)
+        finally:
+            state["bytes_in"] = intake.size
+            self.memory.release(intake.held)
+
+
+async def in_pieces(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Chunks of a body put together, each piece worth a thread's while; the last has the rest, or nothing."""
+    gathered = bytearray()
+    async for chunk in chunks:
+        gathered += chunk
+        if len(gathered) >= PIECE_BYTES:
+            yield bytes(gathered)
+            gathered.clear()
+    yield bytes(gathered)
+
+
+def intake_of(request: Request) -> Intake:
+    """The intake of a request."""
+    intake: Intake = request.state.intake
+    return intake
+
+
+def parse_json(data: bytes | str, what: str) -> Any:
+    """The value of a JSON text; numbers may still be infinite and strings may hold lone surrogates.
+
+    Raises:
+        MalformedBody: it is not JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(data)
+    except RecursionError:
+        raise MalformedBody(f"{what} is nested too deeply.") from None
+    except ValueError as error:
+        raise MalformedBody(f"{what} is not JSON: {error}.") from error
+
+
+def json_size(value: Any, what: str) -> int:
+    """The length in bytes of a value as JSON text.
+
+    Raises:
+        InvalidRequest: it cannot be written as JSON in UTF-8: a number is not finite, a string holds
+            a lone surrogate.
+    """
+    try:
+        return len(json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode())
+    except RecursionError:
+        raise InvalidRequest(f"{what} is nested too deeply.") from None
+    except UnicodeEncodeError:
+        raise InvalidRequest(f"{what} holds half a character (a lone surrogate).") from None
+    except ValueError:
+        raise InvalidRequest(f"{what} holds a number that is not finite.") from None
+
+
+class StrictRequest(Request):
+    """A request whose JSON body holds only what JSON can hold."""
+
+    async def json(self) -> Any:
+        value = parse_json(await self.body(), "The body")
+        json_size(value, "The body")
+        return value
+
+
+class StrictRoute(APIRoute):
+    """A route that reads JSON bodies strictly."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def strict(request: Request) -> Response:
+            return await handler(StrictRequest(request.scope, request.receive))
+
+        return strict

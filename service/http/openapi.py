@@ -1,0 +1,204 @@
+"""How bodies that are read by hand stand in the OpenAPI document, and what every operation can answer."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+
+from core import errors
+from service.access.roles import FORGOTTEN, OPERATIONS, Rule, needs
+from service.errors import faults
+from service.errors.problems import MEDIA_TYPE, Problem, document_problems, problem_examples
+from service.http.links import tell_links
+from service.http.parameters import BatchItem
+from service.http.uploads import FORM, FORMATS
+from service.maps.calibration_schemas import CalibrationOrder
+from service.settings import Settings
+
+BINARY = {"type": "string", "format": "binary"}
+NAMED = {"minLength": 1}
+"""Parts of a form have names."""
+
+COMPONENT = "#/components/schemas/"
+REQUEST_ID = {
+    "description": "Taken from the request or made; it stands in the log.",
+    "schema": {"type": "string"},
+}
+
+# What all operations of a group can answer with, in one place: whoever adds a layer before all resources (keys, rates,
+# limits of the connection) names its problems here, once, and no route has to.  A route names only its own.
+COMMON: tuple[type[Exception], ...] = (
+    faults.MalformedHead,
+    faults.HeadTooSlow,
+    faults.UrlTooLong,
+    faults.HeadTooLarge,
+    faults.TooManyConnections,
+    faults.Stopping,
+)
+"""Problems of every operation."""
+
+COMMON_V1: tuple[type[Exception], ...] = (faults.InvalidRequest,)
+"""Of every operation under /v1: its parameters can be wrong at least."""
+
+COMMON_OF_BODIES: tuple[type[Exception], ...] = (
+    faults.MalformedBody,
+    faults.BodyTooLarge,
+    faults.MemoryFull,
+    faults.DeadlineExceeded,
+)
+"""Of every operation that takes a body."""
+
+COMMON_OF_MAPS: tuple[type[Exception], ...] = (
+    errors.UnknownMap,
+    errors.InvalidIdentifier,
+    errors.StorageFailure,
+    errors.MapQuarantined,
+)
+"""Of every operation on one map."""
+
+
+SECURITY_SCHEME = {
+    "type": "http",
+    "scheme": "bearer",
+    "description": "A key of this service, `placerec_…`. Asked for as soon as one was ever created; without keys, "
+    "requests from pages of elsewhere are refused.",
+}
+
+
+def _access_problems(rule: Rule) -> list[type[Exception]]:
+    if rule.role == "open":
+        return []
+    found = [faults.KeyNeeded, faults.KeyRefused, faults.ForeignPage, faults.RateExceeded, faults.KeysUnreadable]
+    found += [faults.RoleTooLow] if rule.role != "query" else []
+    found += [faults.MapForbidden] if rule.maps in ("path", "named", "all") else []
+    return found
+
+
+def _tell_access(operation: dict[str, Any], rule: Rule) -> None:
+    """Say what key an operation needs; without any keys it needs none."""
+    operation["x-role"] = rule.role
+    operation["security"] = [] if rule.role == "open" else [{"key": []}, {}]
+    if rule.role != "open":
+        operation["description"] = f"{operation.get('description', '')}\n\n{needs(rule)}".strip()
+
+
+def _common_problems(path: str, operation: dict[str, Any], rule: Rule) -> list[type[Exception]]:
+    found = [*COMMON, *_access_problems(rule)]
+    found += COMMON_V1 if path.startswith("/v1/") else ()
+    found += COMMON_OF_BODIES if "requestBody" in operation else ()
+    found += COMMON_OF_MAPS if path.startswith("/v1/maps/{map}") else ()
+    return found
+
+
+def _form_fields(parameters: type[BaseModel]) -> dict[str, Any]:
+    properties: dict[str, Any] = parameters.model_json_schema(ref_template=COMPONENT + "{model}")["properties"]
+    return properties
+
+
+def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
+    """The body of an operation on one frame: raw, or a form with the parameters as fields."""
+    form = {
+        "type": "object",
+        "propertyNames": NAMED,
+        "required": ["image"],
+        "properties": {"image": {**BINARY, "description": "The frame; any name will do."}, **_form_fields(parameters)},
+    }
+    content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
+    content[FORM] = {"schema": form, "encoding": {"image": {"contentType": ", ".join(FORMATS)}}}
+    return {"requestBody": {"required": True, "description": "A JPEG, PNG or WebP file.", "content": content}}
+
+
+def frames_body(parameters: type[BaseModel]) -> dict[str, Any]:
+    """The body of an operation on the frames of one moment: a raw one, or a form of one part for each camera."""
+    form = {
+        "type": "object",
+        "propertyNames": NAMED,
+        "properties": _form_fields(parameters),
+        "additionalProperties": {**BINARY, "description": "One camera's frame, under any name."},
+    }
+    content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
+    content[FORM] = {"schema": form}
+    return {"requestBody": {"required": True, "description": "JPEG, PNG or WebP files.", "content": content}}
+
+
+def form_body(description: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
+    """The body of an operation on several frames."""
+    schema = {
+        "type": "object",
+        "propertyNames": NAMED,
+        "required": required,
+        "properties": properties,
+        "additionalProperties": BINARY,
+    }
+    return {"requestBody": {"required": True, "description": description, "content": {FORM: {"schema": schema}}}}
+
+
+def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
+    """The body of an edit may also say that it is a merge patch."""
+    schema = {"$ref": COMPONENT + changes.__name__}
+    return {"requestBody": {"content": {"application/merge-patch+json": {"schema": schema}}}}
+
+
+def _complete(path: str, operation: dict[str, Any]) -> None:
+    responses = operation["responses"]
+    invalid = responses.get("422", {}).get("content", {}).get("application/json")
+    if invalid is not None:  # the framework's own form of validation errors, which is never sent
+        del responses["422"]["content"]["application/json"]
+        if not responses["422"]["content"]:
+            del responses["422"]
+    rule = OPERATIONS.get(operation["operationId"], FORGOTTEN)
+    _tell_access(operation, rule)
+    document_problems(responses, _common_problems(path, operation, rule), str)
+    tell_links(operation)
+    responses["default"] = {
+        "description": "Any other problem.",
+        "content": {MEDIA_TYPE: {"schema": {"$ref": COMPONENT + "Problem"}}},
+    }
+    for response in responses.values():
+        response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
+
+
+def document(app: FastAPI) -> dict[str, Any]:
+    """The application's OpenAPI document; made once."""
+    if app.openapi_schema is None:
+        made = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=app.summary,
+            description=app.description,
+            tags=app.openapi_tags,
+            routes=app.routes,
+        )
+        schemas = made["components"]["schemas"]
+        for model in (Problem, BatchItem, CalibrationOrder):
+            described = model.model_json_schema(ref_template=COMPONENT + "{model}")
+            schemas.update(described.pop("$defs", {}))
+            schemas[model.__name__] = described
+        made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
+        made["components"]["examples"] = problem_examples()
+        made["components"]["securitySchemes"] = {"key": SECURITY_SCHEME}
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        for path, item in made["paths"].items():
+            for operation in item.values():
+                _complete(path, operation)
+        app.openapi_schema = made
+    return app.openapi_schema
+
+
+def write_document(path: Path) -> None:
+    """Write the document of an application with default settings."""
+    from service.app.application import create_app  # the application is made of routes, which need this module
+
+    made = document(create_app(Settings(host="127.0.0.1")))
+    path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    write_document(Path(sys.argv[1]))

@@ -1,0 +1,208 @@
+"""What callers say about a frame beside its bytes: in the query string, in form fields, in a batch's JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from core.places import Camera, Coordinate, PlaceFields, Pose, Sequence, Timestamp
+from service.errors.faults import InvalidRequest
+from service.errors.problems import invalid_request
+from service.http.bodies import json_size
+from service.http.uploads import parse_metadata
+from service.settings import Settings
+
+POSE = ("x", "y", "z", "latitude", "longitude", "heading")
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], value: Any) -> Model:
+    """``value`` as a model.
+
+    Raises:
+        InvalidRequest: it does not fit.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise invalid_request(error.errors(include_url=False)) from error
+
+
+def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
+    """See that metadata can be kept and shown.
+
+    Raises:
+        InvalidRequest: it is too large, or JSON cannot say it.
+    """
+    if json_size(metadata, "metadata") > settings.max_metadata_bytes:
+        raise InvalidRequest(f"metadata: it has more than {settings.max_metadata_bytes} bytes.")
+
+
+class Parameters(BaseModel):
+    """Base of the parameters of one operation; a name that it does not know is refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def joined(self, fields: Mapping[str, str]) -> Self:
+        """These, from the query string, together with the fields of a form.
+
+        Raises:
+            InvalidRequest: a field is unknown, malformed, or stands in the query string too.
+        """
+        if not fields:
+            return self
+        given = self.model_dump(exclude_unset=True)
+        twice = sorted(set(given) & set(fields))
+        if twice:
+            raise InvalidRequest(f"{twice[0]} stands in the query string and in the form.")
+        return validated(type(self), {**given, **fields})
+
+
+CameraName = Annotated[
+    Camera | None, Field(description="The camera of the map that took the frame; its mask is applied.")
+]
+
+
+class PlaceDescription(Parameters):
+    """Pose, time and traverse of a frame, flat."""
+
+    x: Coordinate | None = Field(default=None, description="Metres in the map's frame; with y.", examples=[1.5])
+    y: Coordinate | None = Field(default=None, description="Metres in the map's frame; with x.", examples=[2.0])
+    z: Coordinate | None = Field(default=None, description="Metres in the map's frame; beside x and y.")
+    latitude: float | None = Field(default=None, ge=-90, le=90, allow_inf_nan=False, description="Degrees, WGS 84.")
+    longitude: float | None = Field(default=None, ge=-180, le=180, allow_inf_nan=False, description="Degrees, WGS 84.")
+    heading: float | None = Field(
+        default=None,
+        ge=-360,
+        le=360,
+        allow_inf_nan=False,
+        description="Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude.",
+        examples=[90.0],
+    )
+    timestamp: Timestamp | None = Field(
+        default=None,
+        description="When the frame was taken (ISO 8601; UTC without a zone).",
+        examples=["2026-11-20T10:00:00Z"],
+    )
+    sequence: Sequence | None = Field(
+        default=None, description="The traverse that the frame belongs to.", examples=["monday"]
+    )
+    camera: CameraName = None
+
+    def fields(self, metadata: dict[str, Any], settings: Settings) -> PlaceFields:
+        """What of it a place keeps.
+
+        Raises:
+            InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be kept.
+        """
+        check_metadata(metadata, settings)
+        pose = {name: value for name in POSE if (value := getattr(self, name)) is not None}
+        return PlaceFields(
+            pose=validated(Pose, pose) if pose else None,
+            timestamp=self.timestamp,
+            sequence=self.sequence,
+            camera=self.camera,
+            metadata=metadata,
+        )
+
+
+EncoderAssertion = Annotated[
+    str | None,
+    Field(max_length=256, description="Name or identity that the map's encoder must have (409 otherwise)."),
+]
+
+
+class EnrolParameters(PlaceDescription):
+    """Beside one frame to enrol."""
+
+    metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"camera": "front"}'])
+    encoder: EncoderAssertion = None
+
+    def place_fields(self, settings: Settings) -> PlaceFields:
+        """The fields of the place; errors as for ``PlaceDescription.fields``."""
+        metadata = {} if self.metadata is None else parse_metadata(self.metadata)
+        return self.fields(metadata, settings)
+
+
+BatchName = Annotated[str | None, Field(pattern=r"^[A-Za-z0-9._~-]{1,64}$", examples=["monday-17"])]
+
+
+class BatchParameters(Parameters):
+    """Beside many frames to enrol."""
+
+    encoder: EncoderAssertion = None
+    background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
+    batch: BatchName = Field(
+        default=None,
+        description="A name for this batch, a random one for example, by which another can say that it comes after it.",
+    )
+    after: BatchName = Field(
+        default=None,
+        description="The batch of this map after which this one is to be stored. It may be under way still: this one "
+        "is encoded meanwhile. 409 batch-out-of-order if it is not stored in time, and nothing of this one is then.",
+    )
+
+    @model_validator(mode="after")
+    def _can_follow(self) -> BatchParameters:
+        if self.background and (self.batch, self.after) != (None, None):
+            raise ValueError("batch and after are for requests that are answered once all is stored, not in background")
+        if self.batch is not None and self.batch == self.after:
+            raise ValueError("a batch cannot come after itself")
+        return self
+
+
+class BatchItem(PlaceDescription):
+    """One place of a batch: its frame is in a part of the form, or is the one that the place holds already."""
+
+    id: str = Field(description="Id of the place.", examples=["p7"])
+    file: str | None = Field(default=None, description="Name of the file part.", examples=["frame7"])
+    sha256: str | None = Field(
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        description="Instead of a file: digest of the bytes of the frame that the place holds. If it does, its fields "
+        "are replaced and nothing has to be sent; 409 frame-needed if it does not.",
+    )
+    metadata: Annotated[dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)] = Field(
+        default_factory=dict
+    )
+
+    @model_validator(mode="after")
+    def _names_its_frame(self) -> BatchItem:
+        if (self.file is None) == (self.sha256 is None):
+            raise ValueError("name the frame's part as file, or give its digest as sha256")
+        return self
+
+
+Matches = Annotated[int, Field(ge=1, le=100, description="How many matches to list.")]
+
+
+class EncoderParameters(Parameters):
+    """Beside a frame that is encoded for no map."""
+
+    encoder: str | None = Field(
+        default=None, max_length=256, description="Name or identity; the default encoder if left out."
+    )
+
+
+class MatchParameters(EncoderParameters):
+    """How to compare two frames."""
+
+    explain: bool = Field(default=False, description="Say which words, regions and cells carried the score.")
+    format: Literal["json", "png"] | None = Field(
+        default=None,
+        description="png: both frames side by side, what answers each other joined by lines; if left out, the Accept "
+        "header decides, and json is the default.",
+    )
+
+
+class RegionsParameters(EncoderParameters):
+    """How to show regions."""
+
+    limit: int | None = Field(default=None, ge=1, le=10_000, description="Only so many, those of the highest energy.")
+    format: Literal["json", "png"] | None = Field(
+        default=None, description="json or png; if left out, the Accept header decides, and json is the default."
+    )

@@ -1,0 +1,123 @@
+"""A job from within: how it says how far it is, what it remembers, and how it learns that it is to stop."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from core.errors import UnknownMap
+from core.storage import Atlas, Map
+from service.jobs.records import Job
+
+if TYPE_CHECKING:
+    from service.jobs.jobs import Jobs
+
+Work = Callable[["JobContext"], Mapping[str, Any]]
+"""What a job does; its result is an object of JSON."""
+
+NOTICE_SECONDS = 0.1
+"""Those who watch a job are told of its progress at most so often."""
+
+WRITING_SECONDS = 2.0
+"""Its progress is written down at most so often; how it ends always is."""
+
+
+class JobCancelled(Exception):
+    """Raised within a job that somebody asked to stop; it undoes what must not stay, and lets it pass."""
+
+
+class JobInterrupted(Exception):
+    """Raised within a job because the service stops; it lets it pass, and goes on at the next start if it can."""
+
+
+class JobGivesWay(Exception):
+    """Raised within a job because others wait and it has had its share of time: it lets it pass, and goes on later."""
+
+
+SLICE_SECONDS = 5.0
+"""So long a job that can be taken up again works before it gives way to those that wait."""
+
+
+class JobContext:
+    """What a job knows of itself while it runs, in the thread that runs it."""
+
+    def __init__(self, jobs: Jobs, job: Job) -> None:
+        self._jobs, self._written, self._noticed = jobs, time.monotonic(), 0.0
+        self._began = time.monotonic()
+        self.id, self.map_id, self.arguments = job.id, job.map_id, job.arguments
+        self.attempt = job.attempt
+        self.notes = job.notes
+        self.maps = job.maps
+
+    def map(self, atlas: Atlas, map_id: str | None = None) -> Map:
+        """One of the maps that the job was asked for, its own one unless another is named.
+
+        Raises:
+            UnknownMap: it was deleted, though another one may have been created under its id.
+            MapQuarantined, StorageFailure.
+        """
+        name = str(self.map_id) if map_id is None else map_id
+        found = atlas.get(name)
+        if name in self.maps and self.maps[name] != born(found):
+            raise UnknownMap(
+                f"The map {name!r} was deleted since the job was asked for; the one of that id now is another."
+            )
+        return found
+
+    def progress(self, done: int, total: int | None = None, message: str = "") -> None:
+        """Say how far the job is; cheap enough to be called at every step."""
+        now = time.monotonic()
+        writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
+        self._written = now if writing else self._written
+        self._noticed = now if noticing else self._noticed
+        self._jobs._progress(self.id, writing, noticing, done=done, total=total, message=message[:500])
+
+    def remember(self, **notes: Any) -> None:
+        """Write down, on disk when this returns, what the next attempt needs besides the arguments; JSON.
+
+        Raises:
+            StorageFull, StorageFailure.
+        """
+        self.notes = {**self.notes, **notes}
+        self._jobs._note(self.id, self.notes)
+
+    @property
+    def cancelled(self) -> bool:
+        """Somebody has asked the job to stop."""
+        return self._jobs.get(self.id).cancelling
+
+    def check_cancelled(self) -> None:
+        """Return unless the job is to stop.
+
+        Raises:
+            JobCancelled: it was asked to.
+            JobInterrupted: the service stops.
+        """
+        if self._jobs.stopping:
+            raise JobInterrupted
+        if self.cancelled:
+            raise JobCancelled
+
+    def give_way(self) -> None:
+        """Let jobs of other maps have their turn, if any wait and this one has worked for a while; for jobs that can be
+        taken up again, called where nothing is half done.
+
+        Raises:
+            JobGivesWay: they go first.
+        """
+        if time.monotonic() - self._began >= SLICE_SECONDS and self._jobs.others_wait(self.id):
+            raise JobGivesWay
+
+    def pause(self, seconds: float) -> None:
+        """Do nothing for a while; raises like :meth:`check_cancelled`, without waiting for the end."""
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            self.check_cancelled()
+            time.sleep(min(left, 0.05))
+        self.check_cancelled()
+
+
+def born(map_: Map) -> str:
+    """What tells a map from later ones of the same id: when it was created."""
+    return map_.record.created_at.isoformat()

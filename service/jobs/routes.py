@@ -1,0 +1,196 @@
+"""Jobs: long work that goes on in the background, to be listed, followed and cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Header, Path, Query, Request
+from pydantic import Field
+from starlette.responses import Response, StreamingResponse
+
+from core import errors
+from core.storage.database.cursors import Listing, decode_number, encode_cursor
+from service.access.principals import Principal
+from service.access.roles import FORGOTTEN, OPERATIONS, covers
+from service.engine.engine import Engine
+from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
+from service.errors.problems import problem_documentation
+from service.http.dependencies import EngineDep, PageParameters, PrincipalDep, single_values
+from service.jobs.jobs import NOTICE_SECONDS, Jobs
+from service.jobs.records import Job, JobState
+from service.jobs.schemas import JobPage, JobView
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
+
+EVENT_STREAM = "text/event-stream"
+HEARTBEAT_SECONDS = 10.0
+"""A stream says at least so often that it is alive."""
+
+LONGEST_WAIT = 60.0
+
+
+class JobPageParameters(PageParameters):
+    """Which jobs."""
+
+    map: str | None = Field(default=None, max_length=64, description="Only the jobs of this map.")
+    kind: str | None = Field(default=None, max_length=64, description="Only the jobs of this kind.")
+    state: JobState | None = Field(default=None, description="Only the jobs in this state.")
+
+
+JobPageQuery = Annotated[JobPageParameters, Query()]
+JobId = Annotated[str, Path(alias="job", max_length=64, description="Id of the job.", examples=["5f0c6a1de2b94c77"])]
+LastEventId = Annotated[
+    str | None,
+    Header(max_length=64, description="The id of the last event that was received; the stream goes on behind it."),
+]
+Wait = Annotated[
+    float,
+    Query(
+        ge=0, le=LONGEST_WAIT, allow_inf_nan=False, description="Seconds to wait for the job's end before answering."
+    ),
+]
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+async def list_jobs(page: JobPageQuery, engine: EngineDep, principal: PrincipalDep) -> JobPage:
+    """List jobs, the newest first; of those that have ended only the latest are kept."""
+    listing: Listing = ["jobs", page.map, page.kind, page.state]
+    after = decode_number(listing, page.cursor)
+    found = [
+        job
+        for job in reversed(engine.jobs.all())
+        if (after < 0 or job.number < after)
+        and page.map in (None, job.map_id)
+        and page.kind in (None, job.kind)
+        and page.state in (None, job.state)
+        and principal.may_use(*maps_of(job))
+    ]
+    shown = found[: page.limit]
+    more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
+    return JobPage(items=[JobView.of(job) for job in shown], next_cursor=more)
+
+
+@router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
+async def read_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
+    """Read how a job stands. With `wait` the answer comes when it has ended, or when that time is up."""
+    job = _job_for(engine, principal, job_id)
+    if wait and not job.ended:
+        until = time.monotonic() + wait
+        with engine.jobs.watching(job_id) as changed:
+            while not (job := engine.jobs.get(job_id)).ended and not engine.jobs.stopping:
+                if not await _wait(changed, until - time.monotonic()):
+                    break
+    return JobView.of(engine.jobs.get(job_id))
+
+
+@router.get(
+    "/{job}/events",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Server-sent events. Each is named after the state of the job, which is its data; "
+            "its id names that moment. The stream ends with the job.",
+            "content": {EVENT_STREAM: {}},
+        },
+        204: {"description": "The job has ended, and its end was received: there is nothing more to come."},
+        **problem_documentation(UnknownJob, TooManyWatchers),
+    },
+)
+async def follow_job(
+    job_id: JobId, request: Request, engine: EngineDep, principal: PrincipalDep, last_event_id: LastEventId = None
+) -> Response:
+    """Follow a job by server-sent events.
+
+    Each event tells all there is to know of the job, so that one who comes late, or again with
+    `Last-Event-ID`, misses nothing that still holds.
+    """
+    job = _job_for(engine, principal, job_id)
+    if job.ended and last_event_id == job.version:
+        return Response(status_code=204)  # which tells a browser not to come again
+    stream = _events(engine.jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
+    first = await anext(stream)  # a refusal comes as a problem, not within the stream
+    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+    return StreamingResponse(_after(first, stream), media_type=EVENT_STREAM, headers=headers)
+
+
+@router.post(
+    "/{job}/cancel", responses=problem_documentation(UnknownJob, JobEnded, errors.StorageFull, errors.StorageFailure)
+)
+def cancel_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep) -> JobView:
+    """Ask a job to stop.
+
+    One that waits is cancelled at once; one that runs stops where it can and undoes what must not
+    stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
+    """
+    job = _job_for(engine, principal, job_id)
+    needed = OPERATIONS.get(str(job.asker.get("operation")), FORGOTTEN).role
+    if not covers(principal.role, needed):
+        raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this job needs {needed}.")
+    return JobView.of(engine.jobs.cancel(job_id))
+
+
+def maps_of(job: Job) -> set[str | None]:
+    """The maps that a job has to do with; None for one that has to do with none in particular."""
+    named = {job.arguments.get(name) for name in ("from", "to")}
+    return {job.map_id, *job.maps, *(name for name in named if isinstance(name, str))}
+
+
+def _job_for(engine: Engine, principal: Principal, job_id: str) -> Job:
+    """A job, if all its maps are the caller's; for any other it is not there.
+
+    Raises:
+        UnknownJob.
+    """
+    job = engine.jobs.get(job_id)
+    if not principal.may_use(*maps_of(job)):
+        raise UnknownJob(f"There is no job {job_id[:80]!r}.")
+    return job
+
+
+async def _wait(changed: asyncio.Event, seconds: float) -> bool:
+    """Whether something changed within so many seconds."""
+    try:
+        async with asyncio.timeout(max(0.0, seconds)):
+            await changed.wait()
+    except TimeoutError:
+        return False
+    changed.clear()
+    return True
+
+
+async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
+    """The stream, from behind the event ``last`` to the end of the job, of the service, or of the caller's key."""
+    with jobs.watching(job_id) as changed:
+        yield ": placerec\n\n"
+        while True:
+            try:
+                job = jobs.get(job_id)
+            except UnknownJob:
+                return  # it ended and was forgotten, so long did the caller not read
+            if job.version != last:
+                last = job.version
+                yield _event(job)
+            if job.ended or jobs.stopping:
+                return
+            if not await _wait(changed, HEARTBEAT_SECONDS):
+                yield ": still there\n\n"
+            await asyncio.sleep(NOTICE_SECONDS)
+            try:
+                check_key()
+            except Fault:
+                return
+
+
+def _event(job: Job) -> str:
+    data = json.dumps(JobView.of(job).model_dump(mode="json"), ensure_ascii=False)
+    return f"id: {job.version}\nevent: {job.state}\ndata: {data}\n\n"
+
+
+async def _after(first: str, rest: AsyncIterator[str]) -> AsyncIterator[str]:
+    yield first
+    async for text in rest:
+        yield text

@@ -1,0 +1,1 @@
+"""Maps: made, calibrated, exported, imported."""

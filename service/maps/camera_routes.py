@@ -1,0 +1,63 @@
+"""Cameras: what of their frames is to be ignored (a bonnet, a gantry, a time stamp)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path
+from starlette.responses import Response
+
+from core import errors
+from core.places import Camera
+from service.errors.faults import UnsupportedMediaType
+from service.errors.problems import problem_documentation
+from service.http.bodies import StrictRoute
+from service.http.dependencies import EngineDep, MapId, json_body, single_values
+from service.maps.camera_schemas import CameraDefinition, CameraList, CameraView
+
+router = APIRouter(
+    prefix="/v1/maps/{map}/cameras",
+    tags=["cameras"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
+CameraName = Annotated[Camera, Path(alias="camera", description="As frames name it.", examples=["front"])]
+
+
+@router.put(
+    "/{camera}",
+    dependencies=[Depends(json_body)],
+    responses={
+        201: {"model": CameraView, "description": "A new camera."},
+        **problem_documentation(UnsupportedMediaType, errors.InvalidField, errors.StorageFull),
+    },
+)
+def put_camera(
+    map_id: MapId, name: CameraName, definition: CameraDefinition, engine: EngineDep, response: Response
+) -> CameraView:
+    """Say what to ignore in the frames of a camera; frames name it with `?camera=`.
+
+    The mask holds for every frame that comes from now on. Places that were enrolled under another mask
+    stay as they are until their frames are sent again.
+    """
+    made, is_new = engine.atlas.get(map_id).cameras.put(name, definition.mask)
+    response.status_code = 201 if is_new else 200
+    return CameraView(**made.__dict__)
+
+
+@router.get("")
+def list_cameras(map_id: MapId, engine: EngineDep) -> CameraList:
+    """List the cameras of a map."""
+    return CameraList(items=[CameraView(**camera.__dict__) for camera in engine.atlas.get(map_id).cameras.all()])
+
+
+@router.get("/{camera}", responses=problem_documentation(errors.UnknownCamera))
+def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraView:
+    """Read one camera."""
+    return CameraView(**engine.atlas.get(map_id).cameras.find(name).__dict__)
+
+
+@router.delete("/{camera}", status_code=204, responses=problem_documentation(errors.UnknownCamera, errors.StorageFull))
+def forget_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
+    """Forget a camera. Frames that name it are refused from then on; its places stay."""
+    engine.atlas.get(map_id).cameras.forget(name)

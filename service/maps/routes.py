@@ -1,0 +1,220 @@
+"""Maps: create, list, read, edit, delete, verify."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Query, Request, Response
+from starlette.responses import JSONResponse
+
+from core import errors
+from core.judgement.verdict import Calibration
+from core.places import check_map_id
+from core.storage import Map, MapRecord, MapSettings, VerifyReport
+from core.storage.database.cursors import Listing, decode_name, encode_cursor
+from service.engine.engine import Engine
+from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
+from service.errors.problems import problem_documentation
+from service.http.bodies import StrictRoute
+from service.http.dependencies import (
+    EngineDep,
+    IfMatch,
+    MapId,
+    Page,
+    PageParameters,
+    PrincipalDep,
+    entity_tag,
+    expected_revision,
+    json_body,
+    single_values,
+)
+from service.http.openapi import json_patch
+from service.jobs.routes import router as jobs
+from service.jobs.schemas import JobView
+from service.maps import rebuilding
+from service.maps.schemas import (
+    CalibrationChanges,
+    MapChanges,
+    MapPage,
+    MapView,
+    NewMap,
+    QuarantinedMap,
+)
+
+router = APIRouter(
+    prefix="/v1/maps",
+    tags=["maps"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
+)
+ALL_MAPS = "(all)"
+"""What is possessed while a map is made, so that no two are counted as the last one: no map is called so."""
+
+BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
+
+
+def show_map(engine: Engine, map_: Map) -> MapView:
+    """A map as callers see it."""
+    record = map_.record
+    calibration = record.calibration or engine.default_calibration(record.encoder)
+    return MapView(
+        **record.model_dump(exclude={"calibration", "index", "precision"}),
+        calibration=calibration,
+        index=map_.index_status(),
+        storage=map_.storage_status(),
+        places=map_.count_places(),
+    )
+
+
+@router.post(
+    "",
+    status_code=201,
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(
+        *BODY_PROBLEMS,
+        errors.MapExists,
+        TooManyMaps,
+        errors.InvalidIdentifier,
+        errors.UnknownEncoder,
+        errors.StorageFull,
+    ),
+)
+def create_map(
+    new: NewMap, request: Request, engine: EngineDep, principal: PrincipalDep, response: Response
+) -> MapView:
+    """Create a map, bound for life to one encoder."""
+    check_map_id(new.id)
+    request.state.noted = {"map": new.id}
+    principal.require(new.id)
+    identity = engine.resolve(new.encoder)
+    encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
+    settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
+    with engine.writing(ALL_MAPS):
+        engine.upkeep.check_room()
+        map_ = engine.atlas.create(
+            new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
+        )
+    map_.open()
+    response.headers["ETag"] = entity_tag(map_.record.revision)
+    response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
+    return show_map(engine, map_)
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_maps(page: Page, engine: EngineDep, principal: PrincipalDep) -> MapPage:
+    """List the maps in the order of their ids, and those that are damaged; of a key limited to maps, only those."""
+    if principal.maps is None:
+        records, next_cursor = engine.atlas.records(page.cursor, page.limit)
+    else:
+        records, next_cursor = _records_among(engine, principal.maps, page)
+    items = []
+    for record in records:
+        try:
+            items.append(show_map(engine, engine.atlas.find(record.id)))
+        except (errors.UnknownMap, errors.MapQuarantined):
+            continue  # deleted, or found to be damaged, since it was listed
+    damaged = engine.atlas.quarantined().items()
+    quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
+    return MapPage(items=items, next_cursor=next_cursor, quarantined=quarantined)
+
+
+def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters) -> tuple[list[MapRecord], str | None]:
+    """The page of a listing of these maps alone, and its cursor, which names no other map either."""
+    listing: Listing = ["maps-among", *sorted(map_ids)]
+    found = []
+    for map_id in sorted(map_ids):
+        with suppress(errors.UnknownMap, errors.MapQuarantined):
+            found += [engine.atlas.find(map_id).record] if map_id > decode_name(listing, page.cursor) else []
+    more = encode_cursor(listing, found[page.limit - 1].id) if len(found) > page.limit else None
+    return found[: page.limit], more
+
+
+@router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
+def read_map(map_id: MapId, engine: EngineDep, response: Response) -> MapView:
+    """Read a map's settings, its calibration and its size; the ETag is for editing it."""
+    map_ = engine.atlas.get(map_id)
+    response.headers["ETag"] = entity_tag(map_.record.revision)
+    return show_map(engine, map_)
+
+
+@router.patch(
+    "/{map}",
+    dependencies=[Depends(json_body)],
+    openapi_extra=json_patch(MapChanges),
+    responses=problem_documentation(
+        *BODY_PROBLEMS, errors.UnknownMap, errors.RevisionMismatch, errors.InvalidField, errors.StorageFull
+    ),
+)
+def edit_map(
+    map_id: MapId, changes: MapChanges, engine: EngineDep, response: Response, if_match: IfMatch = None
+) -> MapView:
+    """Edit a map by a merge patch.
+
+    A calibration set here is the map's own (`"source": "manual"`); what is not given of it is taken
+    from the one in force. `null` brings the encoder's default back.
+    """
+    map_ = engine.atlas.get(map_id)
+    expected = expected_revision(if_match, map_.record.revision)
+    edited = map_.edit(_settings_changes(engine, map_, changes), expected)
+    response.headers["ETag"] = entity_tag(edited.revision)
+    return show_map(engine, map_)
+
+
+def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[str, Any]:
+    """A merge patch as values to set: null is the default of its field."""
+    defaults = MapSettings()
+    given = {name: getattr(changes, name) for name in changes.model_fields_set}
+    calibration = given.pop("calibration", None)
+    values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
+    if "calibration" in changes.model_fields_set:
+        values["calibration"] = _own_calibration(engine, map_, calibration)
+    return values
+
+
+def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:
+    if changes is None:
+        return None
+    record = map_.record
+    default = engine.default_calibration(record.encoder)
+    base = record.calibration or default
+    if base is None:
+        raise errors.InvalidField(f"The encoder {record.encoder} is not installed; its calibration is not known.")
+    values = base.model_dump() | {"source": "manual"}
+    for name in changes.model_fields_set:
+        value = getattr(changes, name)
+        values[name] = getattr(default or base, name) if value is None else value
+    return Calibration(**values)
+
+
+@router.delete("/{map}", status_code=204, responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch))
+def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
+    """Delete a map with all that it holds. A damaged map can be deleted too."""
+    if if_match is not None:
+        expected_revision(if_match, engine.atlas.find(map_id).record.revision)
+    engine.atlas.delete(map_id)
+    engine.metrics.forget_map(map_id)
+
+
+@router.post(
+    "/{map}/verify",
+    response_model=VerifyReport,
+    responses={
+        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        **problem_documentation(errors.UnknownMap, JobQueueFull, errors.StorageFull),
+    },
+)
+def verify_map(
+    map_id: MapId,
+    engine: EngineDep,
+    background: Annotated[
+        bool, Query(description="Answer 202 with a job, whose result is the report: a large map takes minutes.")
+    ] = False,
+) -> VerifyReport | Response:
+    """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
+    if not background:
+        return engine.atlas.verify(map_id)
+    job = engine.jobs.submit(rebuilding.VERIFY, map_id, arguments={}, maps=rebuilding.incarnation(engine, map_id))
+    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})

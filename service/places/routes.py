@@ -1,0 +1,256 @@
+"""Places: enrol one frame or many, browse, read, edit, forget, see."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import JSONResponse, Response
+
+from core import errors
+from core.storage.patches import merge_patch
+from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.queue import Patience
+from service.errors.faults import (
+    BatchOutOfOrder,
+    EncoderNotInstalled,
+    InvalidRequest,
+    JobQueueFull,
+    QueueFull,
+    StagingFull,
+    TooManyPlaces,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation
+from service.http.bodies import StrictRoute
+from service.http.dependencies import (
+    EngineDep,
+    MapId,
+    PatienceDep,
+    PlaceId,
+    PlacePageQuery,
+    json_body,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
+from service.http.openapi import form_body, frame_body, json_patch
+from service.http.parameters import BatchParameters, EnrolParameters, check_metadata
+from service.http.uploads import json_part, read_frame, read_many
+from service.jobs.routes import router as jobs
+from service.jobs.schemas import JobView
+from service.places import bulk_enrolment
+from service.places.batch_order import Sequel
+from service.places.batches import candidate_of, check_batch, given_id, item_problem
+from service.places.enrolment import Candidate, enrol
+from service.places.schemas import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+
+router = APIRouter(
+    prefix="/v1/maps/{map}/places",
+    tags=["places"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
+ENROLMENT_PROBLEMS = (
+    errors.UnknownCamera,
+    errors.WrongEncoder,
+    UnsupportedMediaType,
+    errors.NoRegions,
+    errors.StorageFull,
+    TooManyPlaces,
+    QueueFull,
+    EncoderNotInstalled,
+)
+BATCH_BODY = form_body(
+    "A JSON part `places` and the file parts that it names.",
+    {
+        "places": {
+            "type": "array",
+            "items": {"$ref": "#/components/schemas/BatchItem"},
+            "examples": [[{"id": "p7", "file": "frame7", "x": 1.5, "y": 2.0}]],
+        }
+    },
+    ["places"],
+)
+
+
+@router.put(
+    "/{place}",
+    openapi_extra=frame_body(EnrolParameters),
+    responses={
+        201: {"model": EnrolledPlace, "description": "A new place."},
+        **problem_documentation(*ENROLMENT_PROBLEMS),
+    },
+)
+async def enrol_place(
+    map_id: MapId,
+    place_id: PlaceId,
+    options: Annotated[EnrolParameters, Query()],
+    request: Request,
+    response: Response,
+    engine: EngineDep,
+    patience: PatienceDep,
+) -> EnrolledPlace:
+    """Enrol one frame under an id of the caller's.
+
+    The whole place is replaced: parameters that are left out are cleared. The same bytes are not
+    encoded again, so a request can be repeated until it succeeds. The answer comes when the place is
+    on disk and found by every later query.
+    """
+    engine.inference.check_room()
+    map_ = await engine.map(map_id)
+    frame = await read_frame(request, engine.settings)
+    options = options.joined(frame.fields)
+    engine.assert_encoder(map_, options.encoder)
+    fields = options.place_fields(engine.settings)
+    mask = await camera_mask(map_, fields.camera)
+    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data, mask)], patience))[0]
+    response.status_code = 201 if stored.change == "created" else 200
+    request.state.noted = {"map": map_id, "change": stored.change}
+    return EnrolledPlace(
+        **PlaceView.of(stored.place).__dict__,
+        change=stored.change,
+        encoder=map_.record.encoder,
+        milliseconds=rounded({**stored.milliseconds, "total": milliseconds_since(started(request))}),
+    )
+
+
+@router.post(
+    "",
+    response_model=BatchResults,
+    response_model_exclude_unset=True,
+    openapi_extra=BATCH_BODY,
+    responses={
+        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        **problem_documentation(*ENROLMENT_PROBLEMS, BatchOutOfOrder, JobQueueFull, StagingFull),
+    },
+)
+async def enrol_places(
+    map_id: MapId,
+    options: Annotated[BatchParameters, Query()],
+    request: Request,
+    engine: EngineDep,
+    patience: PatienceDep,
+) -> BatchResults | Response:
+    """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
+
+    With `background` the request may be as long as a traverse: it is written to disk as it arrives, and answered with
+    `202` and a job once it is there whole. The job stores frames a few at a time, goes on after a restart of the
+    service, and tells what became of them in its result.
+
+    To go on with a traverse that was broken off, name what the places should hold by `sha256` first: only the frames
+    answered with `frame-needed` have to be sent.
+
+    To have the next batch encoded while this one is being stored, name them: `?batch=a`, then `?batch=b&after=a`.
+    """
+    if options.background:
+        return await _enrol_later(map_id, options, request, engine)
+    with engine.succession.enter(map_id, options.batch, options.after, patience) as sequel:
+        return await _enrol_now(map_id, options, request, engine, patience, sequel)
+
+
+async def _enrol_now(
+    map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
+) -> BatchResults:
+    engine.inference.check_room()
+    map_ = await engine.map(map_id)
+    entries, files = json_part(await read_many(request, engine.settings), "places")
+    engine.assert_encoder(map_, options.encoder)
+    check_batch(entries, [part.name for part in files], engine.settings.max_batch_items)
+    await in_thread(map_.cameras.all)  # from disk, if they are not in memory yet
+    engine.metrics.batches.labels("enrol").observe(len(entries))
+
+    results: list[BatchResult | None] = [None] * len(entries)
+
+    def reject(position: int, error: Exception) -> None:
+        problem = item_problem(request, error)
+        results[position] = BatchResult(id=given_id(entries[position]), status=problem.status, problem=problem)
+
+    ids: set[str] = set()
+    candidates: dict[int, Candidate] = {}
+    by_name = {part.name: part for part in files}
+    for position, entry in enumerate(entries):
+        try:
+            candidate = candidate_of(entry, by_name, by_name.__getitem__, map_, engine.settings)
+            if candidate.id in ids:
+                raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
+            ids.add(candidate.id)
+            candidates[position] = candidate
+        except Exception as error:
+            reject(position, error)
+    positions = list(candidates)
+    stored = await enrol(
+        engine,
+        map_,
+        list(candidates.values()),
+        patience,
+        lambda index, error: reject(positions[index], error),
+        sequel=sequel,
+    )
+    for index, one in stored.items():
+        results[positions[index]] = BatchResult(
+            id=one.place.id,
+            status=201 if one.change == "created" else 200,
+            change=one.change,
+            place=PlaceView.of(one.place),
+        )
+    request.state.noted = {"map": map_id, "frames": len(entries), "stored": len(stored)}
+    return BatchResults(items=[result for result in results if result is not None], encoder=map_.record.encoder)
+
+
+async def _enrol_later(map_id: str, options: BatchParameters, request: Request, engine: Engine) -> Response:
+    map_ = await engine.map(map_id)
+    engine.assert_encoder(map_, options.encoder)
+    job = await bulk_enrolment.receive(engine, map_, request)
+    request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
+    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_places(map_id: MapId, page: PlacePageQuery, engine: EngineDep) -> PlacePage:
+    """List places in the order of their enrolment, all or those of one traverse."""
+    places, next_cursor = engine.atlas.get(map_id).places(page.cursor, page.limit, page.sequence)
+    return PlacePage(items=[PlaceView.of(place) for place in places], next_cursor=next_cursor)
+
+
+@router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))
+def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView:
+    """Read one place."""
+    return PlaceView.of(engine.atlas.get(map_id).place(place_id))
+
+
+@router.patch(
+    "/{place}",
+    dependencies=[Depends(json_body)],
+    openapi_extra=json_patch(PlaceChanges),
+    responses=problem_documentation(UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull),
+)
+def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
+    """Edit what is known of a place by a merge patch: `null` clears, what is left out stays."""
+    map_ = engine.atlas.get(map_id)
+    with engine.writing(map_id):
+        if changes.metadata is not None:
+            check_metadata(merge_patch(map_.place(place_id).metadata, changes.metadata), engine.settings)
+        return PlaceView.of(map_.patch(place_id, changes.model_dump(exclude_unset=True)))
+
+
+@router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
+def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
+    """Forget a place: no later query finds it."""
+    engine.atlas.get(map_id).forget(place_id)
+
+
+@router.get(
+    "/{place}/thumbnail",
+    response_class=Response,
+    responses={
+        200: {"description": "A small JPEG.", "content": {"image/jpeg": {"schema": {"type": "string"}}}},
+        **problem_documentation(errors.UnknownPlace, errors.NoThumbnail),
+    },
+)
+def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Response:
+    """See a place as the map keeps it."""
+    picture = engine.atlas.get(map_id).thumbnail(place_id)
+    return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})

@@ -1,0 +1,122 @@
+"""Places: as they are shown, enrolled and edited."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
+
+from core.places import Place, Pose, Sequence, Timestamp
+from core.storage import Change, Keep
+from service.errors.problems import Problem
+from service.http.fields import IDENTITY_EXAMPLE, Cursor, Milliseconds
+
+PLACE_EXAMPLE: dict[str, Any] = {
+    "id": "p7",
+    "pose": {"x": 1.5, "y": 2.0, "heading": 90.0},
+    "timestamp": "2026-11-20T10:00:00Z",
+    "sequence": "monday",
+    "camera": None,
+    "metadata": {"camera": "front"},
+    "regions": 600,
+    "picture": "thumbnail",
+    "created_at": "2026-11-20T10:00:01.250000Z",
+    "updated_at": "2026-11-20T10:00:01.250000Z",
+}
+
+# A pose shows the frame that it is in and nothing of the other.
+ShownPose = Annotated[Pose, PlainSerializer(lambda pose: pose.model_dump(exclude_none=True))]
+
+
+class PlaceView(BaseModel):
+    """One enrolled reference frame."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [PLACE_EXAMPLE]})
+
+    id: str
+    pose: ShownPose | None
+    timestamp: Timestamp | None = Field(description="When the frame was taken.")
+    sequence: str | None = Field(description="The traverse that it belongs to.")
+    camera: str | None = Field(description="Whose mask was applied to the frame.")
+    metadata: dict[str, Any]
+    regions: int = Field(description="Regions of interest found in the frame.")
+    picture: Keep = Field(description="What is kept of the frame.")
+    created_at: Timestamp
+    updated_at: Timestamp
+
+    @classmethod
+    def of(cls, place: Place) -> PlaceView:
+        """A place as callers see it."""
+        return cls.model_construct(**place.__dict__)
+
+
+class EnrolledPlace(PlaceView):
+    """A place after a PUT."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                PLACE_EXAMPLE
+                | {
+                    "change": "created",
+                    "encoder": IDENTITY_EXAMPLE,
+                    "milliseconds": {"wait": 0.1, "decode": 2.9, "forward": 4.6, "regions": 3.1, "vlad": 0.8},
+                }
+            ]
+        }
+    )
+
+    change: Change = Field(description="updated: new fields; replaced: a new picture; unchanged: neither.")
+    encoder: str = Field(description="Identity of the map's encoder.")
+    milliseconds: Milliseconds
+
+
+class PlacePage(BaseModel):
+    """Places in the order of their ids."""
+
+    items: list[PlaceView]
+    next_cursor: Cursor
+
+
+class PoseChanges(BaseModel):
+    """Part of a pose; null removes a coordinate."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    heading: float | None = None
+
+
+class PlaceChanges(BaseModel):
+    """A merge patch (RFC 7396) of a place: null clears, what is left out stays."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"pose": {"heading": 180}, "sequence": None, "metadata": {"door": "open"}}]},
+    )
+
+    pose: PoseChanges | None = None
+    timestamp: Timestamp | None = None
+    sequence: Sequence | None = None
+    metadata: dict[str, Any] | None = None
+
+
+class BatchResult(BaseModel):
+    """What became of one place of a batch: ``place`` on success, else ``problem``."""
+
+    id: str | None = Field(description="As it was given; null if it was none.")
+    status: int = Field(description="The status that a PUT of it would have had.")
+    change: Change | None = None
+    place: PlaceView | None = None
+    problem: Problem | None = None
+
+
+class BatchResults(BaseModel):
+    """One result for each entry of ``places``, in its order."""
+
+    items: list[BatchResult]
+    encoder: str

@@ -1,0 +1,94 @@
+"""Loop closure: one request that looks for a frame and enrols it if nobody knows it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import Response
+
+from core import errors
+from core.places import Place, check_place_id
+from service.engine.engine import camera_mask, in_thread
+from service.errors.faults import (
+    EncoderNotInstalled,
+    PlaceTaken,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation
+from service.http.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.http.openapi import frame_body
+from service.http.uploads import parse_metadata, read_frame
+from service.places.enrolment import Candidate
+from service.places.schemas import PlaceView
+from service.queries.answers import answer_of, blank_answer, count_answer
+from service.queries.closures import close_loop
+from service.queries.parameters import ClosureParameters
+from service.queries.schemas import ClosureAnswer
+
+router = APIRouter(
+    prefix="/v1/maps/{map}",
+    tags=["queries"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(
+        errors.UnknownCamera,
+        errors.WrongEncoder,
+        PlaceTaken,
+        UnsupportedMediaType,
+        errors.StorageFull,
+        QueueFull,
+        EncoderNotInstalled,
+    ),
+)
+
+
+@router.post(
+    "/query:enrol",
+    openapi_extra=frame_body(ClosureParameters),
+    responses={201: {"model": ClosureAnswer, "description": "Nobody knew the frame; it is a place now."}},
+)
+async def query_or_enrol(
+    map_id: MapId,
+    options: Annotated[ClosureParameters, Query()],
+    request: Request,
+    response: Response,
+    engine: EngineDep,
+    patience: PatienceDep,
+) -> ClosureAnswer:
+    """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
+
+    Of two robots that send the same new place together one enrols it, and the other finds it. A request can be
+    repeated until it succeeds: the same frame under the same id is looked for among the other places, and not enrolled
+    again. `exclude_frames` and `exclude_seconds` keep a robot from finding what it has just enrolled. A frame without
+    regions is not enrolled.
+    """
+    engine.inference.check_room()
+    map_ = await engine.map(map_id)
+    frame = await read_frame(request, engine.settings)
+    options = options.joined(frame.fields)
+    selection = options.selection()
+    engine.assert_encoder(map_, options.encoder)
+    check_place_id(options.id)
+    metadata = {} if options.metadata is None else parse_metadata(options.metadata)
+    fields = options.fields(metadata, engine.settings)
+    mask = await camera_mask(map_, options.camera)
+    with engine.inference.place_in_queue():
+        encoded = await engine.encode_for(map_, frame.data, patience, mask)
+    enrolled: Place | None = None
+    change: Literal["created", "unchanged"] | None = None
+    if len(encoded.encoding.regions) == 0:
+        answer = blank_answer(map_, encoded)
+    else:
+        candidate = Candidate(options.id, fields, frame.data, mask)
+        closure = await in_thread(close_loop, engine, map_, candidate, encoded, options.k, selection)
+        answer = answer_of(encoded, closure.located)
+        enrolled = closure.enrolled
+        if enrolled is not None:
+            change = "created" if closure.created else "unchanged"
+    count_answer(engine, map_, answer)
+    response.status_code = 201 if change == "created" else 200
+    request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
+    answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
+    shown = None if enrolled is None else PlaceView.of(enrolled)
+    return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)

@@ -1,0 +1,188 @@
+"""What a query is told of the reasons for its answer, and the pictures of it that can be fetched for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
+from core.frames.preprocessing import Pixels
+from core.method.encoder import Encoder
+from core.method.explanation import Explanation, Shown, explain
+from core.method.region_drawing import boxes, layer_grids
+from core.method.regions import Regions
+from core.method.vlad import assign
+from core.places import Place
+from core.storage import Map
+from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.queue import Encoded, Patience
+from service.queries.explanation_schemas import (
+    CellPair,
+    ExplainedRegion,
+    ExplanationView,
+    MatchExplanation,
+    RegionPair,
+    RelativeBox,
+)
+from service.queries.pictures import Line, Outline, scaled, side_by_side
+from service.upkeep.upkeep import key_of
+
+LISTED = 30
+"""Regions of a frame that are told of."""
+
+DRAWN = 60
+"""Lines of a picture at most."""
+
+
+def as_drawn(encoded: Encoded) -> Encoded:
+    """The same with pixels only as many as are drawn: a frame that waits for another may have forty million."""
+    return replace(encoded, pixels=scaled(encoded.pixels))
+
+
+async def explained_match(
+    engine: Engine, map_: Map, query: Encoded, place_id: str, patience: Patience
+) -> MatchExplanation | None:
+    """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
+
+    Raises:
+        As for ``Inference.encode``: the picture that is kept of the place is encoded again, for its regions.
+    """
+    found = await in_thread(_stored, map_, place_id)
+    if found is None:
+        return None
+    stored, place, picture = found
+    encoder, again = query.encoder, None
+    if picture is not None:
+        mask = None
+        with suppress(UnknownCamera):  # forgotten since; the place stays as it was enrolled
+            mask = await camera_mask(map_, place.camera)
+        with engine.inference.place_in_queue():
+            again = await engine.encode_for(map_, picture, patience, mask)
+    match = replace(stored, regions=None if again is None else again.encoding.regions)
+    shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
+    told = await in_thread(lambda: view(encoder, explain(encoder, shown, match), shown, match))
+    path = None
+    if again is not None:
+        drawn = await in_thread(drawing, told, query.pixels, again.pixels)
+        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(key_of(map_), drawn)}"
+    return MatchExplanation(**told.__dict__, place=place_id, match_picture=place.picture, picture=path)
+
+
+def _stored(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | None:
+    """What a map holds of a place: its descriptors, its fields, the picture that is kept."""
+    snapshot = map_.snapshot()
+    (row,) = map_.rows_of([place_id])
+    if row is None or row >= snapshot.rows:
+        return None
+    rows = np.array([row])
+    shown = Shown(snapshot.descriptors_at(rows)[0], snapshot.locals_at(rows)[0], None)
+    try:
+        place = map_.place(place_id)
+        picture = None if place.picture == "none" else map_.thumbnail(place_id)
+    except (UnknownPlace, NoThumbnail):
+        return None
+    return shown, place, picture
+
+
+@dataclass(frozen=True)
+class _Listed:
+    """The regions of a frame that are told of: their indices, most important first, and their boxes."""
+
+    indices: list[int]
+    regions: list[ExplainedRegion]
+
+
+def explained(query: Encoded, match: Encoded) -> ExplanationView:
+    """Why two frames that were encoded by one encoder score as they do."""
+    shown = [Shown(one.encoding.descriptor, one.encoding.local, one.encoding.regions) for one in (query, match)]
+    return view(query.encoder, explain(query.encoder, *shown), *shown)
+
+
+def view(encoder: Encoder, explanation: Explanation, query: Shown, match: Shown) -> ExplanationView:
+    """An explanation as callers see it."""
+    sides = [
+        _listed(encoder, shown.regions, losses)
+        for shown, losses in zip((query, match), explanation.losses, strict=True)
+    ]
+    mine, other = sides
+    assert mine is not None
+    pairs = []
+    if other is not None:
+        here, there = ({index: at for at, index in enumerate(side.indices)} for side in (mine, other))
+        answers = explanation.answers.tolist()
+        pairs = [RegionPair(query=here[a], match=there[b]) for a, b in answers if a in here and b in there]
+    columns = max(1, encoder.grid[1])
+    order = np.argsort(-explanation.gains, kind="stable")
+    cells = explanation.cells
+    return ExplanationView(
+        score=explanation.score,
+        words=[round(word, 6) for word in explanation.words.tolist()],
+        query_regions=mine.regions,
+        match_regions=None if other is None else other.regions,
+        regions=pairs,
+        cells=[
+            CellPair(
+                query=divmod(int(cells.query[at]), columns),
+                match=divmod(int(cells.reference[at]), columns),
+                gain=round(float(explanation.gains[at]), 6),
+            )
+            for at in order
+        ],
+        grid=encoder.grid,
+    )
+
+
+def _listed(encoder: Encoder, regions: Regions | None, losses: np.ndarray | None) -> _Listed | None:
+    if regions is None or losses is None:
+        return None
+    grids = layer_grids(encoder)
+    names, corners = list(grids), boxes(regions, list(grids.values()), 1.0, 1.0)
+    words = assign(regions.features, encoder.centers) if len(regions) else np.empty(0, np.int64)
+    chosen = [int(index) for index in np.argsort(-losses, kind="stable")[:LISTED]]
+    told = []
+    for index in chosen:
+        left, top, right, bottom = (round(corner, 4) for corner in corners[index].tolist())
+        told.append(
+            ExplainedRegion(
+                layer=names[regions.layers[index]],
+                word=int(words[index]),
+                box=RelativeBox(left=left, top=top, right=right, bottom=bottom),
+                loss=round(float(losses[index]), 6),
+            )
+        )
+    return _Listed(chosen, told)
+
+
+def drawing(shown: ExplanationView, query: Pixels, match: Pixels) -> bytes:
+    """A PNG with both frames: cells that answer each other, or else regions, joined; what carries most outlined."""
+    sides = (shown.query_regions, shown.match_regions or [])
+    outlines = ([], []) if shown.cells else (_outlines(sides[0]), _outlines(sides[1]))
+    return side_by_side(query, match, _lines(shown), outlines)
+
+
+def _outlines(regions: Sequence[ExplainedRegion]) -> list[Outline]:
+    most = max((region.loss for region in regions), default=0.0)
+    told = [region for region in regions if region.loss > 0]
+    return [Outline((one.box.left, one.box.top, one.box.right, one.box.bottom), one.loss / most) for one in told]
+
+
+def _lines(shown: ExplanationView) -> list[Line]:
+    if shown.cells:
+        rows, columns = shown.grid
+        most = max(pair.gain for pair in shown.cells) or 1.0
+
+        def centre(cell: tuple[int, int]) -> tuple[float, float]:
+            return (cell[1] + 0.5) / columns, (cell[0] + 0.5) / rows
+
+        return [Line(centre(pair.query), centre(pair.match), pair.gain / most) for pair in shown.cells[:DRAWN]]
+    if shown.match_regions is None:
+        return []
+    ends = [(shown.query_regions[pair.query].box, shown.match_regions[pair.match].box) for pair in shown.regions]
+    return [Line(_middle(a), _middle(b), 0.0) for a, b in ends[:DRAWN]]
+
+
+def _middle(box: RelativeBox) -> tuple[float, float]:
+    return (box.left + box.right) / 2, (box.top + box.bottom) / 2

@@ -1,0 +1,232 @@
+"""What callers know of where a frame was taken, as parameters: filters of what may be found, and soft priors."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, TypeAdapter, ValidationError
+
+from core.judgement.priors import Box, Constraint, Disc, Facing, Period
+from core.places import Pose, Sequence, Timestamp, microseconds
+from core.recognition.selection import TRUST, Knowledge, Recent, Selection
+from core.storage.attributes import Scalar
+from core.storage.database.schema import LONGEST_INDEXED
+from service.errors.faults import InvalidRequest
+from service.http.parameters import PlaceDescription, validated
+
+MOST_NAMES = 100
+"""Sequences, and keys of metadata, that one query may name."""
+
+Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
+KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
+
+_NAMES: TypeAdapter[list[str]] = TypeAdapter(Annotated[list[Sequence], Field(min_length=1, max_length=MOST_NAMES)])
+_DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
+
+
+class FilterParameters(PlaceDescription):
+    """What is known of the frame: filters of what may be found, or soft priors on it."""
+
+    radius: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="Metres: the place is within so many of the position given.",
+        examples=[25.0],
+    )
+    heading_tolerance: float | None = Field(
+        default=None,
+        ge=0,
+        le=180,
+        allow_inf_nan=False,
+        description="Degrees: the place faces within so many of heading.",
+    )
+    bbox: str | None = Field(
+        default=None,
+        max_length=200,
+        description="west,south,east,north in degrees; a west greater than east crosses the antimeridian.",
+        examples=["179.9,-17.1,-179.9,-16.9"],
+    )
+    sequences: str | None = Field(
+        default=None,
+        max_length=20_000,
+        description="Names of traverses, one of which has the place: separated by commas, or a JSON array of strings.",
+        examples=["monday,tuesday"],
+    )
+    after: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or later.")
+    before: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or earlier.")
+    where: str | None = Field(
+        default=None,
+        max_length=100_000,
+        description="A JSON object: the place's metadata has these values under these keys, at its top level. Numbers "
+        f"are equal as numbers; texts have at most {LONGEST_INDEXED} characters.",
+        examples=['{"floor": 2, "light": "day"}'],
+    )
+    soft: str | None = Field(
+        default=None,
+        max_length=200,
+        description=f"Which of {', '.join(KINDS)} are no filters but priors, which weigh the places; with commas.",
+        examples=["position,heading"],
+    )
+    prior_trust: float | None = Field(
+        default=None,
+        ge=0,
+        lt=1,
+        description=f"How probable it is that what is soft is right; {TRUST} if left out. A place against which it "
+        "speaks loses odds down to 1 - prior_trust of them, never more.",
+    )
+    exclude_frames: int | None = Field(
+        default=None, ge=0, le=10**9, description="Leave out the last so many places of the frame's own sequence."
+    )
+    exclude_seconds: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="Leave out the places of the frame's own sequence less than so many seconds from its timestamp, "
+        "and those of it that have no timestamp.",
+    )
+
+    def position(self) -> Pose | None:
+        """Where the frame was taken, without a heading; None if that is not said.
+
+        Raises:
+            InvalidRequest: it is incomplete, or of both kinds.
+        """
+        names = ("x", "y", "z", "latitude", "longitude")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return validated(Pose, given) if given else None
+
+    def selection(self) -> Selection | None:
+        """What the query is to choose from; None: everything.
+
+        Raises:
+            InvalidRequest: the parameters do not go together, or one is malformed.
+        """
+        geometry = self._geometry()
+        sequences, metadata = self._sequences(), self._metadata()
+        given = {*geometry, *(["sequences"] if sequences else []), *(["where"] if metadata else [])}
+        soft = self._soft(given)
+        made = Selection(
+            _knowledge(given - soft, geometry, sequences, metadata),
+            _knowledge(soft, geometry, sequences, metadata),
+            TRUST if self.prior_trust is None else self.prior_trust,
+            self._recent(),
+        )
+        return made if made else None
+
+    def _geometry(self) -> dict[Kind, Constraint]:
+        found: dict[Kind, Constraint] = {}
+        if self.radius is not None:
+            centre = self.position()
+            if centre is None:
+                raise InvalidRequest("radius: it needs a position, x and y or latitude and longitude.")
+            found["position"] = Disc(centre, self.radius)
+        if self.heading_tolerance is not None:
+            if self.heading is None:
+                raise InvalidRequest("heading_tolerance: it needs a heading.")
+            found["heading"] = Facing(self.heading, self.heading_tolerance)
+        if self.bbox is not None:
+            found["bbox"] = parse_box(self.bbox)
+        if self.after is not None or self.before is not None:
+            if self.after is not None and self.before is not None and self.after > self.before:
+                raise InvalidRequest("after: it is later than before.")
+            after, before = (None if moment is None else microseconds(moment) for moment in (self.after, self.before))
+            found["time"] = Period(after, before)
+        return found
+
+    def _sequences(self) -> tuple[str, ...] | None:
+        if self.sequences is None:
+            return None
+        names: Any = self.sequences.split(",")
+        if self.sequences.startswith("["):
+            names = parsed_json(self.sequences, "sequences")
+        try:
+            return tuple(_NAMES.validate_python(names, strict=True))
+        except ValidationError as error:
+            raise InvalidRequest(f"sequences: they are no names of traverses, at most {MOST_NAMES}.") from error
+
+    def _metadata(self) -> dict[str, Scalar]:
+        if self.where is None:
+            return {}
+        found = parsed_json(self.where, "where")
+        if not isinstance(found, dict) or not 0 < len(found) <= MOST_NAMES:
+            raise InvalidRequest(f"where: it is no JSON object with 1 to {MOST_NAMES} keys.")
+        for key, value in found.items():
+            if isinstance(value, dict | list):
+                raise InvalidRequest(f"where: {key[:80]!r} has a value that is no text, number, true, false or null.")
+            if isinstance(value, str) and len(value) > LONGEST_INDEXED:
+                raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
+        return found
+
+    def _soft(self, given: set[str]) -> set[str]:
+        if self.soft is None:
+            if self.prior_trust is not None:
+                raise InvalidRequest("prior_trust: nothing is soft.")
+            return set()
+        names = set(self.soft.split(","))
+        if unknown := sorted(names - set(KINDS)):
+            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is none of {', '.join(KINDS)}.")
+        if absent := sorted(names - given):
+            raise InvalidRequest(f"soft: nothing is said of {absent[0]}.")
+        return names
+
+    def _recent(self) -> Recent | None:
+        if not self.exclude_frames and not self.exclude_seconds:
+            return None
+        if self.sequence is None:
+            raise InvalidRequest("exclude_frames and exclude_seconds need the frame's own sequence.")
+        if self.exclude_seconds and self.timestamp is None:
+            raise InvalidRequest("exclude_seconds: it needs the frame's own timestamp.")
+        moment = None if self.timestamp is None else microseconds(self.timestamp)
+        return Recent(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
+
+
+def _knowledge(
+    names: set[str],
+    geometry: Mapping[Kind, Constraint],
+    sequences: tuple[str, ...] | None,
+    metadata: Mapping[str, Scalar],
+) -> Knowledge:
+    return Knowledge(
+        tuple(constraint for name, constraint in geometry.items() if name in names),
+        sequences if "sequences" in names else None,
+        metadata if "where" in names else {},
+    )
+
+
+def parse_box(text: str) -> Box:
+    """west,south,east,north in degrees.
+
+    Raises:
+        InvalidRequest: it is not.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 4 or not all(_DEGREES.fullmatch(part) for part in parts):
+        raise InvalidRequest("bbox: it is not four numbers, west,south,east,north.")
+    west, south, east, north = map(float, parts)
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
+        raise InvalidRequest("bbox: it needs -180 to 180 for west and east, and -90 <= south <= north <= 90.")
+    return Box(west, south, east, north)
+
+
+def parsed_json(text: str, what: str) -> Any:
+    """The value of JSON text in a parameter.
+
+    Raises:
+        InvalidRequest: it is not JSON, or holds what cannot be stored.
+    """
+
+    def refuse(constant: str) -> Any:
+        raise ValueError(constant)
+
+    try:
+        found = json.loads(text, parse_constant=refuse)
+        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+        return found
+    except (ValueError, RecursionError):
+        raise InvalidRequest(f"{what}: it is not JSON.") from None

@@ -1,0 +1,128 @@
+"""Two frames side by side, with what connects them drawn over both, and the last such pictures."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from core.frames.images import encode_png
+from core.frames.preprocessing import Pixels
+from service.errors.faults import UnknownExplanation
+from service.upkeep.statistics import MapKey
+
+HEIGHT = 360
+"""Of each frame in the drawing, pixels."""
+
+WIDEST = 960
+"""Of each frame in the drawing, pixels; a panorama is lower instead."""
+
+GAP = 8
+
+KEPT = 64
+"""Pictures that can be fetched."""
+
+SECONDS = 600.0
+"""For so long."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """From a point of the left frame to one of the right, (x, y) in shares of width and height; weight in 0 … 1."""
+
+    left: tuple[float, float]
+    right: tuple[float, float]
+    weight: float
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A box in shares of width and height (left, top, right, bottom); weight in 0 … 1."""
+
+    box: tuple[float, float, float, float]
+    weight: float
+
+
+def side_by_side(
+    left: Pixels, right: Pixels, lines: Sequence[Line], outlines: tuple[Sequence[Outline], Sequence[Outline]]
+) -> bytes:
+    """A PNG of two frames; what weighs more is drawn later and thicker.
+
+    Args:
+        left, right: H x W x 3 uint8, BGR.
+        outlines: boxes in the left frame and in the right one.
+    """
+    frames = [scaled(left), scaled(right)]
+    height = max(len(frame) for frame in frames)
+    starts = [0, frames[0].shape[1] + GAP]
+    canvas = np.full((height, starts[1] + frames[1].shape[1], 3), 32, np.uint8)
+    for frame, start in zip(frames, starts, strict=True):
+        canvas[: len(frame), start : start + frame.shape[1]] = frame
+    for frame, start, boxes in zip(frames, starts, outlines, strict=True):
+        for outline in sorted(boxes, key=lambda one: one.weight):
+            (x0, y0), (x1, y1) = (_point(outline.box[i : i + 2], frame, start) for i in (0, 2))
+            cv2.rectangle(canvas, (x0, y0), (x1 - 1, y1 - 1), (255, 255, 255), 1 + round(outline.weight), cv2.LINE_AA)
+    for line in sorted(lines, key=lambda one: one.weight):
+        ends = _point(line.left, frames[0], starts[0]), _point(line.right, frames[1], starts[1])
+        # A colour for each height in the left frame, so that crossing lines can be told apart.
+        colour = _colour(line.left[1])
+        cv2.line(canvas, *ends, colour, 1 + round(line.weight), cv2.LINE_AA)
+        for end in ends:
+            cv2.circle(canvas, end, 3, colour, -1, cv2.LINE_AA)
+    return encode_png(canvas)
+
+
+def scaled(frame: Pixels) -> Pixels:
+    """A frame in the size in which it is drawn; one of that size as it is."""
+    height, width = frame.shape[:2]
+    factor = min(HEIGHT / height, WIDEST / width)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return np.asarray(cv2.resize(frame, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _point(share: Sequence[float], frame: Pixels, start: int) -> tuple[int, int]:
+    height, width = frame.shape[:2]
+    return start + round(share[0] * width), round(share[1] * height)
+
+
+def _colour(share: float) -> tuple[int, int, int]:
+    value = np.full((1, 1), min(255, round(255 * share)), np.uint8)
+    blue, green, red = cv2.applyColorMap(value, cv2.COLORMAP_TURBO)[0, 0].tolist()
+    return blue, green, red
+
+
+class Pictures:
+    """The pictures of the last explanations, in memory; from any thread."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, key: MapKey, picture: bytes) -> str:
+        """Keep a PNG for a while, for as long as its map is there; the name to fetch it by."""
+        name = secrets.token_urlsafe(12)
+        with self._lock:
+            self._kept[key, name] = (time.monotonic() + SECONDS, picture)
+            while len(self._kept) > KEPT:
+                self._kept.popitem(last=False)
+        return name
+
+    def fetch(self, key: MapKey, name: str) -> bytes:
+        """The PNG.
+
+        Raises:
+            UnknownExplanation: there is none of this name, or not any more.
+        """
+        with self._lock:
+            until, picture = self._kept.get((key, name), (0.0, b""))
+        if time.monotonic() > until:
+            raise UnknownExplanation(
+                f"There is no picture {name[:40]!r}; the last {KEPT} are kept for {SECONDS / 60:.0f} minutes."
+            )
+        return picture

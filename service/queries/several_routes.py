@@ -1,0 +1,212 @@
+"""One moment's frames, of one camera or of a rig, asked of several maps at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request
+
+from core import errors
+from core.judgement.probability import sigmoid
+from service.engine.engine import Engine, in_thread
+from service.engine.queue import Encoded
+from service.errors.faults import (
+    InvalidRequest,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation, request_problem
+from service.http.dependencies import (
+    EngineDep,
+    PatienceDep,
+    PrincipalDep,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
+from service.http.openapi import frames_body
+from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
+from service.places.batches import item_problem
+from service.places.schemas import PlaceView
+from service.queries.answers import answer_of, blank_answer, estimated_pose
+from service.queries.parameters import SeveralParameters
+from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
+from service.queries.several_schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
+
+router = APIRouter(
+    prefix="/v1",
+    tags=["queries"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(UnsupportedMediaType, errors.InvalidIdentifier, errors.InvalidImage, QueueFull),
+)
+
+MOST_FRAMES = 16
+"""Cameras of a rig."""
+
+
+@router.post("/query", openapi_extra=frames_body(SeveralParameters))
+async def query_maps(
+    options: Annotated[SeveralParameters, Query()],
+    request: Request,
+    engine: EngineDep,
+    principal: PrincipalDep,
+    patience: PatienceDep,
+) -> SeveralAnswer:
+    """Locate one moment's frames in several maps, ranked together by calibrated probability.
+
+    A form with several file parts is one query of a rig: its cameras' evidence is added up place by place, so the
+    frames must be of one moment, and a blank one spoils nothing. A map that is damaged, unknown or lacks its encoder is
+    reported beside the others, which answer all the same. `place` is given only with the verdict `recognized`, which
+    needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
+    of another place.
+    """
+    engine.inference.check_room()
+    frames, broken, options = await _frames(request, options, engine)
+    selection = options.selection()
+    map_ids = options.map_ids()
+    if map_ids is None:
+        map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
+    principal.require(*map_ids)
+    with engine.inference.place_in_queue():
+        reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
+    shown = _frame_reports(request, frames, reports)
+    together = judge_together(reports)
+    recognized = together.best if together.verdict == "recognized" else None
+    answers = [_map_answer(request, engine, report) for report in reports]
+    for report in reports:
+        if report is recognized or len(reports) == 1:
+            _count_for_health(engine, report)
+    matches = _matches(reports, options.k)
+    place = pose = None
+    if recognized is not None and recognized.located is not None:
+        place = PlaceView.of(recognized.located.matches[0][1])
+        pose = estimated_pose(recognized.located.pose, place)
+    request.state.noted = {"maps": len(map_ids), "frames": len(frames), "verdict": together.verdict}
+    return SeveralAnswer(
+        verdict=together.verdict,
+        map=None if recognized is None else recognized.map_id,
+        place=place,
+        probability=together.probability,
+        pose=pose,
+        matches=matches,
+        maps=answers,
+        frames=[*shown, *broken],
+        milliseconds=rounded({"total": milliseconds_since(started(request))}),
+    )
+
+
+def _all_maps(engine: Engine) -> list[str]:
+    return sorted({record.id for record in engine.all_records()} | set(engine.atlas.quarantined()))
+
+
+async def _frames(
+    request: Request, options: SeveralParameters, engine: Engine
+) -> tuple[list[RigFrame], list[FrameReport], SeveralParameters]:
+    """The frames that can be tried, reports of those that cannot, and the parameters with the form's fields."""
+    if media_type(request) != FORM:
+        frame = await read_frame(request, engine.settings)
+        if options.cameras is not None:
+            raise InvalidRequest("cameras: a raw body has no parts; name its camera as camera.")
+        return [RigFrame("image", frame.data, options.camera)], [], options
+    files, fields = split_form(await read_many(request, engine.settings))
+    options = options.joined(fields)
+    names = [part.name for part in files]
+    if not 1 <= len(files) <= MOST_FRAMES or len(set(names)) < len(names):
+        raise InvalidRequest(f"The form needs 1 to {MOST_FRAMES} file parts under different names.")
+    cameras = options.camera_of(names)
+    frames: list[RigFrame] = []
+    broken: list[FrameReport] = []
+    first: Exception | None = None
+    for part in files:
+        try:
+            check_part(part, engine.settings)
+            frames.append(RigFrame(part.name, part.data, cameras.get(part.name)))
+        except Exception as error:
+            problem = item_problem(request, error)
+            first = first or error
+            report = FrameReport(frame=part.name, camera=cameras.get(part.name), status=problem.status, problem=problem)
+            broken.append(report)
+    if first is not None and not frames:
+        raise first
+    return frames, broken, options
+
+
+def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequence[MapReport]) -> list[FrameReport]:
+    """What became of each frame; if none could be decoded, the first one's error is that of the request."""
+    found: list[FrameReport] = []
+    first: Exception | None = None
+    outcomes = next((report.frames for report in reports if report.frames), ())
+    for index, frame in enumerate(frames):
+        outcome = outcomes[index] if outcomes else None
+        if isinstance(outcome, Exception):
+            first = first or outcome
+            problem = item_problem(request, outcome)
+            found.append(FrameReport(frame=frame.name, camera=frame.camera, status=problem.status, problem=problem))
+        else:
+            regions = len(outcome.encoding.regions) if isinstance(outcome, Encoded) else None
+            found.append(FrameReport(frame=frame.name, camera=frame.camera, status=200, regions=regions))
+    if first is not None and all(report.problem is not None for report in found):
+        raise first
+    return found
+
+
+def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswer:
+    encoder = None if report.map_ is None else report.map_.record.encoder
+    if report.error is not None:
+        problem = request_problem(request, report.error)
+        return MapAnswer(map=report.map_id, status=problem.status, encoder=encoder, problem=problem)
+    if report.located is None:
+        engine.metrics.observe_answer(report.map_id, "unknown", None)
+        return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason="no-regions", encoder=encoder)
+    seen = next(one for one in report.frames if isinstance(one, Encoded) and len(one.encoding.regions))
+    answer = answer_of(seen, report.located)
+    engine.metrics.observe_answer(report.map_id, answer.verdict, answer.score)
+    engine.metrics.searches.observe(report.located.search / 1e3)
+    return MapAnswer(
+        map=report.map_id,
+        status=200,
+        verdict=answer.verdict,
+        probability=answer.probability,
+        score=answer.score,
+        margin=answer.margin,
+        decision=answer.decision,
+        threshold=answer.threshold,
+        reason=answer.reason,
+        encoder=encoder,
+    )
+
+
+def _count_for_health(engine: Engine, report: MapReport) -> None:
+    """Count an answer for the health of its map: of several only the one that has the place, for a frame of elsewhere
+    says nothing of the others."""
+    seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
+    if report.map_ is None or report.error is not None or seen is None:
+        return
+    answer = blank_answer(report.map_, seen) if report.located is None else answer_of(seen, report.located)
+    engine.upkeep.observe(report.map_id, answer)
+
+
+def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:
+    """The best of all maps' matches."""
+    found: list[tuple[float, MapMatch]] = []
+    for report in reports:
+        if report.located is None:
+            continue
+        weights: Sequence[float | None] = report.located.weights or [None] * len(report.located.matches)
+        is_calibrated = report.located.probability is not None
+        for odds, (score, place), weight in zip(match_log_odds(report), report.located.matches, weights, strict=True):
+            probability = float(sigmoid(np.array(odds))) if is_calibrated else None
+            match = MapMatch(
+                rank=0,
+                map=report.map_id,
+                probability=probability,
+                score=score,
+                weight=weight,
+                place=PlaceView.of(place),
+            )
+            found.append((odds, match))
+    best = sorted(found, key=lambda item: -item[0])[:k]
+    return [match.model_copy(update={"rank": rank}) for rank, (_, match) in enumerate(best, start=1)]

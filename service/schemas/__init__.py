@@ -1,1 +1,0 @@
-"""The JSON that the service takes and gives, one module a resource."""

@@ -1,1 +1,0 @@
-"""Between the sockets and the application: connections and their limits, signals, the stop."""

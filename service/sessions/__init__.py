@@ -1,0 +1,1 @@
+"""A robot's run, frame by frame."""

@@ -1,0 +1,238 @@
+"""One frame into a session: encode, locate alone, move the belief on, tell both; over HTTP and over a WebSocket."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, evidence
+from core.recognition.localization import Located, neighborhood_of
+from core.storage import Map
+from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.queue import Patience
+from service.errors.faults import FrameOutOfOrder, InvalidRequest
+from service.http.dependencies import rounded
+from service.places.schemas import PlaceView
+from service.queries.answers import answer_of, blank_answer, count_answer
+from service.queries.schemas import QueryAnswer
+from service.sessions.schemas import (
+    BeliefView,
+    BelievedPlace,
+    EarlierBelief,
+    FrameParameters,
+    Motion,
+    SessionAnswer,
+    SessionReport,
+    SessionView,
+)
+from service.sessions.sessions import Session, alive_rows
+
+
+async def take_in(
+    engine: Engine,
+    map_: Map,
+    session: Session,
+    data: bytes,
+    options: FrameParameters,
+    patience: Patience,
+    request_id: str | None,
+) -> SessionAnswer:
+    """Answer one frame of a session, in its turn.
+
+    A frame that raises was not taken in, and the session goes on as if it had not come.
+
+    Args:
+        request_id: that the caller gave; a frame without a number that comes again under it is the same frame.
+
+    Raises:
+        FrameOutOfOrder: a later frame was taken in already.
+        InvalidRequest: the session needs what the frame does not tell, or cannot use what it tells.
+        QueueFull, DeadlineExceeded, ClientGone, InvalidImage and others: as for a query.
+    """
+    began = time.monotonic()
+    engine.assert_encoder(map_, options.encoder)
+    _check_options(session, options)
+    async with session.turn():
+        run = await in_thread(_found_run, engine, map_, session)
+        if (repeated := _repeated(session, options, request_id)) is not None:
+            return repeated
+        mask = await camera_mask(map_, session.options.camera)
+        with engine.inference.place_in_queue():
+            encoded = await engine.encode_for(map_, data, patience, mask)
+        located: Located | None = None
+        if len(encoded.encoding.regions):
+            (located,) = await engine.searches.locate(
+                map_, encoded.encoder, [encoded.encoding], options.k, session.selection
+            )
+        single = blank_answer(map_, encoded) if located is None else answer_of(encoded, located)
+        count_answer(engine, map_, single)
+        try:
+            return await in_thread(_advanced, engine, map_, session, run, located, single, options, request_id, began)
+        except Exception:
+            session.run = None  # it is taken up again as it was written down after the frame before
+            raise
+
+
+def _found_run(engine: Engine, map_: Map, session: Session) -> Run:
+    """The run of a session, which may have been deleted while this frame waited."""
+    engine.sessions.find(map_, session.id)
+    return engine.sessions.run(map_, session)
+
+
+def _check_options(session: Session, options: FrameParameters) -> None:
+    if session.options.speed_limit is not None and options.timestamp is None:
+        raise InvalidRequest("timestamp: the session has a speed limit, so each frame needs one.")
+    if session.options.filter == "path" and options.forward is not None:
+        raise InvalidRequest("forward: the filter path knows no odometry.")
+
+
+def _repeated(session: Session, options: FrameParameters, request_id: str | None) -> SessionAnswer | None:
+    """The answer that was given already, if this frame is the last one sent again."""
+    number, last = options.frame, session.number
+    again = number == last if number is not None and last is not None else False
+    if number is None and request_id is not None:
+        again = request_id == session.request
+    if again:
+        if session.answer is None:
+            raise FrameOutOfOrder("The frame was taken in already; its answer is not kept any more.")
+        return SessionAnswer.model_validate_json(session.answer).model_copy(update={"repeated": True})
+    if number is not None and last is not None and number < last:
+        raise FrameOutOfOrder(f"Frame {number} comes after frame {last}.")
+    if options.timestamp is not None and session.moment is not None and options.timestamp.timestamp() < session.moment:
+        raise FrameOutOfOrder("The frame was taken before the last one that came.")
+    return None
+
+
+def _advanced(
+    engine: Engine,
+    map_: Map,
+    session: Session,
+    run: Run,
+    located: Located | None,
+    single: QueryAnswer,
+    options: FrameParameters,
+    request_id: str | None,
+    began: float,
+) -> SessionAnswer:
+    """Move the belief on, write it down, and tell it."""
+    started = time.perf_counter()
+    step, motion = _step(session, run, options)
+    run.advance(_evidence(map_, located), step)
+    alive = alive_rows(map_)
+    found = run.estimate(options.k, alive)
+    earlier = run.earlier(options.k, alive)
+    lost = session.lost
+    if options.frame is not None and session.restored and lost is None and session.number is not None:
+        lost = options.frame - session.number - 1
+    answer = SessionAnswer(
+        session=session.id,
+        frame=options.frame,
+        frames=run.frames,
+        **belief_view(map_, run, found).__dict__,
+        earlier=None
+        if earlier is None
+        else EarlierBelief(
+            frames_ago=session.options.lag,
+            verdict=earlier.verdict,
+            candidates=_believed(map_, earlier.candidates),
+        ),
+        motion=motion,
+        restored=session.restored,
+        frames_lost=lost,
+        saved=True,
+        single=single,
+        milliseconds={},
+    )
+    believed = 1e3 * (time.perf_counter() - started)
+    answer.milliseconds = rounded({"belief": believed, "total": 1e3 * (time.monotonic() - began)})
+    # Not before all that may fail is done: a frame that raises was not taken in.
+    session.answer, session.lost = answer.model_dump_json(), lost
+    session.request = request_id
+    session.touch()
+    if options.frame is not None:
+        session.number = options.frame
+    if options.timestamp is not None:
+        session.moment = options.timestamp.timestamp()
+    answer.saved = engine.sessions.save(session)
+    answer.milliseconds |= rounded({"save": 1e3 * (time.perf_counter() - started) - believed})
+    return answer
+
+
+def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, Motion]:
+    """The motion since the last frame, and what tells it."""
+    if not run.frames:
+        return Step(), "first"
+    frames = 1
+    if options.frame is not None and session.number is not None:
+        frames = options.frame - session.number
+    reach, odometry = None, options.odometry()
+    limit = session.options.speed_limit
+    if limit is not None and options.timestamp is not None and session.moment is not None:
+        reach = limit * (options.timestamp.timestamp() - session.moment)
+    motion: Motion = "sequence"
+    if run.graph.posed.any():
+        motion = "odometry" if odometry is not None else "speed-limit" if reach is not None else motion
+    return Step(odometry, reach, frames), motion
+
+
+def _evidence(map_: Map, located: Located | None) -> Evidence:
+    if located is None:
+        return NOTHING
+    scored = located.scored
+    return evidence(
+        scored.rows,
+        scored.scores,
+        scored.whereabouts,
+        located.calibration,
+        neighborhood_of(map_),
+        scored.examined,
+    )
+
+
+def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]:
+    places = map_.places_at([candidate.row for candidate in candidates]) if candidates else []
+    present = [(one.probability, place) for one, place in zip(candidates, places, strict=True) if place is not None]
+    return [
+        BelievedPlace(rank=rank, probability=probability, place=PlaceView.of(place))
+        for rank, (probability, place) in enumerate(present, start=1)
+    ]
+
+
+def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
+    """An estimate as callers see it; a place deleted in this very moment is not told."""
+    candidates = _believed(map_, found.candidates)
+    told = bool(candidates) and found.candidates[0].probability == candidates[0].probability
+    verdict = "ambiguous" if found.verdict == "recognized" and not told else found.verdict
+    return BeliefView(
+        verdict=verdict,
+        place=candidates[0].place if verdict == "recognized" else None,
+        probability=candidates[0].probability if candidates else None,
+        unknown=found.unknown,
+        lost=run.lost,
+        candidates=candidates,
+    )
+
+
+def session_view(session: Session, frames: int) -> SessionView:
+    """A session as it is listed."""
+    options = session.options.model_dump()
+    return SessionView(
+        **{**options, "expires_after": session.expires_after},
+        id=session.id,
+        map=session.map_id,
+        created_at=datetime.fromtimestamp(session.created, UTC),
+        expires_at=datetime.fromtimestamp(session.expires, UTC),
+        frames=frames,
+        last_frame=session.number,
+        restored=session.restored,
+        frames_lost=session.lost,
+    )
+
+
+def session_report(engine: Engine, map_: Map, session: Session, k: int = 5) -> SessionReport:
+    """A session and what is believed now; call it in the session's turn, in a thread."""
+    run = engine.sessions.run(map_, session)
+    found = run.look(k, alive_rows(map_))
+    view = session_view(session, run.frames)
+    return SessionReport(**view.model_dump(), belief=belief_view(map_, run, found))

@@ -1,0 +1,182 @@
+"""Sessions on disk: one small SQLite file in the data directory, written after every frame.
+
+A frame that is answered was written down and synced, as every write that is acknowledged (``synchronous=FULL`` in WAL
+mode): a power cut takes none of it back.  A file that cannot be read is put aside: sessions are worth less than a
+service that starts.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from core.storage.files.disk import refusals
+
+FILE = "sessions.sqlite"
+APPLICATION_ID = 0x504C5253  # "PLRS"
+FORMAT = 1
+
+LOG_PAGES = 256
+"""After so many pages the log is written back."""
+
+_SCHEMA = """
+CREATE TABLE sessions (
+    id TEXT PRIMARY KEY,
+    map TEXT NOT NULL,
+    map_created_at TEXT NOT NULL,
+    options TEXT NOT NULL,
+    created REAL NOT NULL,
+    used REAL NOT NULL,
+    number INTEGER,
+    moment REAL,
+    request TEXT,
+    lost INTEGER,
+    ended TEXT,
+    state BLOB,
+    answer TEXT
+) STRICT
+"""
+
+log = logging.getLogger("placerec.sessions")
+
+
+@dataclass(frozen=True)
+class StoredSession:
+    """One row; times are seconds since 1970.
+
+    number, moment, request: of the last frame, as the robot counts it, when it was taken, the request that brought it.
+    lost: frames that are known to be lost by a restart.
+    ended: why the session is over; None while it lives.
+    state: as ``core.belief.record`` writes it; answer: the JSON last answered.
+    """
+
+    id: str
+    map: str
+    map_created_at: str
+    options: str
+    created: float
+    used: float
+    number: int | None = None
+    moment: float | None = None
+    request: str | None = None
+    lost: int | None = None
+    ended: str | None = None
+    state: bytes | None = None
+    answer: str | None = None
+
+
+COLUMNS = tuple(StoredSession.__dataclass_fields__)
+HEAD = COLUMNS[:-2]
+"""What is read of each session at the start; the rest when it goes on."""
+
+
+class SessionStore:
+    """The file in use; any thread may call any method.
+
+    Every method but ``close`` may raise ``sqlite3.Error``: the disk refuses.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Open the file, or make it; one that is damaged is put aside under ``sessions.sqlite.damaged``.
+
+        Raises:
+            StorageFull, StorageFailure: the disk refuses.
+        """
+        path = folder / FILE
+        self._lock = threading.Lock()
+        with refusals(f"open {path}"):
+            self._connection = self._opened_or_new(path)
+
+    def _opened_or_new(self, path: Path) -> sqlite3.Connection:
+        try:
+            return _opened(path)
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+            told = str(error)
+            if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
+                raise  # the disk refuses, which says nothing of the file
+            log.error("%s cannot be read and is put aside; its sessions are lost: %s", FILE, error)
+            for suffix in ("-wal", "-shm"):
+                path.with_name(FILE + suffix).unlink(missing_ok=True)
+            path.replace(path.with_name(FILE + ".damaged"))
+            return _opened(path)
+
+    def close(self) -> None:
+        """Write the log back and let the file go."""
+        with self._lock:
+            self._connection.close()
+
+    def all(self) -> list[StoredSession]:
+        """All sessions, those that have ended too, without states and answers."""
+        with self._lock:
+            found = self._connection.execute(f"SELECT {', '.join(HEAD)} FROM sessions").fetchall()
+        return [StoredSession(*row) for row in found]
+
+    def read(self, session_id: str) -> StoredSession | None:
+        """One session whole."""
+        with self._lock:
+            row = self._connection.execute(
+                f"SELECT {', '.join(COLUMNS)} FROM sessions WHERE id = ?", [session_id]
+            ).fetchone()
+        return None if row is None else StoredSession(*row)
+
+    def write(self, session: StoredSession) -> None:
+        """Put a session in place of what was there of it."""
+        marks = ", ".join("?" * len(COLUMNS))
+        values = [getattr(session, name) for name in COLUMNS]
+        with self._lock:
+            self._connection.execute(f"INSERT OR REPLACE INTO sessions VALUES ({marks})", values)
+
+    def renew(self, session: StoredSession) -> bool:
+        """The same, unless it was forgotten or has ended meanwhile; whether it was there."""
+        assignments = ", ".join(f"{name} = ?" for name in COLUMNS)
+        values = [getattr(session, name) for name in COLUMNS]
+        with self._lock, closing(self._connection.cursor()) as cursor:
+            cursor.execute(f"UPDATE sessions SET {assignments} WHERE id = ? AND ended IS NULL", [*values, session.id])
+            return cursor.rowcount > 0
+
+    def end(self, session_id: str, reason: str, moment: float) -> None:
+        """Remember that, when and why a session ended, and nothing else of it."""
+        with self._lock:
+            self._connection.execute(
+                "UPDATE sessions SET ended = ?, used = ?, state = NULL, answer = NULL WHERE id = ?",
+                [reason, moment, session_id],
+            )
+
+    def forget(self, session_id: str) -> None:
+        """Remove all trace of a session."""
+        with self._lock:
+            self._connection.execute("DELETE FROM sessions WHERE id = ?", [session_id])
+
+
+def _opened(path: Path) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
+        with closing(connection.execute("PRAGMA user_version")) as cursor:
+            (version,) = cursor.fetchone()
+        if version == 0:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute(_SCHEMA)
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {FORMAT}")
+            connection.execute("COMMIT")
+        elif version != FORMAT:
+            raise sqlite3.DatabaseError(f"it is of format {version}, not {FORMAT}")
+        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
+            if line != "ok":
+                raise sqlite3.DatabaseError(line)
+        connection.execute(f"SELECT {', '.join(HEAD)} FROM sessions").fetchall()
+        connection.execute(f"SELECT {', '.join(COLUMNS)} FROM sessions LIMIT 1").fetchall()
+        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
+        connection.execute("UPDATE sessions SET id = id WHERE false")
+    except BaseException:
+        connection.close()
+        raise
+    return connection

@@ -1,0 +1,142 @@
+"""What Prometheus scrapes: requests, queue, encoding stages, searches, and the answers of each map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from typing import get_args
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+from prometheus_client.core import GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from core.judgement.verdict import Verdict
+
+FAST = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5)
+SECONDS = (*FAST, 5.0, 10.0, 30.0)
+SCORES = tuple(round(0.05 * step, 2) for step in range(-2, 21))
+TOGETHER = (1, 2, 4, 8, 16, 32, 64, 128)
+ITEMS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
+
+
+class MapCollector(Collector):
+    """Gauges that are read from the maps when somebody scrapes.
+
+    Args:
+        count_places: gives the number of places of each map.
+        count_quarantined: gives the number of maps out of service.
+    """
+
+    def __init__(self, count_places: Callable[[], Mapping[str, int]], count_quarantined: Callable[[], int]) -> None:
+        self._count_places, self._count_quarantined = count_places, count_quarantined
+
+    def collect(self) -> Iterable[Metric]:
+        places = GaugeMetricFamily("placerec_map_places", "Places of a map.", labels=["map"])
+        for name, count in self._count_places().items():
+            places.add_metric([name], count)
+        yield places
+        quarantined = GaugeMetricFamily("placerec_quarantined_maps", "Maps that are damaged and out of service.")
+        quarantined.add_metric([], self._count_quarantined())
+        yield quarantined
+
+
+class Metrics:
+    """All series of one application, in a registry of its own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry(auto_describe=False)
+        self._requests: dict[tuple[str, str, int], Histogram] = {}
+        self._stages: dict[str, Histogram] = {}
+        self._verdicts: dict[tuple[str, str], Counter] = {}
+        self._scores: dict[str, Histogram] = {}
+        ProcessCollector(registry=self.registry)
+        self.requests = Histogram(
+            "placerec_request_seconds",
+            "Time from a request's arrival to the end of its answer.",
+            ["route", "method", "status"],
+            buckets=SECONDS,
+            registry=self.registry,
+        )
+        self.queue = Gauge(
+            "placerec_queue_length", "Requests that wait for the encoder or are in it.", registry=self.registry
+        )
+        self.under_way = Gauge(
+            "placerec_requests_under_way", "Requests and WebSockets that are being answered.", registry=self.registry
+        )
+        self.commits = Histogram(
+            "placerec_commit_seconds",
+            "Time of one commit of enrolled frames, until all of it is synced to the disk.",
+            buckets=SECONDS,
+            registry=self.registry,
+        )
+        self.problems = Counter(
+            "placerec_problems", "Requests that ended in a problem, by its type.", ["type"], registry=self.registry
+        )
+        self.stages = Histogram(
+            "placerec_encode_stage_seconds",
+            "Time of one stage of encoding a frame.",
+            ["stage"],
+            buckets=FAST,
+            registry=self.registry,
+        )
+        self.encoded_together = Histogram(
+            "placerec_encoded_together",
+            "Frames that waited together and were encoded together.",
+            buckets=TOGETHER,
+            registry=self.registry,
+        )
+        self.searches = Histogram(
+            "placerec_search_seconds", "Time of a search in one map.", buckets=FAST, registry=self.registry
+        )
+        self.batches = Histogram(
+            "placerec_batch_items",
+            "Frames in one multipart request.",
+            ["operation"],
+            buckets=ITEMS,
+            registry=self.registry,
+        )
+        self.scores = Histogram(
+            "placerec_best_score", "Best score of a query.", ["map"], buckets=SCORES, registry=self.registry
+        )
+        self.verdicts = Counter(
+            "placerec_verdicts", "Queries by their verdict.", ["map", "verdict"], registry=self.registry
+        )
+
+    def observe_request(self, route: str, method: str, status: int, seconds: float) -> None:
+        """Count one request."""
+        key = (route, method, status)
+        if key not in self._requests:  # looking a series up costs more than counting in it
+            self._requests[key] = self.requests.labels(route, method, str(status))
+        self._requests[key].observe(seconds)
+
+    def observe_stages(self, milliseconds: Mapping[str, float]) -> None:
+        """Count the stages of one encoding."""
+        for stage, duration in milliseconds.items():
+            if stage not in self._stages:
+                self._stages[stage] = self.stages.labels(stage)
+            self._stages[stage].observe(duration / 1e3)
+
+    def observe_answer(self, map_id: str, verdict: str, score: float | None) -> None:
+        """Count the answer to one query."""
+        key = (map_id, verdict)
+        if key not in self._verdicts:
+            self._verdicts[key] = self.verdicts.labels(map_id, verdict)
+        self._verdicts[key].inc()
+        if score is not None:
+            if map_id not in self._scores:
+                self._scores[map_id] = self.scores.labels(map_id)
+            self._scores[map_id].observe(score)
+
+    def forget_map(self, map_id: str) -> None:
+        """Drop the series of a deleted map."""
+        self._scores.pop(map_id, None)
+        with suppress(KeyError):
+            self.scores.remove(map_id)
+        for verdict in get_args(Verdict):
+            self._verdicts.pop((map_id, verdict), None)
+            with suppress(KeyError):
+                self.verdicts.remove(map_id, verdict)
+
+    def expose(self) -> bytes:
+        """The text that Prometheus reads."""
+        return generate_latest(self.registry)

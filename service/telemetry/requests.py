@@ -1,0 +1,233 @@
+"""Around every request: its id, its trace, its log line, its place in the histogram, the answer when all else fails."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import logging.config
+import random
+import re
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any
+
+from starlette.datastructures import MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors.faults import Stopping
+from service.errors.problems import problem_response
+from service.telemetry.metrics import Metrics
+from service.telemetry.traces import Origin, Trace, origin, read_trace
+
+_ids = random.Random()
+"""Ids need to differ, not to be secret: asking the system for each one's bytes would cost more than all of its use."""
+
+REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:-]{0,127}")
+UNMATCHED = "(none)"
+METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "color_message"}
+
+LONGEST_PATH = 300
+LONGEST_TEXT, LONGEST_TRACEBACK = 4096, 32_768
+"""Characters of one value of a line of the log: nothing that a caller sends makes a line of megabytes."""
+
+log = logging.getLogger("placerec.requests")
+
+
+class JsonLines(logging.Formatter):
+    """One JSON object a line: time, level, logger, message, and what the caller put in ``extra``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        moment = datetime.fromtimestamp(record.created, UTC)
+        line: dict[str, Any] = {
+            "time": moment.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": cut(record.getMessage(), LONGEST_TEXT),
+        }
+        request = origin.get()
+        if request is not None:
+            line["request_id"] = request.request_id
+            if request.trace_id is not None:
+                line["trace_id"] = request.trace_id
+        for name, value in record.__dict__.items():
+            if name not in FIELDS:
+                line[name] = cut(value, LONGEST_TEXT) if isinstance(value, str) else value
+        if record.exc_info:
+            line["exception"] = cut(self.formatException(record.exc_info), LONGEST_TRACEBACK)
+        return json.dumps(line, default=lambda value: cut(str(value), LONGEST_TEXT))
+
+
+def cut(text: str, longest: int) -> str:
+    """The text, or its first characters and how many more there were."""
+    return text if len(text) <= longest else f"{text[:longest]}… ({len(text) - longest} more)"
+
+
+def configure_logging(level: str) -> None:
+    """Send the service's and the server's logs to standard error as JSON lines."""
+    # In detail the server would tell the heads of requests, and with them keys.
+    servers = "INFO" if level == "debug" else level.upper()
+    logging.config.dictConfig(
+        {
+            "version": 1,
+            "disable_existing_loggers": False,
+            "formatters": {"json": {"()": JsonLines}},
+            "handlers": {"stderr": {"class": "logging.StreamHandler", "formatter": "json"}},
+            "root": {"handlers": ["stderr"], "level": "WARNING"},
+            "loggers": {
+                "placerec": {"level": level.upper()},
+                # Whatever the level of the other logs: who changed what, and who is let in.
+                "placerec.audit": {"level": "INFO"},
+                "placerec.access": {"level": "INFO"},
+                "core": {"level": level.upper()},
+                "uvicorn": {"handlers": [], "level": servers, "propagate": True},
+                "uvicorn.error": {"handlers": [], "level": servers, "propagate": True},
+                # Each request, each WebSocket and each refusal of a connection has a line of our own.
+                "uvicorn.streams": {"handlers": [], "level": "WARNING", "propagate": True},
+                "uvicorn.http": {"handlers": [], "level": "ERROR", "propagate": True},
+                "uvicorn.access": {"handlers": [], "level": "CRITICAL", "propagate": False},
+                # Broken forms are the caller's affair.
+                "python_multipart": {"level": "CRITICAL"},
+            },
+        }
+    )
+
+
+def request_id(headers: list[tuple[bytes, bytes]]) -> str:
+    """The caller's ``X-Request-Id`` if it is a plain one, else a new id."""
+    for name, value in headers:
+        if name == b"x-request-id":
+            given = value.decode("latin-1")
+            if REQUEST_ID.fullmatch(given):
+                return given
+    return f"{_ids.getrandbits(128):032x}"
+
+
+class Telemetry:
+    """Outermost ASGI layer of the application.
+
+    Sets ``request_id``, ``started`` (``time.monotonic``), ``trace`` and ``trace_id`` (None outside of a trace) in the
+    request's state, returns the ids in ``X-Request-Id`` and ``traceresponse``, and answers GET's route for HEAD (the
+    server drops the body).
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self.app, self.metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        state = scope.setdefault("state", {})
+        state["request_id"], state["started"] = request_id(scope["headers"]), time.monotonic()
+        trace = state["trace"] = read_trace(scope["headers"])
+        state["trace_id"] = trace.trace_id if trace is not None else None
+        token = origin.set(Origin(state["request_id"], state["trace_id"]))
+        self.metrics.under_way.inc()
+        try:
+            await (self._stream if scope["type"] == "websocket" else self._answer)(scope, receive, send)
+        finally:
+            self.metrics.under_way.dec()
+            origin.reset(token)
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        method, state = scope["method"], scope["state"]
+        inner = {**scope, "method": "GET"} if method == "HEAD" else scope
+        state["method"] = method  # for routes whose answer is long to make
+        status, sent = 0, 0
+
+        async def send_marked(message: Message) -> None:
+            nonlocal status, sent
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                _mark(message, state["request_id"], state["trace"])
+            elif message["type"] == "http.response.body":
+                sent += len(message.get("body", b""))
+            await send(message)
+
+        try:
+            await self.app(inner, receive, send_marked)
+        except asyncio.CancelledError:  # by the server, which cannot wait any longer
+            if status:
+                raise
+            stopped = Stopping("The service stopped before the request was done; whether it was, is not known.")
+            await problem_response(Request(inner), stopped)(inner, receive, send_marked)
+        except Exception as error:  # a defect of ours: logged there, and told to nobody else
+            if status:
+                log.exception("the answer broke off", extra={"request_id": state["request_id"]})
+            else:
+                await problem_response(Request(inner), error)(inner, receive, send_marked)
+        finally:
+            self._record(inner, method, status, sent)
+
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """A WebSocket: one line at its end."""
+        counts = {"messages_in": 0, "messages_out": 0}
+        status = 0
+
+        async def receive_counted() -> Message:
+            message = await receive()
+            counts["messages_in"] += message["type"] == "websocket.receive"
+            return message
+
+        async def send_counted(message: Message) -> None:
+            nonlocal status
+            counts["messages_out"] += message["type"] == "websocket.send"
+            if message["type"] == "websocket.accept":
+                status = 101
+            elif message["type"] == "websocket.http.response.start":
+                status = message["status"]
+            if message["type"] in ("websocket.accept", "websocket.http.response.start"):
+                _mark(message, scope["state"]["request_id"], scope["state"]["trace"])
+            await send(message)
+
+        with suppress(asyncio.CancelledError):
+            try:
+                await self.app(scope, receive_counted, send_counted)
+            finally:
+                self._log("stream", scope, "GET", status, counts)
+
+    def _record(self, scope: Scope, method: str, status: int, sent: int) -> None:
+        state = scope["state"]
+        route = getattr(scope.get("route"), "path", UNMATCHED)
+        counted = method if method in METHODS else "OTHER"
+        self.metrics.observe_request(route, counted, status, time.monotonic() - state["started"])
+        if "problem" in state:
+            self.metrics.problems.labels(state["problem"]).inc()
+        self._log("request", scope, method, status, {"bytes_in": state.get("bytes_in", 0), "bytes_out": sent})
+
+    def _log(self, message: str, scope: Scope, method: str, status: int, counts: dict[str, int]) -> None:
+        if not log.isEnabledFor(logging.INFO):
+            return
+        state, client = scope["state"], scope.get("client")
+        trace: Trace | None = state["trace"]
+        spans = {} if trace is None else {"span_id": trace.span_id, "parent_id": trace.parent_id}
+        noted = {"problem": state["problem"]} if "problem" in state else {}
+        log.info(
+            message,
+            extra={
+                "request_id": state["request_id"],
+                "method": method if method in METHODS else cut(method, 20),
+                "path": cut(scope["path"], LONGEST_PATH),
+                "route": getattr(scope.get("route"), "path", UNMATCHED),
+                "status": status,
+                "milliseconds": round((time.monotonic() - state["started"]) * 1e3, 2),
+                **counts,
+                "client": client[0] if client else None,
+                **({"principal": state["principal"].name} if "principal" in state else {}),
+                **spans,
+                **noted,
+                **state.get("noted", {}),
+            },
+        )
+
+
+def _mark(message: Message, request_id: str, trace: Trace | None) -> None:
+    headers = MutableHeaders(scope=message)
+    headers["X-Request-Id"] = request_id
+    headers["X-Content-Type-Options"] = "nosniff"
+    if trace is not None:
+        headers["traceresponse"] = trace.response

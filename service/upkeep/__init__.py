@@ -1,0 +1,1 @@
+"""Looking after maps: health, pruning, merging, re-encoding."""

@@ -1,0 +1,250 @@
+"""How a map does: answers counted over the weeks, its own frames held against it, its sequences walked along."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.method.encoder import Encoder
+from core.storage import Map
+from core.upkeep import coverage, hubness
+from core.upkeep.coverage import Gap, Measure
+from core.upkeep.drift import Trend, score_trend, unknown_trend
+from core.upkeep.hubness import Alias
+from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
+from service.places.own_frames import TOGETHER, OwnFrames, spread
+from service.upkeep.schemas import (
+    AliasingView,
+    AliasView,
+    AnswersView,
+    GapView,
+    HubView,
+    MapHealth,
+    SilentPlaces,
+    StretchView,
+    TrendView,
+    WeekView,
+)
+from service.upkeep.statistics import Statistics
+
+HALF = 0.5
+"""Of the time: the map's frames are held against it first, then its sequences are walked along."""
+
+STEPS_TOGETHER = 64
+
+SIGN_OF: dict[Measure, Reason] = {"distance": "distance-gap", "time": "time-gap", "similarity": "similarity-gap"}
+
+
+@dataclass(frozen=True)
+class _Walk:
+    """One sequence: positions in order, and what is out of the ordinary along it."""
+
+    name: str
+    positions: NDArray[np.int64]
+    gaps: list[Gap]
+
+
+@dataclass(frozen=True)
+class _Aliasing:
+    examined: int
+    neighbours: int
+    counts: NDArray[np.int64]
+    hubs: NDArray[np.int64]
+    aliases: list[Alias]
+
+
+def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds: float, limit: int) -> MapHealth:
+    """The report on a map.
+
+    Args:
+        encoder: that of the map.
+        seconds: to look at the map's frames; of a large one only a part, spread over it, is looked at then.
+        limit: most places, gaps and stretches that are named each.
+
+    Raises:
+        MapQuarantined, StorageFailure, UnknownMap: it cannot be read.
+    """
+    began = time.monotonic()
+    own = OwnFrames(map_, encoder)
+    aliasing = _aliasing(own, began + HALF * seconds)
+    walks, all_walked = _walks(own, began + seconds)
+    silent = [i for i, place in enumerate(own.places) if place.id not in statistics.places]
+    names = [place.id for place in own.places]
+    listed = [
+        GapView(
+            sequence=walk.name,
+            before=names[walk.positions[gap.before]],
+            after=names[walk.positions[gap.before + 1]],
+            measure=gap.measure,
+            value=gap.value,
+            median=gap.median,
+            severity=gap.severity,
+        )
+        for walk in walks
+        for gap in walk.gaps
+    ]
+    listed.sort(key=lambda gap: -gap.severity)
+    return MapHealth(
+        map=map_.record.id,
+        places=len(own),
+        complete=all_walked and aliasing.examined == len(own),
+        answers=_answers(statistics),
+        never_matched=_silent(own, statistics, silent, limit),
+        aliasing=_shown(own, aliasing, statistics, limit),
+        gaps=listed[:limit],
+        gap_count=len(listed),
+        retraverse=_retraverse(own, walks, aliasing, statistics, set(silent))[:limit],
+    )
+
+
+def _answers(statistics: Statistics) -> AnswersView:
+    weeks = statistics.weeks
+    shown = [
+        WeekView(
+            monday=week.monday,
+            queries=week.queries,
+            recognized=week.recognized,
+            ambiguous=week.ambiguous,
+            unknown=week.unknown,
+            blank=week.blank,
+            unknown_rate=week.unknown_rate(),
+            mean_score=week.mean_score(),
+            mean_decision=week.mean_decision(),
+            scores=list(week.bins),
+        )
+        for week in weeks
+    ]
+    return AnswersView(
+        since=statistics.since,
+        queries=sum(week.queries for week in weeks),
+        recognized=sum(week.recognized for week in weeks),
+        ambiguous=sum(week.ambiguous for week in weeks),
+        unknown=sum(week.unknown for week in weeks),
+        weeks=shown,
+        score_trend=_trend(score_trend(weeks)),
+        unknown_trend=_trend(unknown_trend(weeks)),
+    )
+
+
+def _trend(found: Trend | None) -> TrendView | None:
+    return None if found is None else TrendView(**asdict(found), significant=found.significant)
+
+
+def _silent(own: OwnFrames, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
+    asked = sum(week.compared for week in statistics.weeks)
+    if not asked or not len(own):
+        return None
+    ordered = sorted(silent, key=lambda i: own.places[i].number)
+    by_chance = len(own) * math.exp(-asked / len(own))  # none of so many, had each been drawn from all places
+    return SilentPlaces(count=len(silent), by_chance=by_chance, places=[own.places[i].id for i in ordered[:limit]])
+
+
+def _aliasing(own: OwnFrames, until: float) -> _Aliasing:
+    """Which places are among the most alike others of many, and which look more like others than like their own."""
+    k = min(hubness.NEIGHBOURS, max(1, len(own) // 10))
+    order = spread(len(own)).tolist()
+    lists: list[NDArray[np.int64]] = [np.empty((0, k), np.int64)]
+    aliases: list[Alias] = []
+    everything = np.arange(len(own))
+    done = 0
+    while done < len(order) and (not done or time.monotonic() < until):
+        some = order[done : done + TOGETHER]
+        for position, others, scores in own.search(some):
+            same = own.near(position, others)
+            best, found = hubness.nearest_others(scores, same, k)
+            lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is the index of the last
+            mine = float(scores[same].max()) if same.any() else None
+            has_own = same.any() or own.near(position, everything[everything != position]).any()
+            if best[0] != hubness.NONE and has_own and (mine is None or found[0] > mine):
+                aliases.append(Alias(position, int(others[best[0]]), float(found[0]), mine))
+        done += len(some)
+    counts = hubness.occurrences(np.concatenate(lists), len(own))
+    aliases.sort(key=lambda alias: -alias.score)
+    return _Aliasing(done, k, counts, hubness.hubs(counts), aliases)
+
+
+def _shown(own: OwnFrames, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
+    names = [place.id for place in own.places]
+    counted = [statistics.places.get(name) for name in names]
+    unsure = np.array([0 if count is None else count.best - count.recognized for count in counted], np.int64)
+    return AliasingView(
+        examined=found.examined,
+        of=len(own),
+        neighbours=found.neighbours,
+        skewness=hubness.skewness(found.counts),
+        hubs=_hubs(names, found.counts, limit),
+        aliases=[
+            AliasView(place=names[one.place], other=names[one.other], score=one.score, own=one.own)
+            for one in found.aliases[:limit]
+        ],
+        alias_count=len(found.aliases),
+        unsure=_hubs(names, unsure, limit),
+    )
+
+
+def _hubs(names: list[str], counts: NDArray[np.int64], limit: int) -> list[HubView]:
+    expected = float(counts.mean()) if len(counts) else 0.0
+    return [
+        HubView(place=names[i], count=int(counts[i]), expected=expected) for i in hubness.hubs(counts)[:limit].tolist()
+    ]
+
+
+def _walks(own: OwnFrames, until: float) -> tuple[list[_Walk], bool]:
+    """Every sequence from its first frame to its last; False if some was walked without looking at the frames."""
+    by_name: dict[str | None, list[int]] = {}
+    for position, place in enumerate(own.places):
+        by_name.setdefault(place.sequence, []).append(position)
+    walks, complete = [], True
+    for name, members in by_name.items():
+        if name is None:  # these were not taken one after the other
+            continue
+        ordered = np.array(sorted(members, key=lambda i: own.places[i].ordinal), np.int64)
+        where = own.where.take(ordered)
+        gaps = coverage.long_steps(coverage.distances(where), "distance")
+        gaps += coverage.long_steps(coverage.durations(where), "time")
+        similarities, seen = _similarities(own, ordered, until)
+        gaps += coverage.unlike_steps(similarities)
+        complete = complete and seen
+        walks.append(_Walk(name, ordered, gaps))
+    return walks, complete
+
+
+def _similarities(own: OwnFrames, ordered: NDArray[np.int64], until: float) -> tuple[NDArray[np.float64], bool]:
+    """How alike each frame looks to the next; NaN behind where the time was up."""
+    found = np.full(max(0, len(ordered) - 1), np.nan)
+    pairs = np.stack([ordered[:-1], ordered[1:]], axis=1)
+    for first in range(0, len(pairs), STEPS_TOGETHER):
+        if time.monotonic() > until:
+            return found, False
+        found[first : first + STEPS_TOGETHER] = own.alike(pairs[first : first + STEPS_TOGETHER])
+    return found, True
+
+
+def _retraverse(
+    own: OwnFrames, walks: list[_Walk], aliasing: _Aliasing, statistics: Statistics, silent: set[int]
+) -> list[StretchView]:
+    """Stretches where several signs come together, the weightiest first."""
+    aliased, hubs = {alias.place for alias in aliasing.aliases}, set(aliasing.hubs.tolist())
+    made = []
+    for walk in walks:
+        signs = [Sign(gap.before, gap.before + 1, SIGN_OF[gap.measure]) for gap in walk.gaps]
+        for index, position in enumerate(walk.positions.tolist()):
+            signs += [Sign(index, index, "aliased")] if position in aliased else []
+            signs += [Sign(index, index, "hub")] if position in hubs else []
+        if statistics.places:
+            signs += silent_runs(position not in silent for position in walk.positions.tolist())
+        made += [
+            StretchView(
+                sequence=walk.name,
+                first=own.places[walk.positions[stretch.first]].id,
+                last=own.places[walk.positions[stretch.last]].id,
+                reasons=list(stretch.reasons),
+                weight=stretch.weight,
+            )
+            for stretch in stretches(signs)
+        ]
+    return sorted(made, key=lambda stretch: -stretch.weight)

@@ -1,0 +1,142 @@
+"""FAB-MAP's likelihood against sums over all that could be, on a vocabulary of four words."""
+
+from __future__ import annotations
+
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+
+from core.baselines.chow_liu import Tree
+from core.baselines.fabmap import (
+    P_Z_GIVEN_E,
+    P_Z_GIVEN_NOT_E,
+    FabMap,
+    local_features,
+    log_likelihoods,
+    log_odds,
+)
+from core.baselines.system import Trainable
+from core.errors import InvalidModel
+from core.frames.preprocessing import Pixels
+
+TREE = Tree(
+    parents=np.array([0, 0, 1, 1]),
+    marginals=np.array([0.4, 0.3, 0.5, 0.2]),
+    given=np.array([[0.4, 0.2, 0.35, 0.1], [0.4, 0.45, 0.85, 0.43]]),
+)
+PLACES = np.array([[1, 0, 0, 1], [1, 1, 1, 0], [0, 0, 0, 0]], np.bool_)
+FRAMES = [np.array(values, np.bool_) for values in itertools.product((False, True), repeat=4)]
+
+
+def detector(z: bool, e: bool) -> float:
+    seen = P_Z_GIVEN_E if e else P_Z_GIVEN_NOT_E
+    return seen if z else 1 - seen
+
+
+def marginal(q: int, z: bool) -> float:
+    return TREE.marginals[q] if z else 1 - TREE.marginals[q]
+
+
+def conditional(q: int, z: bool, above: bool) -> float:
+    one = TREE.given[int(above), q]
+    return one if z else 1 - one
+
+
+def observation(q: int, z: bool, e: bool, above: bool) -> float:
+    """p(z_q | e_q, z_parent) in the form the paper gives it, 1 / (1 + α / β)."""
+    alpha = marginal(q, z) * detector(not z, e) * conditional(q, not z, above)
+    beta = marginal(q, not z) * detector(z, e) * conditional(q, z, above)
+    return beta / (alpha + beta)
+
+
+def likelihood(frame: np.ndarray, there: list[float]) -> float:
+    """p(Z | L) by a sum over every combination of what may exist at the place."""
+    total = 0.0
+    for exists in itertools.product((False, True), repeat=4):
+        product = 1.0
+        for q, e in enumerate(exists):
+            product *= there[q] if e else 1 - there[q]
+            product *= observation(q, bool(frame[q]), e, bool(frame[TREE.parents[q]]))
+        total += product
+    return total
+
+
+def belief(place: np.ndarray) -> list[float]:
+    """p(e_q = 1 | L) by Bayes, its prior the word's marginal."""
+    found = []
+    for q, z in enumerate(place):
+        there, absent = detector(z, True) * marginal(q, True), detector(z, False) * marginal(q, False)
+        found.append(there / (there + absent))
+    return found
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_likelihoods_are_those_of_the_sum_over_everything(frame: np.ndarray) -> None:
+    expected = [likelihood(frame, belief(place)) for place in PLACES] + [likelihood(frame, list(TREE.marginals))]
+    np.testing.assert_allclose(np.exp(log_likelihoods(frame, PLACES, TREE)), expected, rtol=1e-9)
+
+
+def test_likelihoods_of_all_frames_add_up_to_one() -> None:
+    total = sum(np.exp(log_likelihoods(frame, PLACES, TREE)) for frame in FRAMES)
+    np.testing.assert_allclose(total, 1, rtol=1e-9)
+
+
+def test_log_odds_are_those_of_the_posterior() -> None:
+    likelihoods = np.array([-3.0, -1.0, -2.5, -1.5])
+    posterior = np.exp(likelihoods) / np.exp(likelihoods).sum()
+    np.testing.assert_allclose(log_odds(likelihoods), np.log(posterior / (1 - posterior))[:-1], rtol=1e-12)
+
+
+def test_log_odds_tell_certain_matches_apart() -> None:
+    sure, surer = log_odds(np.array([0.0, -800.0, -900.0])), log_odds(np.array([0.0, -1200.0, -1300.0]))
+    np.testing.assert_allclose(sure, [800, -800])
+    np.testing.assert_allclose(surer, [1200, -1200])
+
+
+def scene(seed: int) -> Pixels:
+    """A picture full of corners: random rectangles."""
+    generator = np.random.default_rng(seed)
+    canvas = np.full((120, 160, 3), 128, np.uint8)
+    for _ in range(60):
+        x, y, width, height = generator.integers((0, 0, 5, 5), (150, 110, 40, 40)).tolist()
+        cv2.rectangle(canvas, (x, y), (x + width, y + height), generator.integers(0, 255, 3).tolist(), -1)
+    return canvas
+
+
+def test_places_are_recognized_after_training() -> None:
+    system = FabMap()
+    assert isinstance(system, Trainable)
+    untrained = system.identity
+    places = [scene(seed) for seed in range(12)]
+    system.train((scene(seed) for seed in range(100, 130)), seed=0)
+    assert system.identity != untrained
+
+    index = system.index([system.describe(place) for place in places])
+    moved = [np.ascontiguousarray(np.roll(place, 3, axis=1)) for place in places]
+    scores = index.compare([system.describe(place) for place in moved])
+    assert scores.shape == (12, 12) and scores.dtype == np.float32 and np.isfinite(scores).all()
+    assert (scores.argmax(axis=1) == np.arange(12)).mean() > 0.9
+
+
+def test_a_blank_frame_and_a_single_place_have_scores() -> None:
+    system = FabMap()
+    system.train([scene(1), scene(2)], seed=0)
+    blank = system.describe(np.zeros((120, 160, 3), np.uint8))
+    assert np.isfinite(system.index([system.describe(scene(1))]).compare([blank])).all()
+
+
+def test_large_frames_are_shrunk_first() -> None:
+    grey = cv2.resize(scene(1)[:, :, 0], (1280, 960), interpolation=cv2.INTER_CUBIC)
+    shrunk = cv2.resize(grey, (640, 480), interpolation=cv2.INTER_AREA)
+    large, small = (local_features(np.asarray(np.dstack([picture] * 3), np.uint8)) for picture in (grey, shrunk))
+    assert len(small) > 10
+    np.testing.assert_array_equal(large, small)
+
+
+def test_a_system_without_training_or_features_says_so() -> None:
+    with pytest.raises(InvalidModel, match="no training picture"):
+        FabMap().train([np.zeros((64, 64, 3), np.uint8)], seed=0)
+    with pytest.raises(InvalidModel, match="train it"):
+        FabMap().describe(scene(1))

@@ -1,0 +1,91 @@
+"""The packaged default on real frames: places that the map lost are not recognized, others still are."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.evaluation import auc_pr
+from core.frames.images import decode
+from core.frames.traverses import find_images
+from core.judgement.verdict import Neighborhood, Whereabouts, judge
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder, Encoding
+
+CORRIDOR = Path(__file__).parents[4] / "shared/datasets/eval/corridor"
+MAP_DEFAULTS = Neighborhood(radius=5.0, frames=3)
+
+pytestmark = pytest.mark.skipif(not CORRIDOR.is_dir(), reason="the corridor images are not on this machine")
+
+
+@pytest.fixture(scope="module")
+def encoder() -> Encoder:
+    return EncoderCatalogue().get(DEFAULT_ENCODER)
+
+
+def encode(encoder: Encoder, folder: Path) -> list[Encoding]:
+    frames = [decode(path.read_bytes()) for path in find_images(folder)]
+    batches = [frames[start : start + 8] for start in range(0, len(frames), 8)]
+    return [encoding for batch in batches for encoding in encoder.encode_batch(batch)]
+
+
+@pytest.fixture(scope="module")
+def queries(encoder: Encoder) -> list[Encoding]:
+    return encode(encoder, CORRIDOR / "query")
+
+
+@pytest.fixture(scope="module")
+def references(encoder: Encoder) -> list[Encoding]:
+    return encode(encoder, CORRIDOR / "ref")
+
+
+@pytest.fixture(scope="module")
+def truth() -> NDArray[np.bool_]:
+    with (CORRIDOR / "ground_truth.csv").open() as file:
+        pairs = [(int(row["query"]), int(row["reference"])) for row in csv.DictReader(file)]
+    true = np.zeros((111, 111), np.bool_)
+    true[tuple(np.transpose(pairs))] = True
+    return true
+
+
+def answers(encoder: Encoder, queries: list[Encoding], references: list[Encoding]) -> NDArray[np.float32]:
+    """The scores of both stages, Q x R."""
+    products = np.stack([one.descriptor for one in queries]) @ np.stack([one.descriptor for one in references]).T
+    asked, known = (np.stack([one.local for one in side]) for side in (queries, references))
+    return encoder.with_agreement(encoder.scores_from_inner_products(products), asked, known)
+
+
+def test_the_default_is_ahead_of_every_published_technique(
+    encoder: Encoder, queries: list[Encoding], references: list[Encoding], truth: NDArray[np.bool_]
+) -> None:
+    scores = answers(encoder, queries, references)
+    best = scores.argmax(axis=1)
+    right = truth[np.arange(len(best)), best]
+    assert auc_pr(scores.max(axis=1), right) >= 0.96  # AMOSNet 0.954
+    assert right.mean() >= 0.90  # HybridNet 0.901
+
+
+def test_verdicts_with_the_second_half_of_the_references_left_out(
+    encoder: Encoder, queries: list[Encoding], references: list[Encoding], truth: NDArray[np.bool_]
+) -> None:
+    kept = len(references) // 2
+    scores = answers(encoder, queries, references[:kept])
+    known = [bool(row.any()) for row in truth[:, :kept]]
+    refused, found = 0, 0
+    for query, row in enumerate(scores):
+        order = np.argsort(-row, kind="stable")
+        frames = Whereabouts(
+            np.zeros(kept, np.int8), np.zeros((kept, 3)), np.zeros(kept, np.int32), order.astype(np.int64)
+        )
+        judgement = judge(row[order], frames, encoder.calibration, MAP_DEFAULTS, encoder.candidates)
+        recognized = judgement.verdict == "recognized"
+        refused += int(not known[query] and not recognized)
+        found += int(known[query] and recognized and truth[query, order[0]])
+
+    shares = refused / known.count(False), found / known.count(True)
+    assert shares[0] >= 0.6, shares
+    assert shares[1] >= 0.25, shares

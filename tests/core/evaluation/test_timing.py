@@ -1,0 +1,69 @@
+"""The clockwork of the benchmarks."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from core.evaluation.timing import LAYOUTS, encoding_runs, forward_passes, jpeg, medians, sample_picture
+from core.frames.images import decode
+from core.method.catalogue import EncoderCatalogue
+from core.method.encoder import Encoder
+from core.networks.backbone import PluggedNetwork
+
+
+@pytest.fixture(scope="module")
+def encoder() -> Encoder:
+    return EncoderCatalogue().get("region-vlad")
+
+
+def test_runs_take_turns_and_the_warm_up_does_not_count() -> None:
+    order: list[str] = []
+
+    def first() -> None:
+        order.append("a")
+        time.sleep(0.2 if len(order) == 1 else 0.02)
+
+    times = medians({"a": first, "b": lambda: order.append("b")}, rounds=3, warm_up=1)
+    assert order == ["a", "b"] * 4
+    assert 20 <= times["a"] < 190
+    assert times["b"] < times["a"]
+
+
+def test_the_picture_is_that_of_a_camera() -> None:
+    data = jpeg(sample_picture())
+    assert data == jpeg(sample_picture())
+    assert decode(data).shape == (480, 640, 3)
+    assert 30_000 < len(data) < 300_000
+
+
+def test_the_bare_passes_compute_what_the_encoder_computes(encoder: Encoder) -> None:
+    pixels = sample_picture(3)
+    passes = forward_passes(encoder, pixels)
+    assert set(passes) == set(LAYOUTS)
+    wanted = encoder.extractor.activations([pixels])[0]
+    for run in passes.values():
+        found = run()
+        assert isinstance(found, tuple)
+        for ours, layer in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(ours[0].permute(1, 2, 0).numpy(), layer, atol=1e-3)
+
+
+def test_the_runs_leave_the_encoder_as_it_was(encoder: Encoder) -> None:
+    backbone = encoder.extractor.backbone
+    assert isinstance(backbone, torch.nn.Module)
+    before = [tensor.clone() for tensor in backbone.state_dict().values()]
+    for run in encoding_runs(encoder, jpeg(sample_picture())).values():
+        run()
+    assert all(torch.equal(a, b) for a, b in zip(before, backbone.state_dict().values(), strict=True))
+
+
+def test_another_kind_of_backbone_is_refused(encoder: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    layer = torch.nn.Conv2d(3, 4, 3)
+    plugged = PluggedNetwork(torch.nn.Sequential(layer), ["0"], encoder.extractor.backbone.input, "a test's")
+    monkeypatch.setattr(encoder.extractor, "backbone", plugged)
+    with pytest.raises(TypeError, match="no torch module"):
+        forward_passes(encoder, sample_picture())

@@ -1,0 +1,142 @@
+"""A JPEG whose data ends before its picture is refused; one that is whole never is."""
+
+from __future__ import annotations
+
+import io
+import zlib
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from core.errors import InvalidImage, TruncatedImage
+from core.frames import images
+from core.frames.containers import read_header, read_structure
+from core.frames.images import decode
+from core.frames.truncation import may_be_filled, with_other_endings
+
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    "baseline": ("RGB", {}),
+    "unsubsampled": ("RGB", {"subsampling": 0}),
+    "progressive": ("RGB", {"progressive": True}),
+    "restarts": ("RGB", {"restart_marker_blocks": 4}),
+    "grey": ("L", {}),
+    "cmyk": ("CMYK", {}),
+}
+SHADES: dict[str, Any] = {"RGB": (128, 128, 128), "L": 128, "CMYK": (0, 0, 0, 127)}
+
+
+def photograph(seed: int, mode: str = "RGB", width: int = 160, height: int = 112, **options: Any) -> bytes:
+    """Noise over a slope: something in every block."""
+    random = np.random.default_rng(seed)
+    slope = np.linspace(20, 230, width)[None, :, None] * np.ones((height, 1, 3))
+    pixels = np.clip(slope + random.normal(0, 25, slope.shape), 0, 255).astype(np.uint8)
+    return saved(Image.fromarray(pixels).convert(mode), **options)
+
+
+def saved(image: Image.Image, **options: Any) -> bytes:
+    file = io.BytesIO()
+    image.save(file, "JPEG", **{"quality": 85, **options})
+    return file.getvalue()
+
+
+def scan_start(data: bytes) -> int:
+    return read_structure(data, read_header(data)).coded[0][0]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("share", [0.05, 0.4, 0.8])
+def test_data_that_was_lost_before_an_end_marker(way: str, share: float) -> None:
+    mode, options = WAYS[way]
+    data = photograph(1, mode, **options)
+    start = scan_start(data)
+    cut = data[: start + round(share * (len(data) - 2 - start))] + b"\xff\xd9"
+    with pytest.raises(TruncatedImage):
+        decode(cut)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("more", [16, 112, 1000])
+def test_a_header_that_announces_more_rows_than_there_are(way: str, more: int) -> None:
+    mode, options = WAYS[way]
+    data = bytearray(photograph(2, mode, **options))
+    frame = next(at for marker in (b"\xff\xc0", b"\xff\xc2") if (at := data.find(marker)) > 0)
+    data[frame + 5 : frame + 7] = (112 + more).to_bytes(2, "big")
+    with pytest.raises(TruncatedImage):
+        decode(bytes(data))
+
+
+def test_a_stretch_between_restart_markers_that_was_lost() -> None:
+    data = photograph(3, restart_marker_blocks=4)
+    first, second = data.index(b"\xff\xd2"), data.index(b"\xff\xd3")
+    with pytest.raises(TruncatedImage, match="stretch"):
+        decode(data[:first] + data[second:])
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("quality", [1, 30, 95])
+def test_whole_pictures_are_decoded_whatever_they_show(way: str, quality: int) -> None:
+    mode, options = WAYS[way]
+    for seed, (width, height) in enumerate([(16, 16), (57, 40), (161, 97)]):
+        assert decode(photograph(seed, mode, width, height, quality=quality, **options)).shape == (height, width, 3)
+        flat = Image.new(mode, (width, height), SHADES[mode])
+        assert decode(saved(flat, quality=quality, **options)).shape == (height, width, 3)
+
+
+def test_what_follows_the_data_of_a_whole_picture_changes_no_pixel() -> None:
+    for way in WAYS:
+        mode, options = WAYS[way]
+        data = photograph(4, mode, **options)
+        other = with_other_endings(data, read_structure(data, read_header(data)))
+        assert len(other) > len(data) + 100
+        np.testing.assert_array_equal(images._pixels(other), decode(data))
+
+
+def test_a_picture_is_decoded_twice_only_if_it_looks_filled() -> None:
+    plain = photograph(5)
+    assert not may_be_filled(read_structure(plain, read_header(plain)), decode(plain))
+    grey = saved(Image.new("RGB", (64, 64), (128, 128, 128)))
+    assert may_be_filled(read_structure(grey, read_header(grey)), decode(grey))
+
+
+@pytest.mark.parametrize(("width", "height"), [(64, 4), (4, 64), (1, 1), (7, 7), (2, 900), (8, 8), (9, 8)])
+def test_a_picture_that_is_smaller_than_a_block(width: int, height: int) -> None:
+    """A frame has no such sides, but the small picture of a panorama may."""
+    limits = images.Limits(min_side=1)
+    for image in (Image.new("RGB", (width, height), SHADES["RGB"]), Image.new("RGB", (width, height), "red")):
+        assert decode(saved(image), limits).shape == (height, width, 3)
+    data = photograph(9, width=width, height=height, quality=95)
+    assert decode(data, limits).shape == (height, width, 3)
+    if min(width, height) < 8 < max(width, height):
+        start = scan_start(data)
+        with pytest.raises(TruncatedImage):
+            decode(data[: start + (len(data) - start) // 3] + b"\xff\xd9", limits)
+
+
+@pytest.mark.parametrize("rows", [8, 16, 50])
+def test_filler_is_seen_at_every_place(rows: int) -> None:
+    data = photograph(6)
+    structure, pixels = read_structure(data, read_header(data)), decode(data).copy()
+    pixels[-rows:, -8:] = 128
+    assert may_be_filled(structure, pixels)
+
+
+def test_texts_and_profiles_of_a_png_do_not_reach_the_decoder(capfd: pytest.CaptureFixture[str]) -> None:
+    image = Image.fromarray(decode(photograph(7))[:, :, ::-1])
+    plain, told = io.BytesIO(), io.BytesIO()
+    image.save(plain, "PNG")
+    image.save(told, "PNG", icc_profile=bytes(range(256)) * 4)
+    data = told.getvalue().replace(b"ICC Profile", b'a\n{"forged"')
+    end = data.index(b"iCCP") + 4 + int.from_bytes(data[data.index(b"iCCP") - 4 :][:4], "big")
+    start = data.index(b"iCCP")
+    data = data[:end] + zlib.crc32(data[start:end]).to_bytes(4, "big") + data[end + 4 :]
+    np.testing.assert_array_equal(decode(data), decode(plain.getvalue()))
+    assert "forged" not in capfd.readouterr().err
+
+
+def test_damage_that_is_no_cut_is_still_told() -> None:
+    data = bytearray(photograph(8))
+    data[data.index(b"\xff\xc0") + 9] = 9  # components
+    with pytest.raises(InvalidImage):
+        decode(bytes(data))

@@ -1,0 +1,105 @@
+"""Cameras of a rig and maps side by side: evidence added up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.judgement.fusion import BLIND, Fused, View, fuse, joint_probabilities, log_odds_of
+from core.judgement.probability import Curve, sigmoid
+from core.judgement.verdict import Calibration, Judgement, Neighborhood, judge
+from core.places import Pose
+from tests.core.judgement.test_priors import places
+
+CALIBRATION = Calibration(
+    source="test", threshold=0.2, margin=0.01, background_mean=0.1, background_deviation=0.02,
+    curve=Curve(slope=20, intercept=-4), decision="leading",
+)  # fmt: skip
+NEIGHBORHOOD = Neighborhood(radius=1.0, frames=0)
+
+
+def view(scores: dict[int, float], weights: dict[int, float] | None = None) -> View:
+    """Of places ten metres apart, by row."""
+    rows = sorted(scores, key=lambda row: -scores[row])
+    return View(
+        np.array(rows),
+        np.array([scores[row] for row in rows], np.float32),
+        places([Pose(x=10 * row, y=0) for row in rows]),
+        np.ones(len(rows), np.bool_),
+        None if weights is None else np.array([weights[row] for row in rows]),
+    )
+
+
+def fused(*views: View) -> Fused:
+    return fuse(views, CALIBRATION, NEIGHBORHOOD, second_stage=True)
+
+
+BACKGROUND = {row: 0.1 + 0.001 * row for row in range(10, 18)}
+
+
+def test_one_camera_is_a_plain_query() -> None:
+    one = view({3: 0.5, **BACKGROUND})
+    alone = judge(one.scores, one.whereabouts, CALIBRATION, NEIGHBORHOOD, one.examined)
+    found = fused(one)
+    assert found.rows.tolist() == one.rows.tolist()
+    assert found.judgement.verdict == alone.verdict == "recognized"
+    assert found.judgement.decision == pytest.approx(alone.decision, rel=1e-5)
+    assert found.judgement.score == alone.score
+
+
+def test_two_that_agree_are_surer_than_either() -> None:
+    left, right = view({3: 0.32, **BACKGROUND}), view({3: 0.33, **BACKGROUND})
+    together = fused(left, right).judgement
+    for one in (left, right):
+        alone = fused(one).judgement
+        assert alone.probability is not None and together.probability is not None
+        assert together.probability > alone.probability
+    assert together.verdict == "recognized"
+
+
+def test_a_camera_that_sees_nothing_spoils_nothing() -> None:
+    clear, covered = view({3: 0.6, **BACKGROUND}), view(BACKGROUND)
+    found = fused(clear, covered)
+    assert found.judgement.verdict == "recognized" and found.rows[0] == 3
+    assert found.log_odds[0] > fused(clear).log_odds[0] + np.log(BLIND) + np.log(1 - BLIND)
+
+
+def test_two_that_contradict_each_other_are_ambiguous() -> None:
+    found = fused(view({3: 0.5, **BACKGROUND}), view({5: 0.5, **BACKGROUND}))
+    assert found.judgement.verdict == "ambiguous" and set(found.rows[:2].tolist()) == {3, 5}
+    assert found.judgement.probability is not None and found.judgement.probability <= 0.5
+
+
+def test_what_each_takes_for_one_of_two_both_take_for_the_third() -> None:
+    """Each camera prefers a place that the other rules out; the one that both know is second for both."""
+    found = fused(view({1: 0.42, 3: 0.4, **BACKGROUND}), view({2: 0.42, 3: 0.4, **BACKGROUND}))
+    assert found.rows[0] == 3
+
+
+def test_strangers_together_stay_strangers() -> None:
+    found = fused(*[view(BACKGROUND) for _ in range(4)])
+    assert found.judgement.verdict == "unknown"
+
+
+def test_a_prior_counts_once_for_all_cameras() -> None:
+    scores = {3: 0.5, 4: 0.5, **BACKGROUND}
+    weights = {row: (0.0 if row == 3 else -2.0) for row in scores}
+    found = fused(view(scores, weights), view(scores, weights))
+    assert found.rows[0] == 3
+    assert found.log_odds[0] - found.log_odds[1] == pytest.approx(2.0, abs=1e-4)
+
+
+def test_at_most_one_of_several_maps_is_right() -> None:
+    assert joint_probabilities([2.0])[0] == pytest.approx(sigmoid(np.array(2.0)))
+    both = joint_probabilities([2.0, 2.0])
+    assert both.sum() < 1 and both[0] == both[1] < 0.5
+    assert joint_probabilities([900.0, -900.0])[0] == pytest.approx(1)
+    assert joint_probabilities([30.0, 30.0]).tolist() == pytest.approx([0.5, 0.5])
+
+
+def test_log_odds_of_a_judgement() -> None:
+    judged = Judgement("recognized", 0.5, 0.3, 0.1, 1, 0.9)
+    assert log_odds_of(judged, CALIBRATION) == pytest.approx(np.log(9))
+    bare = Judgement("recognized", 0.5, 0.3, 0.1, 1, None)
+    assert log_odds_of(bare, CALIBRATION) == pytest.approx(2)
+    assert log_odds_of(Judgement("unknown", None, None, None, None), CALIBRATION) < -30

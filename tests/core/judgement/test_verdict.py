@@ -1,0 +1,215 @@
+"""Verdicts: what stands out, who is a rival, and maps too small to say."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from core.judgement.probability import Curve
+from core.judgement.verdict import (
+    GEOGRAPHIC,
+    METRIC,
+    NO_POSE,
+    Calibration,
+    Neighborhood,
+    Whereabouts,
+    completed,
+    judge,
+    probability_of,
+    standing_out,
+)
+from core.places import Pose
+
+CALIBRATION = Calibration(
+    source="encoder-default", threshold=2.0, margin=0.01, background_mean=0.02, background_deviation=0.01
+)
+NEARBY = Neighborhood(radius=5.0, frames=3)
+
+
+def in_sequence(n: int, ordinals: list[int] | None = None) -> Whereabouts:
+    order = np.array(ordinals if ordinals is not None else range(n), np.int64)
+    return Whereabouts(np.zeros(n, np.int8), np.zeros((n, 3)), np.zeros(n, np.int32), order)
+
+
+def at(positions: list[tuple[float, float]]) -> Whereabouts:
+    n = len(positions)
+    xyz = np.array([(x, y, 0) for x, y in positions], np.float64)
+    return Whereabouts(np.full(n, METRIC, np.int8), xyz, np.arange(n, dtype=np.int32), np.zeros(n, np.int64))
+
+
+def falling(*scores: float) -> NDArray[np.float32]:
+    return np.array(scores, np.float32)
+
+
+def test_an_empty_map_is_unknown_without_a_score() -> None:
+    judgement = judge(falling(), in_sequence(0), CALIBRATION, NEARBY)
+    assert judgement.verdict == "unknown"
+    assert judgement.score is judgement.margin is judgement.decision is judgement.rival is None
+
+
+def test_one_place_recognizes_itself_and_has_no_rival() -> None:
+    judgement = judge(falling(0.9), in_sequence(1), CALIBRATION, NEARBY)
+    assert (judgement.verdict, judgement.margin, judgement.rival) == ("recognized", None, None)
+
+
+def test_one_place_does_not_recognize_an_unrelated_frame() -> None:
+    assert judge(falling(0.02), in_sequence(1), CALIBRATION, NEARBY).verdict == "unknown"
+
+
+def test_the_same_scores_higher_up_make_the_same_decision() -> None:
+    """A map whose places all look alike lifts every score; only standing out counts."""
+    generator = np.random.default_rng(0)
+    rest = np.sort(generator.normal(0.03, 0.01, 200).astype(np.float32))[::-1]
+    low = standing_out(0.09, rest, CALIBRATION)
+    high = standing_out(0.29, rest + np.float32(0.2), CALIBRATION)
+    assert low == pytest.approx(high, rel=1e-3)
+    assert low > 3
+
+
+def test_the_best_of_many_unknowns_does_not_stand_out_more_than_the_best_of_few() -> None:
+    generator = np.random.default_rng(1)
+    medians = []
+    for n in (50, 500, 5000):
+        draws = np.sort(generator.normal(0, 1, (200, n)).astype(np.float32), axis=1)[:, ::-1]
+        medians.append(np.median([standing_out(float(row[0]), row[1:], CALIBRATION) for row in draws]))
+    assert max(medians) - min(medians) < 0.8
+
+
+def test_neighbouring_frames_are_no_rivals() -> None:
+    scores = falling(0.5, 0.49, 0.48, 0.2, 0.1)
+    judgement = judge(scores, in_sequence(5, [10, 11, 8, 14, 30]), CALIBRATION, NEARBY)
+    assert judgement.rival == 3
+    assert judgement.margin == pytest.approx(0.3, abs=1e-6)
+    assert judgement.verdict == "recognized"
+
+
+def test_a_close_rival_elsewhere_makes_it_ambiguous() -> None:
+    rest = [0.03 - 0.0001 * i for i in range(60)]
+    judgement = judge(falling(0.5, 0.495, *rest), in_sequence(62), CALIBRATION, Neighborhood(5, 0))
+    assert judgement.verdict == "ambiguous"
+    assert judgement.rival == 1
+
+
+def test_poses_decide_before_sequences_do() -> None:
+    # Other sequences (codes differ), but 3 m and 8 m away.
+    judgement = judge(falling(0.5, 0.49, 0.3), at([(0, 0), (3, 0), (8, 0)]), CALIBRATION, NEARBY)
+    assert judgement.rival == 2
+
+
+def test_a_pose_beside_no_pose_is_compared_by_sequence() -> None:
+    places = Whereabouts(
+        np.array([METRIC, NO_POSE, NO_POSE], np.int8),
+        np.zeros((3, 3)),
+        np.array([0, 0, 1], np.int32),
+        np.array([5, 6, 6], np.int64),
+    )
+    assert places.near(0, NEARBY).tolist() == [True, True, False]
+
+
+def test_degrees_are_compared_in_metres() -> None:
+    here, there = Pose(latitude=48.8462, longitude=2.3464), Pose(latitude=48.8462, longitude=2.34654)  # 10.2 m apart
+    places = Whereabouts(
+        np.full(2, GEOGRAPHIC, np.int8),
+        np.stack([here.position(), there.position()]),
+        np.array([0, 1], np.int32),
+        np.zeros(2, np.int64),
+    )
+    assert places.near(0, Neighborhood(10.0, 0)).tolist() == [True, False]
+    assert places.near(0, Neighborhood(10.5, 0)).tolist() == [True, True]
+
+
+def test_equal_scores_everywhere_are_unknown_not_a_division_by_zero() -> None:
+    judgement = judge(np.full(40, 0.2, np.float32), in_sequence(40), CALIBRATION, NEARBY)
+    assert judgement.verdict == "unknown"
+    assert np.isfinite(judgement.decision or 0)
+
+
+def test_after_a_second_stage_the_lead_over_the_examined_counts() -> None:
+    scores = falling(0.6, 0.2, 0.2, 0.2, 0.2, 0.2)
+    one = judge(scores, in_sequence(6, [0, 10, 20, 30, 40, 50]), CALIBRATION, NEARBY, examined=30)
+    assert one.decision == pytest.approx((0.6 * 0.4) ** 0.5, abs=1e-5)
+    # What was not examined has a lower score by nature and says nothing.
+    unexamined = np.concatenate([scores, np.full(50, -0.5, np.float32)])
+    places = in_sequence(56, [10 * n for n in range(56)])
+    assert judge(unexamined, places, CALIBRATION, NEARBY, examined=6).decision == pytest.approx(one.decision)
+
+
+def test_a_twin_of_the_best_place_leaves_it_ambiguous_and_not_unknown() -> None:
+    rest = [0.1] * 10
+    places = in_sequence(12, [20 * n for n in range(12)])
+    calibration = CALIBRATION.model_copy(update={"threshold": 0.4, "margin": 0.02})
+    assert judge(falling(0.6, 0.6, *rest), places, calibration, NEARBY, examined=30).verdict == "ambiguous"
+
+
+CURVED = Calibration(
+    source="x",
+    threshold=0.2,
+    margin=0.02,
+    background_mean=0.02,
+    background_deviation=0.01,
+    curve=Curve(slope=20, intercept=-4),
+    decision="leading",
+)
+
+
+def test_a_calibration_stored_before_there_were_curves_loads_and_judges_as_before() -> None:
+    stored = {"source": "manual", "threshold": 2, "margin": 0.01, "background_mean": 0.02, "background_deviation": 0.01}
+    old = Calibration.model_validate_json(json.dumps(stored))
+    assert old == CALIBRATION.model_copy(update={"source": "manual"})
+    rest = [0.03 - 0.0001 * i for i in range(60)]
+    judgement = judge(falling(0.5, *rest), in_sequence(61), old, Neighborhood(5, 0))
+    assert judgement.decision == pytest.approx(standing_out(0.5, falling(*rest), old))
+    assert judgement.probability is None
+
+
+def test_the_probability_is_that_of_the_curve_and_half_of_it_for_twins() -> None:
+    rest = [0.1] * 20
+    alone = judge(falling(0.6, *rest), in_sequence(21), CURVED, Neighborhood(5, 0))
+    assert alone.decision is not None and CURVED.curve is not None
+    assert alone.probability == pytest.approx(CURVED.curve.probability(alone.decision))
+    twins = judge(falling(0.6, 0.6, *rest), in_sequence(22), CURVED, Neighborhood(5, 0))
+    assert twins.decision is not None
+    assert twins.verdict == "ambiguous"
+    assert twins.probability == pytest.approx(CURVED.curve.probability(twins.decision) / 2)
+
+
+@given(st.floats(0, 2), st.floats(0, 0.1), st.floats(0, 2), st.floats(0, 0.1))
+def test_a_better_answer_is_never_less_probable(a: float, b: float, more: float, further: float) -> None:
+    less, better = probability_of(a, b, CURVED), probability_of(a + more, b + further, CURVED)
+    assert less is not None and better is not None
+    assert 0 < less <= better < 1
+
+
+def test_the_best_part_of_a_ranking_says_the_same_as_all_of_it() -> None:
+    """An index that returns its hundred best changes neither decision nor verdict, with one stage or two."""
+    scores = np.sort(np.random.default_rng(0).normal(0.05, 0.02, 5000).astype(np.float32))[::-1]
+    scores[0] = 0.5
+    places = in_sequence(5000, [10 * n for n in range(5000)])
+    for examined in (0, 30):
+        whole = judge(scores, places, CURVED, NEARBY, examined)
+        assert judge(scores[:100], places.take(np.arange(100)), CURVED, NEARBY, examined) == whole
+        assert whole.verdict == "recognized"
+
+
+def test_which_places_were_examined_may_be_said_one_by_one() -> None:
+    scores, places = falling(0.6, 0.5, 0.2, 0.1), in_sequence(4, [0, 10, 20, 30])
+    mask = np.array([True, False, True, True])
+    judgement = judge(scores, places, CURVED, NEARBY, mask)
+    expected = judge(falling(0.6, 0.2, 0.1), in_sequence(3, [0, 20, 30]), CURVED, NEARBY, 3)
+    assert judgement.decision == pytest.approx(expected.decision)
+    assert judgement.margin == pytest.approx(0.1)
+
+
+def test_a_map_calibrated_before_there_were_curves_borrows_the_encoders() -> None:
+    old = CALIBRATION.model_copy(update={"source": "manual", "threshold": 0.3})
+    assert completed(None, CURVED, second_stage=True) == CURVED
+    borrowed = completed(old, CURVED, second_stage=True)
+    assert (borrowed.threshold, borrowed.source, borrowed.curve) == (0.3, "manual", CURVED.curve)
+    assert completed(old, CURVED, second_stage=False) == old, "its decision values are in other units"
+    own = CURVED.model_copy(update={"curve": Curve(slope=1, intercept=0)})
+    assert completed(own, CURVED, second_stage=True) == own

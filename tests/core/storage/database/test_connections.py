@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from core.storage.database.connections import Database, DatabaseClosed, connect
+from core.storage.database.schema import migrate
+from core.storage.files.disk import Damage
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    connection = connect(tmp_path / "map.sqlite", create=True)
+    migrate(connection, create=True)
+    connection.close()
+    return tmp_path / "map.sqlite"
+
+
+@pytest.fixture
+def database(path: Path) -> Iterator[Database]:
+    database = Database(path)
+    yield database
+    database.close()
+
+
+def count(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("SELECT count(*) FROM sequences").fetchone()[0])
+
+
+ADD = "INSERT INTO sequences (name, next_ordinal) VALUES (?, 0)"
+
+
+def test_the_settings_that_durability_needs(database: Database) -> None:
+    with database.transaction() as writer, database.reading() as reader:
+        for connection in (writer, reader):
+            assert connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+            assert connection.execute("PRAGMA synchronous").fetchone() == (2,)
+            assert connection.execute("PRAGMA foreign_keys").fetchone() == (1,)
+
+
+def test_a_missing_file_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(sqlite3.OperationalError):
+        Database(tmp_path / "absent.sqlite")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_not_ours(tmp_path: Path) -> None:
+    sqlite3.connect(tmp_path / "other.sqlite").execute("CREATE TABLE t (x)").connection.close()
+    with pytest.raises(Damage):
+        Database(tmp_path / "other.sqlite")
+
+
+def test_all_or_nothing(database: Database) -> None:
+    with pytest.raises(ZeroDivisionError), database.transaction() as connection:
+        connection.execute(ADD, ("a",))
+        1 / 0  # noqa: B018
+    with database.reading() as connection:
+        assert count(connection) == 1
+    with database.transaction() as connection:
+        connection.execute(ADD, ("a",))
+    with database.reading() as connection:
+        assert count(connection) == 2
+
+
+def test_readers_do_not_wait_for_a_writer_and_see_the_last_commit(database: Database) -> None:
+    with database.transaction() as writer:
+        writer.execute(ADD, ("a",))
+        with database.reading() as reader:
+            assert count(reader) == 1
+    with database.reading() as reader:
+        assert count(reader) == 2
+
+
+def test_connections_are_used_again_unless_left_in_a_transaction(database: Database) -> None:
+    with database.reading() as first, database.reading() as second:
+        assert first is not second
+    with database.reading() as again:
+        assert again in (first, second)
+        again.execute("BEGIN")
+    with database.reading() as third:
+        assert third is not again
+
+
+def test_closing_waits_for_reads_under_way_and_refuses_others(database: Database) -> None:
+    entered, leave, closed = threading.Event(), threading.Event(), threading.Event()
+    counts: list[int] = []
+
+    def read() -> None:
+        with database.reading() as connection:
+            entered.set()
+            leave.wait(10)
+            counts.append(count(connection))
+
+    def close() -> None:
+        database.close()
+        closed.set()
+
+    threads = [threading.Thread(target=read), threading.Thread(target=close)]
+    threads[0].start()
+    assert entered.wait(10)
+    threads[1].start()
+    assert not closed.wait(0.1)
+    with pytest.raises(DatabaseClosed), database.reading():
+        pass
+    leave.set()
+    for thread in threads:
+        thread.join(10)
+    assert closed.is_set()
+    assert counts == [1]
+    with pytest.raises(DatabaseClosed), database.transaction():
+        pass
+
+
+def test_settling_empties_the_log(database: Database, path: Path) -> None:
+    log = path.with_name("map.sqlite-wal")
+    with database.transaction() as connection:
+        connection.execute(ADD, ("a",))
+    assert log.stat().st_size > 0
+    database.settle()
+    assert log.stat().st_size == 0
+    with database.reading() as connection:
+        assert count(connection) == 2
+
+
+def test_closing_leaves_one_file(database: Database, path: Path) -> None:
+    with database.transaction() as connection:
+        connection.execute(ADD, ("a",))
+    database.close()
+    assert [found.name for found in path.parent.iterdir()] == ["map.sqlite"]

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+
+import pytest
+
+from core.errors import DataDirectoryTooNew
+from core.storage.database.schema import MIGRATIONS, check_schema, migrate
+from core.storage.files.disk import Damage
+
+LATER = (
+    *MIGRATIONS,
+    ("ALTER TABLE places ADD COLUMN floor INTEGER NOT NULL DEFAULT 0", "CREATE TABLE floors (number INTEGER) STRICT"),
+    ("UPDATE places SET floor = 1", "CREATE INDEX places_of_floor ON places (floor)"),
+)
+
+
+@pytest.fixture
+def connection() -> Iterator[sqlite3.Connection]:
+    connection = sqlite3.connect(":memory:", isolation_level=None)
+    yield connection
+    connection.close()
+
+
+def version(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("PRAGMA user_version").fetchone()[0])
+
+
+PLACE = (
+    "INSERT INTO places (id, row, checksum, digest, regions, picture, sequence, ordinal, metadata, created_at,"
+    " updated_at) VALUES ('p', 0, 1, zeroblob(32), 3, 'none', -1, 0, '{}', 'now', 'now')"
+)
+
+
+def test_an_empty_file_gets_the_newest_schema(connection: sqlite3.Connection) -> None:
+    assert migrate(connection, create=True) == len(MIGRATIONS)
+    assert version(connection) == len(MIGRATIONS)
+    check_schema(connection)
+    assert migrate(connection) == 0
+
+
+def test_an_older_file_becomes_newer_and_keeps_what_it_holds(connection: sqlite3.Connection) -> None:
+    migrate(connection, create=True)
+    connection.execute(PLACE)
+    assert migrate(connection, LATER) == len(LATER) - len(MIGRATIONS)
+    assert version(connection) == len(LATER)
+    assert connection.execute("SELECT id, regions, floor FROM places").fetchall() == [("p", 3, 1)]
+    check_schema(connection, LATER)
+
+
+def test_maps_of_the_first_schema_have_no_local_descriptors(connection: sqlite3.Connection) -> None:
+    migrate(connection, MIGRATIONS[:1], create=True)
+    columns = "only, id, encoder, dimension, rows_per_segment, description, keep, same_place_radius, same_place_frames"
+    values = "1, 'lab', 'e@1', 16, 4, '', 'none', 5.0, 3, 1, 'then', 'then'"
+    connection.execute(f"INSERT INTO map ({columns}, revision, created_at, updated_at) VALUES ({values})")
+    assert migrate(connection) == len(MIGRATIONS) - 1
+    assert connection.execute("SELECT dimension, local_cells, local_values FROM map").fetchall() == [(16, 0, 0)]
+    check_schema(connection)
+    with pytest.raises(sqlite3.IntegrityError):
+        connection.execute("UPDATE map SET local_cells = -1")
+
+
+def test_a_migration_that_fails_leaves_the_file_as_it_was(connection: sqlite3.Connection) -> None:
+    migrate(connection, create=True)
+    before = connection.execute("SELECT sql FROM sqlite_schema").fetchall()
+    with pytest.raises(sqlite3.OperationalError):
+        migrate(connection, (*LATER, ("SELECT nonsense",)))
+    assert version(connection) == len(MIGRATIONS)
+    assert connection.execute("SELECT sql FROM sqlite_schema").fetchall() == before
+    assert not connection.in_transaction
+
+
+def test_a_later_file_is_refused_and_not_touched(connection: sqlite3.Connection) -> None:
+    migrate(connection, LATER, create=True)
+    with pytest.raises(DataDirectoryTooNew):
+        migrate(connection)
+    assert version(connection) == len(LATER)
+
+
+def test_what_is_not_ours_is_refused(connection: sqlite3.Connection) -> None:
+    with pytest.raises(Damage):
+        migrate(connection)  # an empty file, where there should be a map
+    connection.execute("CREATE TABLE t (x)")
+    with pytest.raises(Damage):
+        migrate(connection, create=True)
+    connection.execute("PRAGMA user_version = 1")
+    with pytest.raises(Damage):
+        migrate(connection)
+
+
+def test_a_missing_table_or_column_is_found(connection: sqlite3.Connection) -> None:
+    migrate(connection, create=True)
+    connection.execute("ALTER TABLE places DROP COLUMN regions")
+    with pytest.raises(Damage, match="regions of its table 'places'"):
+        check_schema(connection)
+    connection.execute("DROP TABLE segments")
+    with pytest.raises(Damage, match="segments"):
+        check_schema(connection)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE INDEX places_of_camera ON places (camera)",
+        "CREATE TRIGGER no_more AFTER INSERT ON places BEGIN DELETE FROM pictures WHERE place = 0; END",
+    ],
+)
+def test_a_later_file_with_the_same_columns_is_refused_as_such(connection: sqlite3.Connection, statement: str) -> None:
+    migrate(connection, (*MIGRATIONS, (statement,)), create=True)
+    with pytest.raises(DataDirectoryTooNew):
+        migrate(connection)
+
+
+def test_a_version_that_is_not_that_of_the_tables_is_damage(connection: sqlite3.Connection) -> None:
+    migrate(connection, MIGRATIONS[:1], create=True)
+    migrate(connection)  # by way of an older file
+    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) | 64}")
+    with pytest.raises(Damage, match="schema"):
+        migrate(connection)

@@ -1,0 +1,378 @@
+"""Maps that are searched by codes: what they answer, and what is left of them after anything that can happen."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.errors import MapQuarantined, UnknownMap
+from core.index import Coder, InvertedLists
+from core.storage import Atlas, IndexStatus, Map, MapSettings
+from core.storage.files import arrays
+from core.storage.files.segment_files import HEADER_BYTES
+from core.storage.search import indexing, recall, snapshot, tiers
+from core.storage.search.snapshot import Snapshot
+from tests.core.storage.frames import ENCODER, LOCAL_SHAPE, descriptor_of, frame, local_of
+from tests.core.storage.test_opening import cut, flip, flip_middle, garbage, remove
+
+DIMENSION, ROWS, PLACES, SHORTLIST = 256, 16, 150, 20
+SECONDS = 60.0
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of codes of 32 rows, and shortlists that are shorter than the maps here."""
+    monkeypatch.setattr("core.storage.search.index_files.GROUP_ROWS", 32)
+    monkeypatch.setattr(snapshot, "SHORTLIST", SHORTLIST)
+    monkeypatch.setattr(indexing, "_ROWS_AT_ONCE", 8)
+    monkeypatch.setattr(recall, "QUERIES", 16)
+
+
+@pytest.fixture
+def atlas(directory: Path) -> Iterator[Atlas]:
+    atlas = Atlas(directory, rows_per_segment=ROWS)
+    yield atlas
+    atlas.close()
+
+
+@pytest.fixture
+def folder(directory: Path) -> Path:
+    return directory / "maps" / "lab"
+
+
+def make(atlas: Atlas, places: int = PLACES, **settings: object) -> Map:
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(**settings), LOCAL_SHAPE)  # type: ignore[arg-type]
+    lab.enrol([frame(f"p{i}", dimension=DIMENSION) for i in range(places)])
+    return lab
+
+
+def settled(lab: Map) -> IndexStatus:
+    """The status once nothing is being built any more."""
+    deadline = time.monotonic() + SECONDS
+    while (status := lab.index_status()).state == "building":
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+    return status
+
+
+def finds(lab: Map, place_id: str, shown: str | None = None) -> bool:
+    """Whether what ``shown`` shows is recognized as the place, its local descriptors beside it."""
+    found = lab.snapshot()
+    rows, products = found.search(descriptor_of(shown or place_id, DIMENSION))
+    if not len(rows):
+        return False
+    (place,) = lab.places_at(rows[:1].tolist())
+    assert (np.diff(products) <= 0).all()
+    same = np.array_equal(found.locals_at(rows[:1])[0], local_of(shown or place_id))
+    return place is not None and place.id == place_id and same
+
+
+def nothing_held(found: Snapshot) -> bool:
+    return all(segment.held is None for segment in found.segments)
+
+
+def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> None:
+    lab = make(atlas)
+    queries = np.array([descriptor_of(f"query {i}", DIMENSION) for i in range(10)])
+    exact = lab.snapshot().search_batch(queries)
+    before = lab.index_status()
+    assert (before.tier, before.state, before.recall) == ("exact", "ready", None)
+
+    lab.edit({"index": "compact"})
+    status = settled(lab)
+    assert (status.setting, status.tier, status.wanted) == ("compact", "compact", "compact")
+    assert (status.rows_indexed, status.progress) == (PLACES, 1.0)
+    assert status.recall is not None
+    assert (status.recall.queries, status.recall.places) == (16, PLACES)
+    assert status.recall.at_1 > 0.9
+    assert nothing_held(lab.snapshot())
+    held = DIMENSION * 2 + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
+    assert status.bytes_in_memory <= before.bytes_in_memory - PLACES * held + PLACES * (DIMENSION // 8 + 128)
+    for (rows, products), (all_rows, all_products) in zip(lab.snapshot().search_batch(queries), exact, strict=True):
+        assert len(rows) == SHORTLIST
+        np.testing.assert_allclose(products, all_products[np.argsort(all_rows)][rows], atol=1e-6)
+    assert all(finds(lab, f"p{i}") for i in range(PLACES))
+
+    lab.edit({"index": "exact"})
+    assert settled(lab).tier == "exact"
+    assert not list(folder.glob("*.index"))
+    for (rows, products), (all_rows, all_products) in zip(lab.snapshot().search_batch(queries), exact, strict=True):
+        assert rows.tolist() == all_rows.tolist()
+        np.testing.assert_allclose(products, all_products, atol=1e-6)
+    assert lab.verify().ok
+
+
+@pytest.mark.parametrize("setting", ["compact", "inverted"])
+def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
+    monkeypatch.setattr(tiers, "COMPACT_FROM", 100)
+    monkeypatch.setattr(tiers, "INVERTED_FROM", 120 if setting == "inverted" else 10_000)
+    lab = make(atlas, 99)
+    assert settled(lab).tier == "exact"
+    lab.enrol([frame(f"q{i}", dimension=DIMENSION) for i in range(51)])
+    assert settled(lab).tier == setting
+    assert all(finds(lab, name) for name in ("p0", "p98", "q0", "q50"))
+    for i in range(99):
+        lab.forget(f"p{i}")
+    lab.enrol([frame("last", dimension=DIMENSION)])
+    assert settled(lab).tier == "compact"
+    assert finds(lab, "last")
+    lab.transfer.forget({f"q{i}": lab.digest(f"q{i}") or b"" for i in range(10)})
+    assert settled(lab).tier == "exact"
+    assert finds(lab, "q40")
+
+
+def test_writes_are_seen_at_once(atlas: Atlas) -> None:
+    lab = make(atlas, index="compact")
+    settled(lab)
+    for i in range(20):
+        lab.enrol([frame(f"new{i}", dimension=DIMENSION)])
+        assert finds(lab, f"new{i}")
+        lab.enrol([frame(f"new{i}", f"another {i}", dimension=DIMENSION)])
+        assert finds(lab, f"new{i}", f"another {i}")
+        lab.forget(f"p{i}")
+        rows, _ = lab.snapshot().search(descriptor_of(f"p{i}", DIMENSION))
+        assert i not in rows.tolist()
+    assert nothing_held(lab.snapshot())
+    settled(lab)
+    assert lab.snapshot().coded == lab.snapshot().rows
+    report = lab.verify()
+    assert (report.ok, report.stale_caches, report.problems) == (True, [], [])
+
+
+def test_an_older_snapshot_stays_what_it_was(atlas: Atlas) -> None:
+    lab = make(atlas, index="compact")
+    settled(lab)
+    before, query = lab.snapshot(), descriptor_of("p5", DIMENSION)
+    first = before.search(query)
+    lab.forget("p5")
+    lab.enrol([frame("late", "p5 again", dimension=DIMENSION)])
+    assert before.search(query)[0].tolist() == first[0].tolist()
+    assert lab.snapshot().search(query)[0].tolist() != first[0].tolist()
+
+
+@pytest.mark.parametrize("setting", ["compact", "inverted"])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
+def test_only_allowed_places_are_found(atlas: Atlas, setting: str, share: float) -> None:
+    lab = make(atlas, index=setting)
+    settled(lab)
+    found = lab.snapshot()
+    allowed = np.random.default_rng(0).random(found.rows) < share
+    for i in (3, 77):
+        rows, _ = found.search(descriptor_of(f"p{i}", DIMENSION), allowed)
+        assert allowed[rows].all()
+        assert len(rows) == min(SHORTLIST, int(allowed.sum()))
+        if allowed[i]:
+            assert rows[0] == i
+
+
+def test_searches_and_writes_go_on_while_codes_are_made(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every step of the making waits to be told, and between any two of them the map is asked and written to."""
+    lab = make(atlas, 60)
+    waiting, step, encode = threading.Semaphore(0), threading.Semaphore(0), Coder.encode
+
+    def by_step(self: Coder, descriptors: NDArray[np.float32]) -> object:
+        if threading.current_thread().name == "index":
+            waiting.release()
+            assert step.acquire(timeout=SECONDS)
+        return encode(self, descriptors)
+
+    monkeypatch.setattr(Coder, "encode", by_step)
+    lab.edit({"index": "compact"})
+    progress = []
+    for i in range(7):
+        assert waiting.acquire(timeout=SECONDS)
+        assert all(finds(lab, f"p{j}") for j in range(50))
+        lab.enrol([frame(f"new{i}", dimension=DIMENSION)])
+        assert finds(lab, f"new{i}")
+        lab.forget(f"p{59 - i}")
+        assert not finds(lab, f"p{59 - i}")
+        assert lab.index_status().state == "building"
+        progress.append(lab.index_status().progress)
+        step.release()
+    step.release(1000)
+    assert settled(lab).tier == "compact"
+    assert progress == sorted(progress)
+    assert len(set(progress)) >= 6
+    assert all(finds(lab, name) for name in ("p0", "p49", "new0", "new6"))
+    assert nothing_held(lab.snapshot())
+
+
+def test_a_start_reads_codes_and_makes_none(
+    atlas: Atlas, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(atlas, index="inverted")
+    settled(atlas.get("lab"))
+    atlas.close()
+    before = {path.name: path.read_bytes() for path in folder.glob("*.index")}
+    codes = [f"codes-00000{i}.index" for i in range(1, 6)]
+    assert sorted(before) == ["coder.index", *codes, "lists.index", "recall.index"]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(Coder, "encode", refuse)
+    monkeypatch.setattr(Coder, "fitted", refuse)
+    monkeypatch.setattr(InvertedLists, "built", refuse)
+    again = Atlas(directory)
+    lab = again.get("lab")
+    assert lab.snapshot().coded == PLACES  # from the first query on
+    assert all(finds(lab, f"p{i}") for i in (0, 31, 32, PLACES - 1))
+    status = settled(lab)
+    assert (status.tier, status.recall is not None) == ("inverted", True)
+    again.close()
+    assert {path.name: path.read_bytes() for path in folder.glob("*.index")} == before
+
+
+def of_another_group(path: Path) -> None:
+    path.write_bytes(path.with_name("codes-000003.index").read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("codes-000001.index", flip_middle),
+        ("codes-000001.index", of_another_group),
+        ("codes-000002.index", cut),
+        ("codes-000004.index", remove),
+        ("coder.index", flip_middle),
+        ("coder.index", remove),
+        ("lists.index", garbage),
+        ("lists.index", cut),
+    ],
+)
+def test_a_file_that_is_no_good_is_told_and_made_again(
+    atlas: Atlas, directory: Path, folder: Path, name: str, spoil: Callable[[Path], None]
+) -> None:
+    make(atlas, index="inverted")
+    settled(atlas.get("lab"))
+    atlas.close()
+    good = (folder / name).read_bytes()
+    spoil(folder / name)
+    again = Atlas(directory)
+    lab = again.get("lab")
+    assert all(finds(lab, f"p{i}") for i in (0, 40, PLACES - 1))
+    settled(lab)
+    assert (folder / name).read_bytes() == good
+    report = lab.verify()
+    assert (report.ok, report.stale_caches) == (True, [])
+    spoil(folder / name)
+    report = lab.verify()
+    assert report.ok
+    assert any(found.startswith(name) for found in report.stale_caches)
+    again.close()
+
+
+def test_a_disk_that_is_full_for_codes_leaves_the_map_serving(
+    atlas: Atlas, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
+        patched.setattr(arrays, "_written", full)
+        lab = make(atlas, index="compact")
+        assert settled(lab).tier == "compact"
+        assert all(finds(lab, f"p{i}") for i in (0, PLACES - 1))
+        atlas.close()
+    assert "could not be written and will be made again" in caplog.text
+    assert not [*folder.glob("*.index"), *folder.glob("*.tmp")]
+    again = Atlas(directory)
+    assert finds(again.get("lab"), "p7")
+    assert settled(again.get("lab")).tier == "compact"
+    again.close()
+
+
+def test_damage_on_the_shelf_takes_the_map_out_of_service(atlas: Atlas, directory: Path, folder: Path) -> None:
+    make(atlas, index="compact")
+    atlas.create("hall", ENCODER, 16, local_shape=(0, 0)).enrol([frame("h", local_shape=(0, 0))])
+    settled(atlas.get("lab"))
+    atlas.close()
+    flip(folder / "descriptors-000002.seg", HEADER_BYTES + 5)
+    again = Atlas(directory)
+    lab = again.get("lab")
+    assert finds(lab, "p0")
+    with pytest.raises(MapQuarantined, match=r"descriptors-000002\.seg: row 16 does not match"):
+        lab.snapshot().search(descriptor_of("p16", DIMENSION))
+    with pytest.raises(MapQuarantined):
+        again.get("lab")
+    assert list(again.quarantined()) == ["lab"]
+    assert not again.verify("lab").ok
+    assert again.get("hall").count_places() == 1
+    again.close()
+
+
+@pytest.mark.parametrize("spoil", [remove, cut])
+def test_a_lost_or_cut_segment_is_found_at_the_start(
+    atlas: Atlas, directory: Path, folder: Path, spoil: Callable[[Path], None]
+) -> None:
+    make(atlas, index="compact")
+    settled(atlas.get("lab"))
+    atlas.close()
+    spoil(folder / "descriptors-000002.seg")
+    again = Atlas(directory)
+    with pytest.raises(MapQuarantined, match=r"descriptors-000002\.seg: the file"):
+        again.get("lab")
+    again.close()
+
+
+def test_a_deleted_map_says_so_to_those_that_still_search_it(atlas: Atlas) -> None:
+    lab = make(atlas, index="compact")
+    settled(lab)
+    before = lab.snapshot()
+    atlas.delete("lab")
+    with pytest.raises(UnknownMap):
+        before.search(descriptor_of("p8", DIMENSION))
+
+
+def test_a_map_is_closed_while_it_is_built(atlas: Atlas, directory: Path) -> None:
+    make(atlas, 60)
+    atlas.get("lab").edit({"index": "inverted"})
+    atlas.close()
+    again = Atlas(directory)
+    assert finds(again.get("lab"), "p59")
+    assert settled(again.get("lab")).tier == "inverted"
+    assert again.get("lab").verify().ok
+    again.close()
+
+
+def test_an_empty_map_waits_for_its_first_place(atlas: Atlas) -> None:
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE)
+    assert settled(lab).tier == "exact"
+    lab.enrol([frame("first", dimension=DIMENSION)])
+    assert finds(lab, "first")
+    assert settled(lab).tier == "compact"
+    assert finds(lab, "first")
+    lab.forget("first")
+    assert lab.snapshot().search(descriptor_of("first", DIMENSION))[0].tolist() == []
+
+
+def test_whereabouts_of_a_few_rows_are_those_of_all(atlas: Atlas) -> None:
+    lab = make(atlas, index="compact")
+    lab.enrol([frame(f"at {i}".replace(" ", ""), dimension=DIMENSION, x=i) for i in range(5)])
+    found, rows = lab.snapshot(), np.array([PLACES + 3, 0, PLACES + 1])
+    few, every = found.whereabouts_at(rows), found.whereabouts.take(rows)
+    for name, column in vars(few).items():
+        np.testing.assert_array_equal(column, getattr(every, name))
+    assert len(found.whereabouts_at(np.arange(found.rows))) == found.rows
+    assert len(found.whereabouts_at(np.empty(0, np.int64))) == 0
+
+
+def test_compressed_maps_answer_too(directory: Path) -> None:
+    atlas = Atlas(directory, rows_per_segment=ROWS)
+    lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE, precision="compressed")
+    lab.enrol([frame(f"p{i}", dimension=DIMENSION) for i in range(PLACES)])
+    assert settled(lab).tier == "compact"
+    rows = [int(lab.snapshot().search(descriptor_of(f"p{i}", DIMENSION))[0][0]) for i in range(PLACES)]
+    assert rows == list(range(PLACES))
+    assert lab.verify().ok
+    atlas.close()
+    size = os.path.getsize(directory / "maps" / "lab" / "descriptors-000001.seg") - HEADER_BYTES
+    assert size == ROWS * (2 * (2 + 96) + 24 + 3 * (1 + 3))

@@ -1,0 +1,103 @@
+"""The audit trail: who asked is kept with a job, a refusal that repeats fills no disk, a file can be moved away."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+
+from core.errors import StorageFailure
+from service.access import audit
+from service.access.audit import Refusals, kept_in, note_change, told
+from service.access.principals import ASKER, Asker
+from service.jobs.jobs import Jobs
+
+EVE = Asker("eve", "0123456789ab", "prune_map", "a-request", None, "10.0.0.1")
+
+
+@pytest.fixture(autouse=True)
+def heard(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, audit.LOGGER)
+
+
+def test_what_is_not_known_is_left_out() -> None:
+    assert told(EVE) == {
+        "principal": "eve",
+        "key": "0123456789ab",
+        "operation": "prune_map",
+        "request_id": "a-request",
+        "client": "10.0.0.1",
+    }
+
+
+def test_a_request_that_changed_nothing_is_no_change(caplog: pytest.LogCaptureFixture) -> None:
+    note_change(EVE, {"map": "lab"}, {"map": "lab", "verdict": "recognized", "change": None}, 200)
+    assert caplog.records == []
+    note_change(EVE, {"map": "lab"}, {"change": None}, 507)
+    note_change(EVE, {"map": "lab"}, {"change": "created"}, 201)
+    note_change(EVE, {"map": "lab", "explanation": "x"}, {}, 204)
+    assert [(record.__dict__["map"], record.__dict__["status"]) for record in caplog.records] == [
+        ("lab", 507),
+        ("lab", 201),
+        ("lab", 204),
+    ]
+
+
+def test_a_job_tells_at_its_end_who_asked_for_it_over_a_restart(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = Jobs(tmp_path)
+    before.register("prune", lambda _context: {})
+    token = ASKER.set(EVE)
+    try:
+        job = before.submit("prune", "lab", arguments={"dry_run": False})
+        lost = before.submit("once", "lab", lambda _context: {})
+    finally:
+        ASKER.reset(token)
+    before.close(0.0)
+    after = Jobs(tmp_path)
+    after.register("prune", lambda _context: {})
+    after.start()
+    while not after.get(job.id).ended:
+        pass
+    after.close(5.0)
+    lines = {
+        (record.__dict__["job"], record.getMessage()): record.__dict__
+        for record in caplog.records
+        if record.name == audit.LOGGER
+    }
+    assert set(lines) == {(lost.id, "job failed"), (job.id, "job running"), (job.id, "job succeeded")}
+    for line in lines.values():
+        assert told(EVE).items() <= line.items() and line["map"] == "lab"
+    assert lines[lost.id, "job failed"]["problem"].endswith("job-lost")
+    assert lines[job.id, "job succeeded"]["dry_run"] is False
+
+
+def test_a_refusal_that_repeats_is_told_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusals = Refusals()
+    for _ in range(100):
+        refusals.note(EVE, {"map": "lab"}, 403, "role-too-low")
+    refusals.note(EVE, {"map": "lab"}, 429, "rate-exceeded")
+    assert [record.__dict__["problem"] for record in caplog.records] == ["role-too-low", "rate-exceeded"]
+    monkeypatch.setattr(audit, "REPEAT_SECONDS", 0.0)
+    refusals.note(EVE, {"map": "lab"}, 403, "role-too-low")
+    assert caplog.records[-1].__dict__["before"] == 99
+    for number in range(2 * audit.MOST_REFUSALS):
+        refusals.note(Asker("nobody", client=str(number)), {}, 401, "key-needed")
+    assert len(refusals._told) == audit.MOST_REFUSALS
+
+
+def test_a_file_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "audit.jsonl"
+    with kept_in(path):
+        note_change(EVE, {"map": "lab"}, {}, 200)
+        path.rename(tmp_path / "old.jsonl")
+        note_change(EVE, {"map": "yard"}, {}, 200)
+    note_change(EVE, {"map": "late"}, {}, 200)
+    for name, map_id in (("old.jsonl", "lab"), ("audit.jsonl", "yard")):
+        (line,) = (json.loads(text) for text in (tmp_path / name).read_text().splitlines())
+        assert (line["logger"], line["map"], line["principal"]) == ("placerec.audit", map_id, "eve")
+    with pytest.raises(StorageFailure, match="cannot be opened"), kept_in(tmp_path / "absent" / "audit.jsonl"):
+        pass

@@ -1,0 +1,287 @@
+"""Keys: how they are stored, what a running service knows of them, and what no damage and no clock may open."""
+
+from __future__ import annotations
+
+import sqlite3
+import stat
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from core.errors import InvalidIdentifier
+from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
+from service.access.keys import FILE, KeyStore
+from service.access.principals import TOKEN, Principal
+from service.errors.faults import InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self, now: float) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> KeyStore:
+    return KeyStore(tmp_path)
+
+
+def bearer(token: str) -> bytes:
+    return f"Bearer {token}".encode()
+
+
+def ring(store: KeyStore, wall: Clock | None = None, monotonic: Clock | None = None) -> Keyring:
+    """A keyring that looks at its file when a test says so."""
+    made = Keyring(store, wall or Clock(datetime.now(UTC).timestamp()), monotonic or Clock(0.0))
+    made._read()
+    return made
+
+
+# The file
+
+
+def test_a_key_is_kept_without_its_secret(store: KeyStore, tmp_path: Path) -> None:
+    assert not store.exists() and store.all() == []
+    until = datetime.now(UTC) + timedelta(days=30)
+    key, token = store.create("robot-7", "query", ["lab", "yard"], until)
+    match = TOKEN.fullmatch(token)
+    assert match is not None and match[1] == key.id and len(match[2]) == 43, "43 of 64 characters: 256 bits"
+    assert store.all() == [key]
+    assert (key.role, key.maps, key.expires_at) == ("query", frozenset({"lab", "yard"}), until)
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    assert stat.S_IMODE(store.path.stat().st_mode) == 0o600
+    assert match[2].encode() not in store.path.read_bytes() and token.encode() not in store.path.read_bytes()
+    assert store.create("other", "admin")[1] != token
+
+
+def test_what_cannot_be_a_key_is_refused(store: KeyStore) -> None:
+    past = datetime.now(UTC) - timedelta(seconds=1)
+    for name in ("", "two words", "a" * 65, "0123456789ab", "anonymous", "owner", "new\nline"):
+        with pytest.raises(InvalidRequest):
+            store.create(name, "query")
+    for role in ("open", "root"):
+        with pytest.raises(InvalidRequest):
+            store.create("ann", role)  # type: ignore[arg-type]
+    with pytest.raises(InvalidRequest):
+        store.create("ann", "query", None, past)
+    with pytest.raises(InvalidIdentifier):
+        store.create("ann", "query", ["Not A Map"])
+    assert not store.exists(), "nothing was made on the way"
+
+
+def test_a_name_is_free_again_when_its_key_is_revoked(store: KeyStore) -> None:
+    first, _ = store.create("ann", "query")
+    with pytest.raises(InvalidRequest, match="revoke it first"):
+        store.create("ann", "admin")
+    assert store.revoke("ann").id == first.id
+    moment = store.revoke(first.id).revoked_at
+    second, _ = store.create("ann", "admin")
+    assert store.revoke(first.id).revoked_at == moment, "once and for all"
+    assert store.revoke("ann").id == second.id, "the one that was in force"
+    for unknown in ("ann", "nobody", "000000000000"):
+        with pytest.raises(InvalidRequest):
+            store.revoke(unknown)
+
+
+def test_first_keys_at_one_moment_are_all_kept(store: KeyStore) -> None:
+    threads = [threading.Thread(target=store.create, args=(f"key-{number}", "query")) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {key.name for key in store.all()} == {f"key-{number}" for number in range(8)}
+    assert [path.name for path in store.path.parent.iterdir()] == [FILE]
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def _overwrite(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-300:] = b"\xff" * 300
+    path.write_bytes(bytes(data))
+
+
+def _promote(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("UPDATE keys SET role = 'admin', maps = NULL")
+        connection.commit()
+
+
+def _prolong(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("UPDATE keys SET expires_at = NULL")
+        connection.commit()
+
+
+def _replace(path: Path) -> None:
+    path.unlink()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("CREATE TABLE keys (id)")
+
+
+def _date_forward(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA user_version = 99")
+
+
+def _share(path: Path) -> None:
+    path.chmod(0o666)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [_empty, _cut, _overwrite, _promote, _prolong, _replace, _date_forward, _share],
+    ids=lambda one: one.__name__,
+)
+def test_a_damaged_file_lets_nobody_in(store: KeyStore, damage: Callable[[Path], None]) -> None:
+    _, token = store.create("ann", "query", ["lab"], datetime.now(UTC) + timedelta(days=1))
+    clock = Clock(0.0)
+    running = ring(store, monotonic=clock)
+    damage(store.path)
+    assert store.exists(), "keys are demanded all the same"
+    for action in (store.all, lambda: store.create("bob", "admin"), lambda: store.revoke("ann"), Keyring(store).start):
+        with pytest.raises(KeysUnreadable):
+            action()
+    running.look()
+    clock.now += GRACE_SECONDS
+    running.look()
+    for header in (bearer(token), None):
+        with pytest.raises(KeysUnreadable):
+            running.principal(header)
+    assert running.demanded
+
+
+# A running service
+
+
+def test_who_is_let_in(store: KeyStore) -> None:
+    _, token = store.create("robot", "query", ["lab"])
+    running = ring(store)
+    principal = running.principal(bearer(token))
+    assert principal == Principal("robot", store.all()[0].id, "query", frozenset({"lab"}))
+    assert principal.may_use("lab") and not principal.may_use("yard") and not principal.may_use("lab", "yard")
+    assert not principal.may_use(None), "what is of no map is not of this one"
+    assert running.principal(b"bearer  " + token.encode() + b" ") == principal
+    for header in (None, b"", b"Bearer", b"Basic YTpi", token.encode(), bearer(token[:-1]), bearer(token) + b"\xff"):
+        with pytest.raises(KeyNeeded):
+            running.principal(header)
+    other = token[:-1] + ("A" if token[-1] != "A" else "B")
+    unknown = "placerec_000000000000_" + token[-43:]
+    for wrong in (other, unknown):
+        with pytest.raises(KeyRefused, match="not one of this service"):
+            running.principal(bearer(wrong))
+
+
+def test_a_running_service_learns_of_every_change(store: KeyStore) -> None:
+    running = Keyring(store)
+    running.look()
+    assert not running.demanded
+    _, first = store.create("ann", "query")
+    running.look()
+    assert running.demanded and running.principal(bearer(first)).name == "ann"
+    _, second = store.create("bob", "query")
+    running.look()
+    assert running.principal(bearer(second)).name == "bob"
+    store.revoke("ann")
+    running.look()
+    with pytest.raises(KeyRefused, match="revoked"):
+        running.principal(bearer(first))
+    store.revoke("bob")
+    running.look()
+    assert running.demanded, "also when no key is in force"
+    running.close()
+
+
+def test_a_file_that_is_away_for_a_moment_and_for_good(store: KeyStore) -> None:
+    _, token = store.create("ann", "query")
+    clock = Clock(0.0)
+    running = ring(store, monotonic=clock)
+    aside = store.path.with_name("aside")
+    store.path.rename(aside)
+    running.look()
+    assert running.principal(bearer(token)).name == "ann", "another process may be putting it in place"
+    clock.now += GRACE_SECONDS
+    running.look()
+    with pytest.raises(KeysUnreadable, match="is gone"):
+        running.principal(bearer(token))
+    aside.rename(store.path)
+    running.look()
+    assert running.principal(bearer(token)).name == "ann"
+
+
+def test_a_disk_that_does_not_answer_ends_what_nobody_can_check(store: KeyStore) -> None:
+    _, token = store.create("ann", "query")
+    clock = Clock(0.0)
+    running = Keyring(store, monotonic=clock)
+    running._read()
+    running._thread = threading.current_thread()  # which is stuck
+    assert running.principal(bearer(token)).name == "ann"
+    clock.now += STUCK_SECONDS + 1
+    with pytest.raises(KeysUnreadable):
+        running.principal(bearer(token))
+
+
+def test_a_key_expires_and_no_clock_brings_it_back(store: KeyStore) -> None:
+    made = datetime.now(UTC)
+    _, token = store.create("ann", "query", None, made + timedelta(days=30))
+    _, lasting = store.create("bob", "query")
+    wall, monotonic = Clock(made.timestamp()), Clock(1000.0)
+    running = ring(store, wall, monotonic)
+    wall.now += 31 * 86400
+    with pytest.raises(KeyRefused, match="expired"):
+        running.principal(bearer(token))
+    wall.now = made.timestamp()
+    assert running.principal(bearer(token)), "the clock was wrong for a moment, which costs nobody a key"
+    monotonic.now += 30 * 86400  # the clock was set back again and again
+    with pytest.raises(KeyRefused, match="expired"):
+        running.principal(bearer(token))
+    assert running.principal(bearer(lasting))
+
+
+def test_a_clock_that_is_set_back_prolongs_no_use(store: KeyStore) -> None:
+    made = datetime.now(UTC)
+    _, token = store.create("ann", "query", None, made + timedelta(days=30))
+    long_ago = made.timestamp() - 10 * 365 * 86400
+    for _ in range(3):  # restarts, each with a clock of ten years ago
+        monotonic = Clock(0.0)
+        running = ring(store, Clock(long_ago), monotonic)
+        running.principal(bearer(token))
+        monotonic.now += 9 * 86400 + USE_SECONDS
+        running.principal(bearer(token))
+        running.look()
+        running.close()
+    with pytest.raises(KeyRefused, match="expired"):  # after 27 days
+        monotonic = Clock(0.0)
+        running = ring(store, Clock(long_ago), monotonic)
+        monotonic.now += 4 * 86400
+        running.principal(bearer(token))
+
+
+def test_last_uses_are_written_now_and_then(store: KeyStore) -> None:
+    _, token = store.create("ann", "query")
+    before = datetime.now(UTC)
+    monotonic = Clock(0.0)
+    running = ring(store, monotonic=monotonic)
+    running.principal(bearer(token))
+    running.look()
+    assert store.all()[0].last_used_at is None
+    monotonic.now += USE_SECONDS
+    running.look()
+    used = store.all()[0].last_used_at
+    assert used is not None and abs((used - before).total_seconds()) < 60
+    assert running.principal(bearer(token)), "its own note does not disturb it"
+    running.close()

@@ -1,0 +1,100 @@
+"""The table of roles: every way into the application has its row, and every row its way."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+from service.access.gate import Way, ways_of
+from service.access.roles import OPERATIONS, ROLES, Role, Rule, covers
+from service.app.application import create_app
+from service.http.openapi import document
+from service.settings import Settings
+
+OPEN = {"check_liveness", "check_readiness", "read_version", "read_openapi", "read_documentation"}
+READING = {"GET", "HEAD"}
+
+
+@pytest.fixture(scope="module")
+def ways() -> list[Way]:
+    return ways_of(create_app(Settings(host="127.0.0.1")).routes)
+
+
+@pytest.fixture(scope="module")
+def described() -> dict[str, Any]:
+    return document(create_app(Settings(host="127.0.0.1")))
+
+
+def test_every_route_has_a_row_and_every_row_a_route(ways: list[Way]) -> None:
+    there = {way.operation for way in ways}
+    assert there - set(OPERATIONS) == set(), "a route without a role: say in service/access/roles.py who may use it"
+    assert set(OPERATIONS) - there == set(), "a role without a route"
+    assert {"WEBSOCKET", "GET", "POST", "PUT", "PATCH", "DELETE"} <= {way.method for way in ways}
+
+
+def test_no_two_operations_have_one_name(ways: list[Way]) -> None:
+    assert len({(way.method, way.path) for way in ways}) == len(ways)
+    paths = {way.operation: way.path for way in ways}
+    assert all(paths[way.operation] == way.path for way in ways), "the second would have the first one's role"
+
+
+def test_what_is_open_to_all_is_named_here_too() -> None:
+    assert {operation for operation, role in ROLES.items() if role == "open"} == OPEN
+
+
+def test_a_route_below_a_map_is_held_to_it(ways: list[Way]) -> None:
+    for way in ways:
+        below = "{map}" in way.path
+        assert (way.rule.maps in ("path", "named")) >= below, f"{way.operation}: the map in its path is not looked at"
+        assert below or way.rule.maps != "path", f"{way.operation}: there is no map in its path"
+    stray = {way.path for way in ways if re.search(r"/maps/[^{]", way.path)}
+    assert stray <= {"/v1/maps/import"}, "a path that looks like a map's"
+
+
+def test_whoever_only_queries_changes_nothing(ways: list[Way]) -> None:
+    for way in ways:
+        if way.rule.changes:
+            assert way.method not in READING and covers(way.rule.role, "enrol"), way.operation
+
+
+def test_roles_are_ordered() -> None:
+    order: tuple[Role, ...] = ("query", "enrol", "admin")
+    for index, role in enumerate(order):
+        assert [covers(role, needed) for needed in order] == [place <= index for place in range(3)]
+        assert covers(role, "open") and not covers("open", role)
+
+
+def test_a_route_that_was_forgotten_needs_the_highest_role() -> None:
+    app = create_app(Settings(host="127.0.0.1"))
+
+    @app.get("/v1/new")
+    def forgotten() -> None:
+        """Nobody wrote down who may use it."""
+
+    (way,) = (way for way in ways_of(app.routes) if way.operation == "forgotten")
+    assert way.rule == Rule("admin", "all", changes=True)
+
+
+def test_a_route_of_an_unknown_kind_does_not_slip_through() -> None:
+    app = create_app(Settings(host="127.0.0.1"))
+    app.mount("/files", create_app(Settings(host="127.0.0.1")))
+    with pytest.raises(TypeError, match="not guarded"):
+        ways_of(app.routes)
+
+
+def test_the_interface_says_what_each_operation_needs(described: dict[str, Any]) -> None:
+    assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
+    for item in described["paths"].values():
+        for operation in item.values():
+            name, role = operation["operationId"], ROLES[operation["operationId"]]
+            assert operation["x-role"] == role
+            answers = set(operation["responses"])
+            if role == "open":
+                assert operation["security"] == [] and not answers & {"401", "403", "429"}, name
+            else:
+                assert {"key": []} in operation["security"] and {"401", "403", "429"} <= answers, name
+                assert "a key of" in operation["description"], name
+            if role in ("enrol", "admin"):
+                assert f"`{role}`" in operation["description"], name

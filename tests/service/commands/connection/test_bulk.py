@@ -1,0 +1,154 @@
+"""Two batches under way at a time: whatever happens on the way, places keep their order."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.commands.connection import bulk
+from service.commands.connection.bulk import Outcome, enrol_frames
+from service.commands.connection.client import Refused, Service
+from service.commands.console import Failure
+from service.commands.manifest import Frame
+from tests.service.commands.connection.test_client import problem
+from tests.service.places.test_batch_order import order
+from tests.service.scenes import jpeg
+from tests.service.server import Server
+from tests.service.upkeep.upkeeping import wait_until
+
+
+class Mischief(httpx.AsyncBaseTransport):
+    """A way to a service on which some batches have other answers than its own, or none.
+
+    Args:
+        answers: by the number of the batch, counted from 1 as they are sent.
+        lost: the numbers of those that the service takes, but whose answers are lost.
+    """
+
+    def __init__(self, answers: Mapping[int, httpx.Response | Exception], lost: Sequence[int] = ()) -> None:
+        self._way, self._answers, self._lost = httpx.AsyncHTTPTransport(), answers, lost
+        self.sent: list[httpx.QueryParams] = []
+        self.under_way = self.most = 0
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        self.sent.append(request.url.params)
+        number = len(self.sent)
+        if (answer := self._answers.get(number)) is not None:
+            await asyncio.sleep(0.2)  # so that the one behind is there before
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+        self.under_way += 1
+        self.most = max(self.most, self.under_way)
+        try:
+            response = await self._way.handle_async_request(request)
+            await response.aread()
+        finally:
+            self.under_way -= 1
+        if number in self._lost:
+            raise httpx.ReadError("the answer was lost", request=request)
+        return response
+
+    async def aclose(self) -> None:
+        await self._way.aclose()
+
+
+def enrol(server: Server, map_id: str, folder: Path, count: int, way: Mischief) -> list[Outcome]:
+    frames = []
+    for index in range(count):
+        (folder / f"{index}.jpg").write_bytes(jpeg(index, 64, 48))
+        frames.append(Frame(folder / f"{index}.jpg", f"p{index}", "walk", listed=True))
+    told: list[Outcome] = []
+
+    async def work() -> None:
+        async with httpx.AsyncClient(transport=way, base_url=server.client.base_url, timeout=60) as client:
+            await enrol_frames(Service(client, "The service"), map_id, frames, frozenset(), None, told.append)
+
+    try:
+        asyncio.run(work())
+    finally:
+        assert [one.frame.id for one in told] == [f"p{index}" for index in range(len(told))]
+    return told
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bulk, "FIRST_BATCH", 4)
+    monkeypatch.setattr(bulk, "LARGEST_BATCH", 4)
+
+
+def test_two_at_a_time_in_line(server: Server, map_id: str, tmp_path: Path) -> None:
+    way = Mischief({})
+    told = enrol(server, map_id, tmp_path, 26, way)
+    assert order(server, map_id) == [f"p{index}" for index in range(26)]
+    assert {one.change for one in told} == {"created"} and len(told) == 26
+    assert way.most == 2 and len(way.sent) == 7
+    names = [line["batch"] for line in way.sent]
+    assert [line.get("after") for line in way.sent] == [None, None, *names[1:-1]]
+
+
+def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, map_id: str, tmp_path: Path) -> None:
+    way = Mischief(
+        {
+            3: problem(503, "queue-full", **{"Retry-After": "0"}),
+            7: httpx.ConnectError("refused"),
+            11: problem(409, "batch-out-of-order"),
+        },
+        lost=[5, 9],
+    )
+    told = enrol(server, map_id, tmp_path, 60, way)
+    assert order(server, map_id) == [f"p{index}" for index in range(60)]
+    assert {one.change for one in told} <= {"created", "unchanged"} and len(told) == 60
+    assert len(way.sent) > 15  # those that were sent once more
+
+
+def test_more_than_the_service_takes_at_a_time(server: Server, map_id: str, tmp_path: Path) -> None:
+    way = Mischief({4: problem(413, "body-too-large"), 8: problem(503, "deadline-exceeded", **{"Retry-After": "1"})})
+    assert len(enrol(server, map_id, tmp_path, 30, way)) == 30
+    assert order(server, map_id) == [f"p{index}" for index in range(30)]
+
+
+@pytest.mark.parametrize("failing", [1, 2, 4])
+def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, tmp_path: Path, failing: int) -> None:
+    way = Mischief({failing: problem(507, "storage-full")})
+    with pytest.raises(Refused, match="It is storage-full"):
+        enrol(server, map_id, tmp_path, 40, way)
+    assert len(way.sent) <= failing + 1
+    before = 4 * (failing - 1)
+    assert order(server, map_id) == [f"p{index}" for index in range(before)]
+    # The same again goes on.
+    enrol(server, map_id, tmp_path, 40, Mischief({}))
+    assert order(server, map_id) == [f"p{index}" for index in range(40)]
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("moment", [13, 30])
+def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
+    monkeypatch.setattr(bulk, "PATIENCE", 0.0)
+    server = Server(tmp_path / "service").wait()
+    server.create_map("walk")
+    way, ended = Mischief({}), list[BaseException]()
+
+    def send() -> None:
+        try:
+            enrol(server, "walk", tmp_path, 160, way)
+        except Failure as error:
+            ended.append(error)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    wait_until(lambda: len(way.sent) >= moment)
+    server.kill()
+    sender.join(60)
+    assert len(ended) == 1
+    server = Server(tmp_path / "service").wait()
+    kept = order(server, "walk")
+    assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 160
+    enrol(server, "walk", tmp_path, 160, Mischief({}))
+    assert order(server, "walk") == [f"p{index}" for index in range(160)]
+    assert server.stop() == 0

@@ -1,0 +1,216 @@
+"""The encoder's turn: bounded, timed, given up by those who leave, and never in the way of the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+
+import pytest
+
+from core.errors import NotAnImage, UnknownEncoder
+from core.frames.images import Limits
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from service.engine.queue import Inference, Patience
+from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
+from service.telemetry.metrics import Metrics
+from tests.service.scenes import encoded, jpeg, scene
+from tests.service.server import Server, assert_problem
+
+pytestmark = pytest.mark.anyio
+IDENTITY = EncoderCatalogue().resolve(DEFAULT_ENCODER)
+
+
+async def stays() -> None:
+    """A caller who does not hang up."""
+    await asyncio.Event().wait()
+
+
+def patience(seconds: float = 30) -> Patience:
+    return Patience(time.monotonic() + seconds, stays)
+
+
+@pytest.fixture
+async def inference() -> AsyncIterator[Inference]:
+    made = Inference(EncoderCatalogue(), Limits(), queue_length=2, threads=0, metrics=Metrics())
+    await made.load(IDENTITY)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def busy(inference: Inference) -> Iterator[threading.Event]:
+    """The encoder is at work until the event is set."""
+    done, begun = threading.Event(), threading.Event()
+
+    def work() -> None:
+        begun.set()
+        done.wait(30)
+
+    inference._batches.call(work)
+    assert begun.wait(5)
+    yield done
+    done.set()
+
+
+def frames_encoded(inference: Inference) -> float:
+    return inference._metrics.registry.get_sample_value("placerec_encode_stage_seconds_count", {"stage": "vlad"}) or 0
+
+
+async def test_a_frame_is_decoded_and_encoded(inference: Inference) -> None:
+    encoded = await inference.encode(IDENTITY, jpeg(1), patience())
+    assert encoded.pixels.shape == (240, 320, 3) and len(encoded.encoding.regions) > 0
+    assert set(encoded.milliseconds) == {"wait", "decode", "forward", "regions", "vlad"}
+    assert frames_encoded(inference) == 1
+
+
+async def test_the_event_loop_goes_on(inference: Inference, busy: threading.Event) -> None:
+    waiting = asyncio.ensure_future(inference.encode(IDENTITY, jpeg(1), patience()))
+    start = time.monotonic()
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert time.monotonic() - start < 0.5 and not waiting.done()
+    busy.set()
+    assert (await waiting).milliseconds["wait"] > 0
+
+
+async def test_a_full_queue_refuses(inference: Inference) -> None:
+    with inference.place_in_queue(), inference.place_in_queue():
+        with pytest.raises(QueueFull):
+            inference.check_room()
+        with pytest.raises(QueueFull), inference.place_in_queue():
+            pass
+    inference.check_room()
+    assert inference._metrics.registry.get_sample_value("placerec_queue_length") == 0
+
+
+async def test_a_late_frame_is_dropped_before_it_is_encoded(inference: Inference, busy: threading.Event) -> None:
+    start = time.monotonic()
+    with pytest.raises(DeadlineExceeded):
+        await inference.encode(IDENTITY, jpeg(1), patience(0.2))
+    assert time.monotonic() - start < 5, "told at the deadline, not when the encoder is free"
+    with pytest.raises(DeadlineExceeded):
+        await inference.encode(IDENTITY, jpeg(1), patience(-1))
+    busy.set()
+    await inference.encode(IDENTITY, jpeg(2), patience())
+    assert frames_encoded(inference) == 1
+
+
+async def test_who_hangs_up_is_dropped(inference: Inference, busy: threading.Event) -> None:
+    async def leaves() -> None:
+        await asyncio.sleep(0.05)
+
+    with pytest.raises(ClientGone):
+        await inference.encode(IDENTITY, jpeg(1), Patience(time.monotonic() + 30, leaves))
+    busy.set()
+    await inference.encode(IDENTITY, jpeg(2), patience())
+    assert frames_encoded(inference) == 1
+
+
+async def test_a_cancelled_request_is_dropped(inference: Inference, busy: threading.Event) -> None:
+    waiting = asyncio.ensure_future(inference.encode(IDENTITY, jpeg(1), patience()))
+    await asyncio.sleep(0.05)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    busy.set()
+    await inference.encode(IDENTITY, jpeg(2), patience())
+    assert frames_encoded(inference) == 1
+
+
+async def test_a_poisoned_frame_fails_alone(inference: Inference) -> None:
+    frames = [jpeg(1), b"poison", jpeg(2)]
+    results = await asyncio.gather(
+        *(inference.encode(IDENTITY, data, patience()) for data in frames), return_exceptions=True
+    )
+    assert isinstance(results[1], NotAnImage)
+    assert not isinstance(results[0], BaseException) and not isinstance(results[2], BaseException)
+
+
+async def test_an_encoder_that_is_not_there(inference: Inference) -> None:
+    with pytest.raises(UnknownEncoder):
+        await inference.load("absent")
+    with pytest.raises(UnknownEncoder):
+        await inference.encode("absent", jpeg(1), patience())
+
+
+async def test_turns_are_taken_in_order(inference: Inference, busy: threading.Event) -> None:
+    order: list[int] = []
+
+    async def one(number: int) -> None:
+        await inference.encode(IDENTITY, jpeg(number), patience())
+        order.append(number)
+
+    waiting = []
+    for number in range(4):
+        waiting.append(asyncio.ensure_future(one(number)))
+        await asyncio.sleep(0.01)
+    busy.set()
+    await asyncio.gather(*waiting)
+    assert order == [0, 1, 2, 3]
+
+
+HEADERS = {"Content-Type": "image/jpeg"}
+
+
+def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> None:
+    frame = encoded(scene(1), quality=60)
+    with ThreadPoolExecutor(16) as pool:
+        answers = list(
+            pool.map(lambda _: tight_server.client.post("/v1/encode", content=frame, headers=HEADERS), range(64))
+        )
+    statuses = {answer.status_code for answer in answers}
+    assert statuses == {200, 503}
+    for answer in answers:
+        if answer.status_code == 503:
+            assert_problem(answer, 503, "queue-full")
+            assert 1 <= int(answer.headers["retry-after"]) <= 3
+    assert tight_server.client.post("/v1/encode", content=frame, headers=HEADERS).status_code == 200
+    assert 'placerec_problems_total{type="queue-full"}' in tight_server.client.get("/metrics").text
+
+
+def test_a_server_at_work_is_alive_and_keeps_deadlines(server: Server) -> None:
+    slow = encoded(scene(1, 4000, 4000))
+    with ThreadPoolExecutor(4) as pool:
+        heavy = [pool.submit(server.client.post, "/v1/encode", content=slow, headers=HEADERS) for _ in range(4)]
+        slowest, late = 0.0, []
+        while not all(job.done() for job in heavy):
+            start = time.monotonic()
+            assert server.client.get("/livez").status_code == 200
+            slowest = max(slowest, time.monotonic() - start)
+            hurried = {**HEADERS, "X-Request-Timeout": "0.02"}
+            late.append(server.client.post("/v1/encode", content=jpeg(1), headers=hurried))
+        assert all(job.result().status_code == 200 for job in heavy)
+    assert slowest < 1
+    refused = [answer for answer in late if answer.status_code == 503]
+    assert refused, "a frame that would have waited for a large one was dropped"
+    for answer in refused:
+        assert_problem(answer, 503, "deadline-exceeded")
+        assert 1 <= int(answer.headers["retry-after"]) <= 3
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "soon", "nan", "inf", "1e9"])
+def test_a_bad_deadline(server: Server, value: str) -> None:
+    response = server.client.post("/v1/encode", content=jpeg(1), headers={**HEADERS, "X-Request-Timeout": value})
+    assert_problem(response, 422, "invalid-request")
+
+
+def test_requests_of_many_frames_have_half_of_the_queue() -> None:
+    inference = Inference(EncoderCatalogue(), Limits(), 8, 0, Metrics())
+    try:
+        with ExitStack() as places:
+            for _ in range(4):
+                places.enter_context(inference.place_in_queue(2))
+            with pytest.raises(QueueFull), inference.place_in_queue(2):
+                pass
+            for _ in range(4):
+                places.enter_context(inference.place_in_queue(1))
+            with pytest.raises(QueueFull), inference.place_in_queue(1):
+                pass
+        with inference.place_in_queue(2):
+            assert inference.waiting == 1
+    finally:
+        inference.close()

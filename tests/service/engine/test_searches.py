@@ -1,0 +1,163 @@
+"""Searches that come together are one search, and answer as each would alone."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from core.errors import StorageFailure
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder, Encoding
+from core.places import PlaceFields
+from core.recognition.localization import Located, locate
+from core.storage import Atlas, Enrolment, Map, MapSettings
+from service.engine import searches
+from service.engine.searches import MOST_TOGETHER, Searches
+from tests.service.scenes import scene, seen_again
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.fixture(scope="module")
+def encoder() -> Encoder:
+    catalogue = EncoderCatalogue()
+    return catalogue.get(catalogue.resolve(DEFAULT_ENCODER))
+
+
+@pytest.fixture(scope="module")
+def queries(encoder: Encoder) -> list[Encoding]:
+    return encoder.encode_batch([seen_again(scene(seed), seed) for seed in range(6)])
+
+
+@pytest.fixture(scope="module")
+def map_(encoder: Encoder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
+    with map_of_scenes(encoder, tmp_path_factory.mktemp("atlas"), 6) as made:
+        yield made
+
+
+@contextmanager
+def map_of_scenes(encoder: Encoder, folder: Path, count: int) -> Iterator[Map]:
+    """So many scenes as the places p0, p1, …"""
+    atlas = Atlas(folder / "data")
+    made = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
+    encodings = encoder.encode_batch([scene(seed) for seed in range(count)])
+    made.enrol([enrolment(seed, encoding) for seed, encoding in enumerate(encodings)])
+    yield made
+    atlas.close()
+
+
+def enrolment(seed: int, encoding: Encoding) -> Enrolment:
+    return Enrolment(
+        id=f"p{seed}",
+        fields=PlaceFields(sequence="monday"),
+        descriptor=encoding.descriptor,
+        local=encoding.local,
+        regions=len(encoding.regions),
+        digest=bytes([seed]) * 32,
+        thumbnail=None,
+        image=None,
+    )
+
+
+@pytest.fixture
+def sizes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many queries each search was for."""
+    noted: list[int] = []
+
+    def noting(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Located]:
+        noted.append(len(encodings))
+        return locate(map_, encoder, encodings, *more)
+
+    monkeypatch.setattr(searches, "locate", noting)
+    return noted
+
+
+def ids(located: Located) -> list[str]:
+    return [place.id for _, place in located.matches]
+
+
+async def test_together_as_alone(map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]) -> None:
+    together = Searches()
+    together._at_once = 1
+    found = await asyncio.gather(*(together.locate(map_, encoder, [query], 3) for query in queries))
+    assert sizes == [len(queries)], "all that came in one moment were one search"
+    for query, (one,) in zip(queries, found, strict=True):
+        (alone,) = locate(map_, encoder, [query], 3)
+        assert ids(one) == ids(alone)
+        assert one.judgement.verdict == alone.judgement.verdict
+        np.testing.assert_allclose(
+            [score for score, _ in one.matches], [score for score, _ in alone.matches], rtol=0, atol=1e-5
+        )
+    assert not together._waiting and not together._running
+
+
+async def test_what_comes_meanwhile_is_the_next_search(
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+) -> None:
+    together = Searches()
+    together._at_once = 1
+    first = asyncio.ensure_future(together.locate(map_, encoder, queries[:1], 3))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    later = [asyncio.ensure_future(together.locate(map_, encoder, [query], 3)) for query in queries[1:5]]
+    await asyncio.gather(first, *later)
+    assert sizes == [1, 4]
+
+
+async def test_other_purposes_are_searched_apart(
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+) -> None:
+    together = Searches()
+    three, two = await asyncio.gather(
+        together.locate(map_, encoder, queries[:2], 3), together.locate(map_, encoder, queries[2:4], 2)
+    )
+    assert [len(one.matches) for one in three] == [3, 3] and [len(one.matches) for one in two] == [2, 2]
+    assert [ids(one)[0] for one in [*three, *two]] == ["p0", "p1", "p2", "p3"]
+    assert sum(sizes) == 4 and len(sizes) >= 2
+
+
+async def test_a_large_batch_is_several_searches_in_its_order(
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+) -> None:
+    many = [queries[index % len(queries)] for index in range(2 * MOST_TOGETHER + 3)]
+    found = await Searches().locate(map_, encoder, many, 1)
+    assert [ids(one) for one in found] == [[f"p{index % len(queries)}"] for index in range(len(many))]
+    assert max(sizes) <= MOST_TOGETHER
+
+
+async def test_a_failing_query_fails_alone(
+    map_: Map, encoder: Encoder, queries: list[Encoding], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Located]:
+        if any(encoding is queries[1] for encoding in encodings):
+            raise StorageFailure("the disk cannot be read")
+        return locate(map_, encoder, encodings, *more)
+
+    monkeypatch.setattr(searches, "locate", failing)
+    together = Searches()
+    found = await asyncio.gather(
+        *(together.locate(map_, encoder, [query], 1) for query in queries[:3]), return_exceptions=True
+    )
+    assert isinstance(found[1], StorageFailure)
+    assert [ids(found[index][0]) for index in (0, 2)] == [["p0"], ["p2"]]  # type: ignore[index]
+    (after,) = await together.locate(map_, encoder, queries[3:4], 1)
+    assert ids(after) == ["p3"]
+
+
+async def test_who_gives_up_does_not_hold_the_others_up(map_: Map, encoder: Encoder, queries: list[Encoding]) -> None:
+    together = Searches()
+    given_up = asyncio.ensure_future(together.locate(map_, encoder, queries[:1], 1))
+    other = asyncio.ensure_future(together.locate(map_, encoder, queries[1:2], 1))
+    await asyncio.sleep(0)
+    given_up.cancel()
+    (found,) = await other
+    assert ids(found) == ["p1"]
+    with pytest.raises(asyncio.CancelledError):
+        await given_up

@@ -1,0 +1,91 @@
+"""The interface's description: complete, stable, and the one in the repository."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import httpx
+import pytest
+
+from service.app.application import create_app
+from service.http.openapi import document
+from service.settings import Settings
+from tests.service.server import ROOT
+
+OPERATIONS = {
+    "check_liveness", "check_readiness", "read_metrics", "read_version",
+    "create_map", "list_maps", "read_map", "edit_map", "delete_map", "verify_map",
+    "enrol_place", "enrol_places", "list_places", "read_place", "edit_place", "forget_place", "see_thumbnail",
+    "list_sequences", "delete_sequence",
+    "put_camera", "list_cameras", "read_camera", "forget_camera",
+    "query", "query_batch", "query_maps", "query_or_enrol", "see_explanation",
+    "create_session", "list_sessions", "read_session", "delete_session", "send_frame",
+    "calibrate_map", "reencode_map", "check_health", "prune_map", "merge_map", "rebuild_map",
+    "export_map", "import_map",
+    "list_jobs", "read_job", "follow_job", "cancel_job",
+    "encode", "regions", "match", "list_encoders",
+}  # fmt: skip
+FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")
+
+
+@pytest.fixture(scope="module")
+def described() -> dict[str, Any]:
+    return document(create_app(Settings(host="127.0.0.1")))
+
+
+@pytest.fixture(scope="module")
+def operations(described: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {operation["operationId"]: operation for item in described["paths"].values() for operation in item.values()}
+
+
+def test_the_file_in_the_repository_is_current(described: dict[str, Any]) -> None:
+    stored = json.loads((ROOT / "openapi.json").read_text())
+    assert stored == described, "openapi.json is stale: run scripts/openapi"
+
+
+def test_the_server_gives_the_same(client: httpx.Client, described: dict[str, Any]) -> None:
+    assert client.get("/openapi.json").json() == described
+
+
+def test_operation_ids_are_those_that_clients_were_made_from(operations: dict[str, dict[str, Any]]) -> None:
+    assert set(operations) == OPERATIONS
+
+
+def test_every_operation_is_described(operations: dict[str, dict[str, Any]]) -> None:
+    for name, operation in operations.items():
+        assert operation["description"] and operation["tags"], name
+        assert "application/problem+json" in operation["responses"]["default"]["content"], name
+        for parameter in operation.get("parameters", []):
+            assert parameter.get("description") or parameter["schema"].get("description"), (name, parameter["name"])
+
+
+def test_the_frameworks_own_errors_are_not_promised(described: dict[str, Any]) -> None:
+    assert "HTTPValidationError" not in json.dumps(described)
+
+
+def test_frames_may_be_raw_or_in_a_form(operations: dict[str, dict[str, Any]]) -> None:
+    for name in FRAME_OPERATIONS:
+        content = operations[name]["requestBody"]["content"]
+        assert set(content) == {"image/jpeg", "image/png", "image/webp", "multipart/form-data"}
+        assert content["image/jpeg"]["schema"] == {"type": "string", "format": "binary"}
+        query = {p["name"] for p in operations[name]["parameters"] if p["in"] == "query"}
+        assert query < set(content["multipart/form-data"]["schema"]["properties"]), "fields are the parameters"
+
+
+def test_problems_are_declared_by_status(operations: dict[str, dict[str, Any]]) -> None:
+    declared = {name: set(operation["responses"]) for name, operation in operations.items()}
+    assert {"200", "201", "400", "404", "409", "413", "415", "422", "503", "507"} <= declared["enrol_place"]
+    assert {"200", "400", "404", "409", "413", "415", "422", "503"} <= declared["query"]
+    assert "412" in declared["edit_map"] and "409" in declared["create_map"]
+
+
+def test_every_reference_leads_somewhere(described: dict[str, Any]) -> None:
+    for kind, name in re.findall(r'"#/components/([^/]+)/([^"]+)"', json.dumps(described)):
+        assert name in described["components"][kind]
+
+
+def test_answers_have_examples(described: dict[str, Any]) -> None:
+    for name in ("QueryAnswer", "EnrolledPlace", "PlaceView", "MapView", "NewMap", "PlaceChanges", "MapChanges"):
+        assert described["components"]["schemas"][name]["examples"], name

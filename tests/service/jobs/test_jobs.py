@@ -1,0 +1,374 @@
+"""Jobs without HTTP: their turn, their end, what a restart makes of them, and what a disk that refuses does."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.errors import DataDirectoryTooNew, UnknownMap
+from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
+from service.jobs.jobs import JobContext, Jobs
+from service.jobs.records import FILE, Job
+
+Kinds = Mapping[str, Callable[[JobContext], Mapping[str, Any]]]
+
+
+@contextmanager
+def running(folder: Path, kinds: Kinds | None = None, **limits: int) -> Iterator[Jobs]:
+    jobs = Jobs(folder, **limits)
+    for kind, work in (kinds or {}).items():
+        jobs.register(kind, work)
+    jobs.start()
+    try:
+        yield jobs
+    finally:
+        jobs.close(patience=5)
+
+
+def end_of(jobs: Jobs, job: Job) -> Job:
+    until = time.monotonic() + 10
+    while not (found := jobs.get(job.id)).ended:
+        assert time.monotonic() < until, found
+        time.sleep(0.005)
+    return found
+
+
+class Gate:
+    """Work that says when it has begun, and goes on when it is let."""
+
+    def __init__(self) -> None:
+        self.begun, self.open = threading.Event(), threading.Event()
+
+    def __call__(self, context: JobContext) -> dict[str, Any]:
+        context.progress(1, 4, "at the gate")
+        self.begun.set()
+        while not self.open.is_set():
+            context.pause(0.01)
+        return {"passed": context.arguments}
+
+
+def test_a_job_runs_and_is_remembered(tmp_path: Path) -> None:
+    with running(tmp_path) as jobs:
+        job = jobs.submit("sum", "lab", lambda _: {"sum": 3})
+        assert job.state == "queued" and job.map_id == "lab"
+        ended = end_of(jobs, job)
+        assert (ended.state, ended.result, ended.attempt) == ("succeeded", {"sum": 3}, 1)
+        assert ended.started_at and ended.ended_at and job.created_at <= ended.started_at <= ended.ended_at
+    with running(tmp_path) as jobs:
+        assert jobs.get(job.id) == ended
+
+
+def test_a_job_that_fails_says_why_and_a_defect_of_ours_is_not_told(tmp_path: Path) -> None:
+    def refuse(_: JobContext) -> dict[str, Any]:
+        raise UnknownMap("There is no map 'lab'.")
+
+    def break_down(_: JobContext) -> dict[str, Any]:
+        raise RuntimeError("secret")
+
+    with running(tmp_path) as jobs:
+        refused = end_of(jobs, jobs.submit("refuse", None, refuse))
+        broken = end_of(jobs, jobs.submit("break", None, break_down))
+        no_json = end_of(jobs, jobs.submit("odd", None, lambda _: {"value": float("nan")}))
+    assert refused.state == broken.state == no_json.state == "failed"
+    assert refused.problem is not None and broken.problem is not None
+    assert refused.problem["type"] == "urn:placerec:problem:unknown-map"
+    assert refused.problem["detail"] == "There is no map 'lab'."
+    assert broken.problem["type"] == "urn:placerec:problem:internal-error"
+    assert "secret" not in str(broken)
+
+
+def test_jobs_take_turns_and_the_queue_is_bounded(tmp_path: Path) -> None:
+    gate, order = Gate(), list[int]()
+
+    def noting(number: int) -> Callable[[JobContext], dict[str, Any]]:
+        def note(_: JobContext) -> dict[str, Any]:
+            order.append(number)
+            return {}
+
+        return note
+
+    with running(tmp_path, longest_queue=2) as jobs:
+        first = jobs.submit("gate", None, gate)
+        assert gate.begun.wait(5)
+        waiting = [jobs.submit("note", None, noting(number)) for number in range(2)]
+        with pytest.raises(JobQueueFull):
+            jobs.submit("note", None, lambda _: {})
+        assert [jobs.get(job.id).state for job in (first, *waiting)] == ["running", "queued", "queued"]
+        gate.open.set()
+        assert [end_of(jobs, job).state for job in waiting] == ["succeeded"] * 2
+    assert order == [0, 1]
+
+
+def test_two_workers_never_work_on_one_map(tmp_path: Path) -> None:
+    first, other = Gate(), Gate()
+    with running(tmp_path, workers=2) as jobs:
+        jobs.submit("gate", "lab", first)
+        second = jobs.submit("note", "lab", lambda _: {})
+        jobs.submit("gate", "hall", other)
+        assert first.begun.wait(5) and other.begun.wait(5)
+        assert jobs.get(second.id).state == "queued"
+        first.open.set()
+        assert end_of(jobs, second).state == "succeeded"
+        other.open.set()
+
+
+def test_cancelling(tmp_path: Path) -> None:
+    gate, undone = Gate(), threading.Event()
+
+    def careful(context: JobContext) -> Mapping[str, Any]:
+        try:
+            return gate(context)
+        finally:
+            undone.set()
+
+    with running(tmp_path) as jobs:
+        job = jobs.submit("gate", None, careful)
+        waiting = jobs.submit("note", None, lambda _: {})
+        assert gate.begun.wait(5)
+        assert jobs.cancel(waiting.id).state == "cancelled"
+        assert jobs.cancel(job.id).cancelling
+        assert end_of(jobs, job).state == "cancelled" and undone.is_set()
+        assert jobs.cancel(job.id).state == "cancelled", "cancelling twice is no error"
+        done = end_of(jobs, jobs.submit("note", None, lambda _: {}))
+        with pytest.raises(JobEnded):
+            jobs.cancel(done.id)
+        with pytest.raises(UnknownJob):
+            jobs.cancel("none")
+
+
+def test_a_stop_interrupts_and_the_next_start_goes_on(tmp_path: Path) -> None:
+    gate = Gate()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        job = jobs.submit("gate", "lab", arguments={"to": "hall"})
+        waiting = jobs.submit("gate", None, arguments={"number": 2})
+        lost = jobs.submit("note", None, lambda _: {})
+        assert gate.begun.wait(5)
+    gate.open.set()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        again = end_of(jobs, job)
+        assert (again.state, again.attempt, again.result) == ("succeeded", 2, {"passed": {"to": "hall"}})
+        assert end_of(jobs, waiting).result == {"passed": {"number": 2}}
+        failed = jobs.get(lost.id)
+        assert failed.state == "failed" and failed.problem is not None
+        assert failed.problem["type"] == "urn:placerec:problem:job-lost"
+
+
+def test_a_job_that_cannot_be_taken_up_again_fails_when_the_service_stops(tmp_path: Path) -> None:
+    gate = Gate()
+    with running(tmp_path) as jobs:
+        job = jobs.submit("gate", None, gate)
+        assert gate.begun.wait(5)
+    with running(tmp_path) as jobs:
+        failed = jobs.get(job.id)
+        assert failed.state == "failed" and failed.problem is not None
+        assert failed.problem["type"] == "urn:placerec:problem:job-lost"
+
+
+def test_a_resumed_job_has_its_notes_and_is_still_cancelled(tmp_path: Path) -> None:
+    begun = threading.Event()
+    seen: list[tuple[Mapping[str, Any], bool]] = []
+
+    def noting(context: JobContext) -> dict[str, Any]:
+        seen.append((context.notes, context.cancelled))
+        context.remember(plan=["a", "b"])
+        begun.set()
+        while context.attempt == 1 and not jobs.stopping:  # deaf to being cancelled
+            time.sleep(0.005)
+        context.check_cancelled()
+        return {}
+
+    with running(tmp_path, {"note": noting}) as jobs:
+        job = jobs.submit("note", None, arguments={})
+        assert begun.wait(5)
+        assert jobs.cancel(job.id).cancelling
+    with running(tmp_path, {"note": noting}) as jobs:
+        assert end_of(jobs, job).state == "cancelled"
+    assert seen == [({}, False), ({"plan": ["a", "b"]}, True)]
+
+
+def test_the_history_is_bounded(tmp_path: Path) -> None:
+    with running(tmp_path, history=3) as jobs:
+        made = [end_of(jobs, jobs.submit("note", None, lambda _: {})) for _ in range(6)]
+        assert [job.id for job in jobs.all()] == [job.id for job in made[3:]]
+        with pytest.raises(UnknownJob):
+            jobs.get(made[0].id)
+    with running(tmp_path, history=3) as jobs:
+        assert [job.number for job in jobs.all()] == [4, 5, 6]
+        assert jobs.submit("note", None, lambda _: {}).number == 7
+
+
+def test_progress_grows_and_its_versions_differ(tmp_path: Path) -> None:
+    gate, versions = Gate(), set()
+    with running(tmp_path) as jobs:
+        job = jobs.submit("gate", None, gate)
+        versions.add(job.version)
+        assert gate.begun.wait(5)
+        now = jobs.get(job.id)
+        assert (now.done, now.total, now.message) == (1, 4, "at the gate")
+        versions.add(now.version)
+        gate.open.set()
+        versions.add(end_of(jobs, job).version)
+    assert len(versions) == 3
+
+
+@pytest.mark.anyio
+async def test_watchers_are_bounded(tmp_path: Path) -> None:
+    gate = Gate()
+    with running(tmp_path, most_watchers=1) as jobs:
+        job = jobs.submit("gate", None, gate)
+        with jobs.watching(job.id) as changed:
+            with pytest.raises(TooManyWatchers), jobs.watching(job.id):
+                pass
+            gate.open.set()
+            await changed.wait()
+        with jobs.watching(job.id):
+            pass
+
+
+def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"this is no database" * 100)
+    with running(tmp_path) as jobs:
+        assert jobs.all() == []
+        assert end_of(jobs, jobs.submit("note", None, lambda _: {})).state == "succeeded"
+    assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
+
+
+def test_a_file_of_a_later_version_is_refused(tmp_path: Path) -> None:
+    import sqlite3
+
+    with running(tmp_path):
+        pass
+    connection = sqlite3.connect(tmp_path / FILE)
+    connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(DataDirectoryTooNew):
+        Jobs(tmp_path)
+
+
+def test_work_goes_on_when_the_disk_refuses_to_remember_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sqlite3
+
+    gate = Gate()
+    with running(tmp_path) as jobs:
+        job = jobs.submit("gate", None, gate)
+        assert gate.begun.wait(5)
+
+        def refuse(_job: Job) -> None:
+            raise sqlite3.OperationalError("disk I/O error")
+
+        with monkeypatch.context() as broken:
+            broken.setattr(jobs._records, "put", refuse)
+            broken.setattr(jobs._records, "update", refuse)
+            with pytest.raises(sqlite3.OperationalError):
+                jobs.submit("note", None, lambda _: {})
+            gate.open.set()
+            assert end_of(jobs, job).state == "succeeded"
+        assert [found.id for found in jobs.all()] == [job.id], "what was refused is not there"
+
+
+def test_a_kind_that_is_gone_after_an_upgrade_ends_in_a_stated_failure(tmp_path: Path) -> None:
+    gate, discarded = Gate(), list[str]()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        job = jobs.submit("gate", "lab", arguments={"form": "f"})
+        assert gate.begun.wait(5)
+    with running(tmp_path, {"other": gate}) as jobs:
+        failed = jobs.get(job.id)
+        assert failed.state == "failed" and failed.problem is not None
+        assert failed.problem["type"] == "urn:placerec:problem:job-lost" and "gate" in failed.problem["detail"]
+    assert not discarded
+
+
+@pytest.mark.parametrize("how", ["a record", "the file"])
+def test_what_is_left_of_damaged_records_is_told_as_lost(tmp_path: Path, how: str) -> None:
+    import sqlite3
+
+    gate = Gate()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
+        job = jobs.submit("gate", "lab", arguments={})
+        assert gate.begun.wait(5)
+    connection = sqlite3.connect(tmp_path / FILE)
+    if how == "a record":
+        connection.execute("UPDATE jobs SET arguments = '{' WHERE id = ?", (job.id,))
+    else:
+        connection.execute("CREATE TABLE foreign_one (x)")
+        connection.execute("PRAGMA user_version = 0")
+    connection.commit()
+    connection.close()
+    with running(tmp_path, {"gate": gate}) as jobs:
+        assert jobs.get(done.id).result == {"kept": True}
+        lost = jobs.get(job.id)
+        assert lost.state == "failed" and lost.problem is not None
+        assert lost.problem["type"] == "urn:placerec:problem:job-lost" and "damaged" in lost.problem["detail"]
+        if how == "the file":
+            with pytest.raises(UnknownJob, match="put aside"):
+                jobs.get("forgotten")
+        gate.open.set()
+        assert end_of(jobs, jobs.submit("gate", "lab", arguments={})).state == "succeeded"
+
+
+def test_a_file_of_the_first_version_is_taken_over(tmp_path: Path) -> None:
+    import sqlite3
+
+    with running(tmp_path) as jobs:
+        done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
+    connection = sqlite3.connect(tmp_path / FILE)
+    for later in ("maps", "asker"):
+        connection.execute(f"ALTER TABLE jobs DROP COLUMN {later}")
+    connection.execute("PRAGMA user_version = 1")
+    connection.commit()
+    connection.close()
+    with running(tmp_path) as jobs:
+        assert jobs.get(done.id) == replace(done, asker={})
+        assert end_of(jobs, jobs.submit("note", None, lambda _: {}, maps={"lab": "then"})).maps == {"lab": "then"}
+
+
+def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
+    gate, discarded = Gate(), list[str]()
+
+    def refuse(_: JobContext) -> dict[str, Any]:
+        raise UnknownMap("There is no map 'lab'.")
+
+    jobs = Jobs(tmp_path)
+    kinds: Kinds = {"gate": gate, "refuse": refuse}
+    for kind, work in kinds.items():
+        jobs.register(kind, work, lambda job: discarded.append(job.id))
+    jobs.start()
+    first, second, third = (jobs.submit(kind, None, arguments={}) for kind in ("gate", "refuse", "gate"))
+    assert gate.begun.wait(5)
+    jobs.cancel(third.id)
+    assert discarded == [third.id], "cancelled before it began"
+    gate.open.set()
+    end_of(jobs, first)
+    end_of(jobs, second)
+    jobs.close(5)
+    assert sorted(discarded) == sorted([first.id, second.id, third.id])
+
+
+def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None:
+    from core.storage import Atlas
+    from service.jobs.context import born
+
+    atlas, gate = Atlas(tmp_path / "data"), threading.Event()
+    lab = atlas.create("lab", "some@" + "0" * 64, 8)
+
+    def look(context: JobContext) -> dict[str, Any]:
+        assert gate.wait(5)
+        return {"places": context.map(atlas).count_places()}
+
+    with running(tmp_path) as jobs:
+        bound = jobs.submit("look", "lab", look, maps={"lab": born(lab)})
+        atlas.delete("lab")
+        again = atlas.create("lab", "some@" + "0" * 64, 8)
+        gate.set()
+        failed = end_of(jobs, bound)
+        assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
+        assert end_of(jobs, jobs.submit("look", "lab", look, maps={"lab": born(again)})).result == {"places": 0}
+    atlas.close()

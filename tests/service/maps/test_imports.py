@@ -1,0 +1,108 @@
+"""What comes of a file of a map when the task that takes it in is cancelled, as the server does when it stops."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.storage import MapSettings
+from core.storage.archives import building
+from core.storage.files import segment_files as descriptors
+from core.storage.files.disk import write_at
+from service.engine.engine import Engine
+from service.errors.faults import TooManyImports
+from service.maps import imports
+from service.maps.imports import Arrived
+from tests.core.storage.archives.files import exported
+from tests.service.engines import ENCODER, engine_at, enrolments
+
+
+@pytest.fixture
+def content(tmp_path: Path) -> bytes:
+    with engine_at(tmp_path / "source") as engine:
+        lab = engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
+        lab.enrol(enrolments(1, 3, "p", "monday"))
+        return exported(lab, tmp_path / "kept")
+
+
+async def chunks(data: bytes) -> AsyncIterator[bytes]:
+    yield data
+
+
+async def received(engine: Engine, data: bytes) -> Arrived:
+    return await engine.imports.receive(chunks(data), 0, [], lambda _: "lab")
+
+
+class Gate:
+    """Keeps calls of a function waiting, from the first one on."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self.reached, self.opened = threading.Event(), threading.Event()
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.reached.set()
+        assert self.opened.wait(10)
+        return self._function(*arguments)
+
+    async def cancelled_there(self, task: asyncio.Task[Any]) -> None:
+        """Cancel a task whose thread waits here, and see that it waits, too."""
+        async with asyncio.timeout(10):
+            while not self.reached.is_set():
+                await asyncio.sleep(0.001)
+        task.cancel()
+        await asyncio.sleep(0.01)
+        assert not task.done()
+
+    async def open(self, task: asyncio.Task[Any]) -> None:
+        self.opened.set()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+
+@pytest.mark.anyio
+async def test_cancelled_while_it_arrives(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    with engine_at(tmp_path) as engine:
+        gate = Gate(write_at)
+        monkeypatch.setattr(imports, "write_at", gate)
+        task = asyncio.create_task(received(engine, content))
+        await gate.cancelled_there(task)
+        with (tmp_path / "another").open("xb") as another:  # which would get the number of a file that was closed
+            await gate.open(task)
+            assert another.tell() == 0
+        assert (tmp_path / "another").read_bytes() == b""
+        assert list((tmp_path / "data" / "imports").iterdir()) == []
+        monkeypatch.undo()
+        first, second = await received(engine, content), await received(engine, content)
+        with pytest.raises(TooManyImports):
+            await received(engine, content)
+        assert len({first.name, second.name}) == 2
+    with engine_at(tmp_path) as engine:
+        engine.imports.clean()
+        assert list((tmp_path / "data" / "imports").iterdir()) == []
+        await received(engine, content)
+
+
+@pytest.mark.anyio
+async def test_cancelled_while_the_map_is_built(
+    tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with engine_at(tmp_path) as engine:
+        monkeypatch.setattr(engine.imports, "check_encoder", lambda _: None)  # its maps are made up
+        monkeypatch.setattr(building, "CHUNK_BYTES", 1)
+        gate = Gate(descriptors.append)
+        with monkeypatch.context() as disk:
+            disk.setattr(descriptors, "append", gate)
+            task = asyncio.create_task(engine.imports.build(await received(engine, content)))
+            await gate.cancelled_there(task)
+            await gate.open(task)
+        assert list((tmp_path / "data" / "imports").iterdir()) == []
+        assert list((tmp_path / "data" / "maps").iterdir()) == [], "broken off after the first of three commits"
+        arrived = await received(engine, content)
+        await engine.imports.build(arrived)
+        assert engine.atlas.get("lab").count_places() == 3

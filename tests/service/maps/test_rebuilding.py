@@ -1,0 +1,35 @@
+"""Rebuilding what a map is searched by, and verifying it, as jobs over HTTP."""
+
+from __future__ import annotations
+
+import time
+
+from tests.service.scenes import jpeg
+from tests.service.server import Server, assert_problem
+from tests.service.upkeep.upkeeping import enrol_many, finished
+
+
+def test_a_map_is_rebuilt_and_verified_in_the_background(server: Server) -> None:
+    enrol_many(server, "rebuilt", 24, keep="none")
+    assert server.client.patch("/v1/maps/rebuilt", json={"index": "compact"}).status_code == 200
+    until = time.monotonic() + 60
+    while server.client.get("/v1/maps/rebuilt").json()["index"]["state"] == "building":
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    before = server.query("rebuilt", jpeg(3) + b"\x00" * 4)["matches"]
+    asked = server.client.post("/v1/maps/rebuilt/rebuild")
+    assert asked.status_code == 202 and asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"
+    done = finished(server, asked.json())
+    assert done["state"] == "succeeded" and done["kind"] == "rebuild", done
+    index = done["result"]["index"]
+    assert (index["tier"], index["rows_indexed"], index["problem"]) == ("compact", 24, None)
+    assert done["progress"]["done"] == done["progress"]["total"] == 24
+    assert server.query("rebuilt", jpeg(3) + b"\x00" * 4)["matches"] == before
+
+    asked = server.client.post("/v1/maps/rebuilt/verify?background=true")
+    assert asked.status_code == 202 and asked.json()["kind"] == "verify"
+    report = finished(server, asked.json())["result"]
+    assert report["ok"] and report["places"] == report["rows"] == 24
+    assert report == server.client.post("/v1/maps/rebuilt/verify").json()
+    for what in ("rebuild", "verify?background=true"):
+        assert_problem(server.client.post(f"/v1/maps/nowhere/{what}"), 404, "unknown-map")

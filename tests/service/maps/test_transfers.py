@@ -1,0 +1,369 @@
+"""Maps as files over HTTP: downloads that go on, uploads that are all or nothing, whatever ends in between."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import itertools
+import json
+import socket
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from core.storage.archives.manifest import group_names
+from core.storage.archives.reading import Archive, check
+from tests.core.storage.archives.files import Parts, changed, line_changed, named, parts_of, sealed
+from tests.service.encoders import install_coarse_encoder
+from tests.service.scenes import jpeg
+from tests.service.server import Server, assert_problem
+from tests.service.upkeep.upkeeping import wait_until
+
+TAR = {"Content-Type": "application/x-tar"}
+_ids = itertools.count()
+
+
+def new_id() -> str:
+    return f"brought-{next(_ids)}"
+
+
+def export(server: Server, map_id: str, **headers: str) -> httpx.Response:
+    sent = {name.replace("_", "-"): value for name, value in headers.items()}
+    return server.client.get(f"/v1/maps/{map_id}/export", headers=sent)
+
+
+def bring(server: Server, content: bytes, map_id: str | None = None, **params: str) -> httpx.Response:
+    sent = {**params, **({} if map_id is None else {"id": map_id})}
+    return server.client.post("/v1/maps/import", params=sent, content=content, headers=TAR)
+
+
+def places(server: Server, map_id: str) -> list[Any]:
+    items: list[Any] = server.client.get(f"/v1/maps/{map_id}/places", params={"limit": 1000}).json()["items"]
+    return items
+
+
+def staged(server: Server) -> list[str]:
+    """What lies in the folders of transfers and, unlisted, among the maps."""
+    found = [*server.data_dir.glob("imports/*"), *server.data_dir.glob("imports/.*"), *server.data_dir.glob("maps/.*")]
+    return [path.name for path in found]
+
+
+@pytest.fixture(scope="module")
+def source(server: Server) -> str:
+    """A map that keeps images; nobody changes it."""
+    server.create_map("to-move", keep="image", description="three rooms")
+    assert server.client.put("/v1/maps/to-move/cameras/front", json={"mask": None}).status_code in (200, 201)
+    for number in range(3):
+        place = {"x": number, "y": 0, "sequence": "monday", "metadata": {"n": number}, "camera": "front"}
+        assert server.enrol("to-move", f"p{number}", jpeg(number), **place).status_code == 201
+    return "to-move"
+
+
+@pytest.fixture(scope="module")
+def content(server: Server, source: str) -> bytes:
+    """Its file."""
+    return export(server, source).content
+
+
+def test_a_map_comes_back_under_another_id(server: Server, source: str, content: bytes) -> None:
+    name = new_id()
+    made = bring(server, content, name)
+    assert made.status_code == 201 and made.headers["location"] == f"/v1/maps/{name}"
+    ours, theirs = (server.client.get(f"/v1/maps/{map_id}") for map_id in (source, name))
+    assert theirs.headers["etag"] == made.headers["etag"]
+    changing = {"id", "index", "storage"}
+    assert {**ours.json(), **dict.fromkeys(changing)} == {**theirs.json(), **dict.fromkeys(changing)}
+    assert places(server, name) == places(server, source)
+    answers = [server.query(map_id, jpeg(1)) for map_id in (source, name)]
+    for answer in answers:
+        for field in ("milliseconds", "request_id", "map"):
+            answer.pop(field, None)
+    assert answers[0] == answers[1] and answers[0]["matches"][0]["place"]["id"] == "p1"
+    assert server.client.post(f"/v1/maps/{name}/verify").json()["ok"]
+    assert server.enrol(name, "next", jpeg(7)).status_code == 201
+    assert staged(server) == []
+
+
+def test_a_download_is_of_one_moment(server: Server, content: bytes) -> None:
+    name = new_id()
+    assert bring(server, content, name).status_code == 201
+    first = export(server, name)
+    tag, size = first.headers["etag"], int(first.headers["content-length"])
+    assert first.status_code == 200 and len(first.content) == size and first.headers["accept-ranges"] == "bytes"
+    manifest = parts_of(first.content)[0]
+    assert tag.strip('"') == hashlib.sha256(first.content[512 : 512 + _size(first.content)]).hexdigest()
+    assert manifest["map"]["id"] == name
+    head = server.client.head(f"/v1/maps/{name}/export", headers={"Range": "bytes=5-"})
+    assert head.status_code == 200 and head.content == b""
+    assert (head.headers["etag"], head.headers["content-length"]) == (tag, str(size))
+    assert export(server, name, if_none_match=tag).status_code == 304
+    # The map changes, and is deleted: the rest is that of the first moment all the same.
+    assert server.enrol(name, "later", jpeg(8)).status_code == 201
+    part = export(server, name, range="bytes=1000-1999", if_range=tag)
+    assert part.status_code == 206 and part.headers["content-range"] == f"bytes 1000-1999/{size}"
+    assert part.content == first.content[1000:2000] and part.headers["content-length"] == "1000"
+    now = export(server, name, if_none_match=tag)
+    assert now.status_code == 200 and now.headers["etag"] != tag
+    assert server.client.delete(f"/v1/maps/{name}").status_code == 204
+    rest = export(server, name, range=f"bytes={size - 700}-", if_match=tag)
+    assert rest.status_code == 206 and rest.content == first.content[-700:]
+    behind = export(server, name, range=f"bytes={size}-", if_range=tag)
+    assert behind.headers["content-range"] == f"bytes */{size}"
+    assert_problem(behind, 416, "range-not-satisfiable")
+    assert_problem(export(server, name), 404, "unknown-map")
+    assert_problem(export(server, name, if_match='"other"'), 404, "unknown-map")
+
+
+def _size(content: bytes) -> int:
+    return int(content[124:135], 8)
+
+
+def test_a_moment_that_is_not_kept(server: Server, source: str) -> None:
+    assert_problem(export(server, source, range="bytes=5-", if_match='"0123"'), 412, "export-gone")
+    whole = export(server, source, range="bytes=5-", if_range='"0123"')
+    assert whole.status_code == 200 and len(whole.content) == int(whole.headers["content-length"])
+
+
+def test_taken_ids(server: Server, source: str, content: bytes) -> None:
+    assert_problem(bring(server, content), 409, "map-exists")
+    assert_problem(bring(server, content, source), 409, "map-exists")
+    assert_problem(bring(server, content, "../x"), 422, "invalid-identifier")
+    assert_problem(bring(server, content, "import"), 422, "invalid-identifier")
+    assert staged(server) == []
+
+
+def test_encoders(server: Server, content: bytes) -> None:
+    name = new_id()
+
+    def elsewhere(manifest: dict[str, Any], _parts: Parts) -> None:
+        manifest["map"]["encoder"] = "m-region-vlad@" + "0" * 64
+
+    problem = assert_problem(bring(server, changed(content, elsewhere), name), 409, "wrong-encoder")
+    assert "not installed" in problem["detail"]
+    assert_problem(bring(server, content, name, encoder="coarse"), 409, "wrong-encoder")
+
+    def reshaped(manifest: dict[str, Any], parts: Parts) -> None:
+        manifest["map"]["dimension"] //= 2
+
+    assert_problem(bring(server, changed(content, reshaped), name), 422, "invalid-archive")
+    assert bring(server, content, name, encoder="m-region-vlad").status_code == 201
+
+
+def _no_picture(manifest: dict[str, Any], parts: Parts) -> None:
+    (line, *rest) = parts["places-000001.jsonl"].splitlines(keepends=True)
+    value = json.loads(line)
+    data = b"<script>".ljust(value["picture"]["bytes"])
+    value["picture"]["sha256"] = hashlib.sha256(data).hexdigest()
+    parts["places-000001.jsonl"] = json.dumps(value).encode() + b"\n" + b"".join(rest)
+    parts["pictures-000001.bin"] = data + parts["pictures-000001.bin"][len(data) :]
+
+
+def _endless_picture(manifest: dict[str, Any], parts: Parts) -> None:
+    """A PNG of 900 megapixels, by its header."""
+    (line, *rest) = parts["places-000001.jsonl"].splitlines(keepends=True)
+    value = json.loads(line)
+    old = value["picture"]["bytes"]
+    data = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + (30_000).to_bytes(4, "big") * 2 + bytes(9)
+    value["picture"] |= {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    parts["places-000001.jsonl"] = json.dumps(value).encode() + b"\n" + b"".join(rest)
+    parts["pictures-000001.bin"] = data + parts["pictures-000001.bin"][old:]
+
+
+def test_hostile_files(server: Server, content: bytes) -> None:
+    """A few of each kind; ``tests/core/storage/archives`` has them all."""
+    manifest, parts = parts_of(content)
+    for made, slug in (
+        (b"", "invalid-archive"),
+        (jpeg(1), "invalid-archive"),
+        (content[:-600], "invalid-archive"),
+        (content + content, "invalid-archive"),
+        (content[:-5000] + b"x" + content[-4999:], "invalid-archive"),
+        (line_changed(content, "places-000001.jsonl", 1, id="../p"), "invalid-archive"),
+        (changed(content, _no_picture), "invalid-archive"),
+        (changed(content, _endless_picture), "invalid-archive"),
+        (named(json.dumps({**manifest, "version": 9}).encode(), parts), "archive-too-new"),
+    ):
+        name = new_id()
+        assert_problem(bring(server, made, name), 422, slug)
+        assert_problem(server.client.get(f"/v1/maps/{name}"), 404, "unknown-map")
+        assert staged(server) == []
+    text = server.client.post("/v1/maps/import", content=content, headers={"Content-Type": "text/plain"})
+    assert_problem(text, 415, "unsupported-media-type")
+
+
+def test_digests(server: Server, content: bytes) -> None:
+    right = base64.b64encode(hashlib.sha256(content).digest()).decode()
+    wrong = base64.b64encode(bytes(32)).decode()
+    name = new_id()
+    for header, value, status, slug in (
+        ("Content-Digest", f"sha-256=:{wrong}:", 422, "digest-mismatch"),
+        ("Repr-Digest", f"md5=:abcd:, sha-256=:{wrong}:", 422, "digest-mismatch"),
+        ("Repr-Digest", right, 422, "invalid-request"),
+    ):
+        sent = server.client.post(
+            "/v1/maps/import", params={"id": name}, content=content, headers={**TAR, header: value}
+        )
+        assert_problem(sent, status, slug)
+    headers = {**TAR, "Content-Digest": f"sha-256=:{right}:", "Repr-Digest": f"sha-512=:AA==:,sha-256=:{right}:"}
+    sent = server.client.post("/v1/maps/import", params={"id": name}, content=content, headers=headers)
+    assert sent.status_code == 201
+
+
+def begun(server: Server, target: str, announced: int, first: bytes) -> socket.socket:
+    """A request of which only the beginning is sent."""
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=20)
+    head = f"POST {target} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/x-tar\r\n"
+    connection.sendall(f"{head}Content-Length: {announced}\r\n\r\n".encode() + first)
+    return connection
+
+
+@pytest.mark.parametrize(
+    ("query", "announced", "status"),
+    [
+        ("id=to-move", 1 << 24, b"409"),  # seen before anything of the body is read
+        ("id=never-moved", 1 << 40, b"413"),
+        ("id=never-moved", 1 << 24, b"422"),  # seen when the manifest has come: the file is not that long
+        ("id=never-moved&encoder=coarse", 0, b"409"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_the_rest_is_sent(
+    server: Server, content: bytes, query: str, announced: int, status: bytes
+) -> None:
+    """All but the last byte is sent, and as much more as is gathered before it is looked at."""
+    first = content[:-1] if not announced else content + bytes((2 << 20) - len(content))
+    with begun(server, f"/v1/maps/import?{query}", announced or len(content), first) as connection:
+        if announced:
+            assert connection.recv(100).startswith(b"HTTP/1.1 " + status)
+        else:  # a short file is looked at when it ends
+            connection.sendall(content[-1:])
+            assert connection.recv(100).startswith(b"HTTP/1.1 " + status)
+    assert _settled(server) == []
+
+
+def _settled(server: Server) -> list[str]:
+    """What is left a moment later."""
+    until = time.monotonic() + 10
+    while (left := staged(server)) and time.monotonic() < until:
+        time.sleep(0.02)
+    return left
+
+
+def test_an_upload_that_breaks_off_leaves_nothing(server: Server, content: bytes) -> None:
+    name = new_id()
+    begun(server, f"/v1/maps/import?id={name}", len(content), content[: len(content) // 2]).close()
+    assert _settled(server) == []
+    assert_problem(server.client.get(f"/v1/maps/{name}"), 404, "unknown-map")
+
+
+def test_as_a_job(server: Server, source: str, content: bytes) -> None:
+    name = new_id()
+    asked = bring(server, content, name, background="true")
+    assert asked.status_code == 202 and asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"
+    done = server.client.get(f"{asked.headers['location']}?wait=30").json()
+    assert done["state"] == "succeeded" and done["result"]["places"] == 3, done
+    assert done["progress"]["done"] == done["progress"]["total"] == 3
+    assert places(server, name) == places(server, source)
+    bad = bring(server, line_changed(content, "places-000001.jsonl", 1, regions=-1), new_id(), background="true")
+    failed = server.client.get(f"{bad.headers['location']}?wait=30").json()
+    assert failed["state"] == "failed" and failed["problem"]["type"] == "urn:placerec:problem:invalid-archive"
+    assert_problem(bring(server, content, name, background="true"), 409, "map-exists")
+    wait_until(lambda: staged(server) == [])
+
+
+MANY = 8_000
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a service that may be killed."""
+    folder = tmp_path_factory.mktemp("apart")
+    install_coarse_encoder(folder / "models")
+    return folder
+
+
+def large(server: Server) -> bytes:
+    """The file of a map of many places of the coarse encoder, made up."""
+    server.create_map("seed", encoder="coarse", keep="none")
+    assert server.enrol("seed", "p", jpeg(1)).status_code == 201
+    manifest, parts = parts_of(export(server, "seed").content)
+    assert server.client.delete("/v1/maps/seed").status_code == 204
+    line, width = json.loads(parts["places-000001.jsonl"]), len(parts["descriptors-000001.bin"])
+    random = np.random.default_rng(1)
+    made: Parts = {name: parts[name] for name in ("sequences.jsonl", "cameras.jsonl")}
+    made["sequences.jsonl"] = json.dumps({"name": None, "next_ordinal": MANY}).encode() + b"\n"
+    listed = manifest["parts"][:2]
+    for group, first in enumerate(range(0, MANY, 1000)):
+        lines = [json.dumps({**line, "id": f"p{n}", "ordinal": n}) + "\n" for n in range(first, first + 1000)]
+        halves = random.standard_normal((1000, width // 2)).astype("<f2")
+        for name, data in zip(group_names(group), ("".join(lines).encode(), halves.tobytes(), b""), strict=True):
+            made[name] = data
+            listed.append({"name": name, "rows": 1000})
+    return sealed({**manifest, "places": MANY, "parts": listed}, made)
+
+
+@pytest.mark.timeout(300)  # the service is started twice
+def test_killed_at_every_stage(apart: Path) -> None:
+    """While a file arrives, a request builds one and a job another: nothing half is there, and the job goes on."""
+    settings = {"export_seconds": 1, "max_exports": 1, "max_imports": 3, "max_import_bytes": 1 << 28}
+    server = Server(apart, settings).wait()
+    content = large(server)
+    _limits(server)
+    job = bring(server, content, "by-job", background="true").headers["location"]
+    making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
+    wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
+    arriving = begun(server, "/v1/maps/import?id=arriving", len(content), content[: len(content) // 2])
+    wait_until(lambda: any(server.data_dir.glob("imports/.*")))
+    wait_until(lambda: server.client.get(job).json()["progress"]["done"] > 200)
+    assert server.client.get("/v1/maps").json()["items"] == []
+    assert_problem(server.client.post("/v1/maps", json={"id": "by-request"}), 409, "map-exists")
+    second = bring(server, content, "second")
+    assert "retry-after" in second.headers
+    assert_problem(second, 503, "too-many-imports")
+    server.kill()
+    for connection in (making, arriving):
+        connection.close()
+    server = Server(apart).wait()
+    assert (
+        server.client.get("/v1/maps/by-request").status_code
+        == server.client.get("/v1/maps/arriving").status_code
+        == 404
+    )
+    done = server.client.get(f"{job}?wait=60").json()
+    assert done["state"] == "succeeded" and done["attempt"] == 2 and done["result"]["places"] == MANY, done
+    assert server.client.get("/v1/maps/by-job").json()["places"] == MANY
+    # Cancelled, nothing is left.
+    other = bring(server, content, "other", background="true").headers["location"]
+    wait_until(lambda: server.client.get(other).json()["progress"]["done"] > 200)
+    assert server.client.post(f"{other}/cancel").status_code == 200
+    assert server.client.get(f"{other}?wait=30").json()["state"] == "cancelled"
+    wait_until(lambda: staged(server) == [])
+    assert server.client.get("/v1/maps/other").status_code == 404
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(export(server, "by-job").content)
+        file.flush()
+        with Archive(Path(file.name)) as archive:
+            check(archive)
+    assert server.stop() == 0
+    assert not (apart / "data" / "exports").exists()
+
+
+def _limits(server: Server) -> None:
+    """Files have 256 MiB at most; moments of maps are kept for a second, and one at a time."""
+    with begun(server, "/v1/maps/import", 1 << 29, b"") as connection:
+        assert connection.recv(100).startswith(b"HTTP/1.1 413")
+    for name in ("a", "b"):
+        server.create_map(name, encoder="coarse")
+    tag = export(server, "a").headers["etag"]
+    assert export(server, "a", if_match=tag).status_code == 200
+    assert server.enrol("a", "p", jpeg(1)).status_code == 201
+    assert export(server, "b").status_code == 200, "the moment of a makes room: nobody reads it"
+    wait_until(lambda: export(server, "a", if_match=tag).status_code != 503)  # that of b is being let go of
+    assert_problem(export(server, "a", if_match=tag), 412, "export-gone")
+    wait_until(lambda: not any(server.data_dir.glob("exports/*")))
+    for name in ("a", "b"):
+        assert server.client.delete(f"/v1/maps/{name}").status_code == 204

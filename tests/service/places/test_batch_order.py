@@ -1,0 +1,162 @@
+"""Batches in line: each is encoded and stored after the one that it names, or not at all."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Sequence
+
+import httpx
+import pytest
+
+from service.engine.queue import Patience
+from service.errors.faults import BatchOutOfOrder, ClientGone
+from service.places import batch_order as succession
+from service.places.batch_order import Sequel, Stage, Succession
+from tests.service.places.test_batches import send
+from tests.service.scenes import jpeg
+from tests.service.server import Server, assert_problem
+
+SMALL = [jpeg(seed, 96, 72) for seed in range(24)]
+
+
+def patience(seconds: float = 20.0, gone: asyncio.Event | None = None) -> Patience:
+    async def hung_up() -> None:
+        await (gone or asyncio.Event()).wait()
+
+    return Patience(time.monotonic() + seconds, hung_up)
+
+
+async def begun(waiting: asyncio.Task[None]) -> None:
+    await asyncio.sleep(0.02)
+    assert not waiting.done()
+
+
+@pytest.mark.anyio
+async def test_one_waits_until_the_other_has_come_so_far() -> None:
+    line = Succession()
+    with line.enter("lab", "b", "a", patience()) as second:
+        encoding = asyncio.ensure_future(second.wait_for(Stage.ENCODED))
+        storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
+        with line.enter("lab", "a", None, patience()) as first, line.enter("hall", "a", None, patience()) as elsewhere:
+            await begun(encoding)
+            elsewhere.reach(Stage.ENCODED)
+            await begun(encoding)
+            first.reach(Stage.ENCODED)
+            await asyncio.wait_for(encoding, 5)
+            await begun(storing)
+        await asyncio.wait_for(storing, 5)
+    with line.enter("lab", None, "b", patience()) as third:
+        await asyncio.wait_for(third.wait_for(Stage.STORED), 5)
+
+
+@pytest.mark.anyio
+async def test_what_fails_is_not_stored_and_may_come_again() -> None:
+    line = Succession()
+    second = Sequel(line, "lab", None, "a", patience())
+    with pytest.raises(ValueError), line.enter("lab", "a", None, patience()):
+        raise ValueError
+    storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
+    await begun(storing)
+    with line.enter("lab", "a", None, patience()):
+        await begun(storing)
+    await asyncio.wait_for(storing, 5)
+    # What was stored stays so, whatever becomes of a request that says the same again.
+    with pytest.raises(ValueError), line.enter("lab", "a", None, patience()):
+        raise ValueError
+    await asyncio.wait_for(second.wait_for(Stage.STORED), 5)
+
+
+@pytest.mark.anyio
+async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    line = Succession()
+    with line.enter("lab", "slow", None, patience()):
+        with pytest.raises(BatchOutOfOrder):
+            await Sequel(line, "lab", None, "slow", patience(0.05)).wait_for(Stage.STORED)
+        gone = asyncio.Event()
+        storing = asyncio.ensure_future(Sequel(line, "lab", None, "slow", patience(20, gone)).wait_for(Stage.STORED))
+        await begun(storing)
+        gone.set()
+        with pytest.raises(ClientGone):
+            await asyncio.wait_for(storing, 5)
+    monkeypatch.setattr(succession, "GRACE", 0.05)
+    with pytest.raises(BatchOutOfOrder):
+        await asyncio.wait_for(Sequel(line, "lab", None, "never", patience()).wait_for(Stage.ENCODED), 5)
+
+
+@pytest.mark.anyio
+async def test_so_many_names_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(succession, "KEPT", 3)
+    line = Succession()
+    with line.enter("lab", "open", None, patience()):
+        for number in range(9):
+            with line.enter("lab", str(number), None, patience()):
+                pass
+        assert [number for number in range(9) if line.stage("lab", str(number)) is not None] == [6, 7, 8]
+        assert line.stage("lab", "open") == Stage.BEGUN
+
+
+def numbered(first: int, count: int) -> list[dict[str, object]]:
+    return [{"id": f"p{number}", "file": f"f{number}", "sequence": "walk"} for number in range(first, first + count)]
+
+
+def files(first: int, count: int) -> dict[str, bytes]:
+    return {f"f{number}": SMALL[number] for number in range(first, first + count)}
+
+
+def order(server: Server, map_id: str) -> list[str]:
+    return [item["id"] for item in server.client.get(f"/v1/maps/{map_id}/places?limit=1000").json()["items"]]
+
+
+def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map_id: str) -> None:
+    answers: dict[str, httpx.Response] = {}
+
+    def post(batch: str, after: str | None, first: int) -> None:
+        line = {"batch": batch} if after is None else {"batch": batch, "after": after}
+        answers[batch] = send(server, map_id, numbered(first, 8), files(first, 8), params=line)
+
+    senders: Sequence[threading.Thread] = [
+        threading.Thread(target=post, args=("c", "b", 16)),
+        threading.Thread(target=post, args=("b", "a", 8)),
+        threading.Thread(target=post, args=("a", None, 0)),
+    ]
+    for sender in senders:
+        sender.start()
+        time.sleep(0.3)
+    for sender in senders:
+        sender.join(60)
+    assert {name: answer.status_code for name, answer in answers.items()} == {"a": 200, "b": 200, "c": 200}
+    assert order(server, map_id) == [f"p{number}" for number in range(24)]
+
+
+def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
+    def post(first: int, line: dict[str, str], **options: object) -> httpx.Response:
+        return send(server, map_id, numbered(first, 2), files(first, 2), params=line, **options)
+
+    hasty = {"X-Request-Timeout": "0.6"}
+    assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
+    assert_problem(post(0, {"batch": "a", "encoder": "another"}), 409, "wrong-encoder")
+    assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
+    assert order(server, map_id) == []
+    # A frame that is bad fails alone: the batch as such is stored.
+    places = [*numbered(0, 1), {"id": "bad", "file": "bad"}]
+    first = send(server, map_id, places, {"f0": SMALL[0], "bad": b"none"}, params={"batch": "a"})
+    assert [item["status"] for item in first.json()["items"]] == [201, 422]
+    assert post(2, {"batch": "b", "after": "a"}).status_code == 200
+    assert order(server, map_id) == ["p0", "p2", "p3"]
+    # Sent once more, as after an answer that was lost, it changes nothing.
+    again = post(2, {"batch": "b", "after": "a"})
+    assert [item["change"] for item in again.json()["items"]] == ["unchanged", "unchanged"]
+
+
+@pytest.mark.parametrize(
+    "line", [{"batch": "a", "after": "a"}, {"batch": ""}, {"after": "a b"}, {"batch": "a" * 65}, {"after": "a/b"}]
+)
+def test_names_that_make_no_sense(server: Server, map_id: str, line: dict[str, str]) -> None:
+    assert_problem(send(server, map_id, numbered(0, 1), files(0, 1), params=line), 422, "invalid-request")
+
+
+def test_not_in_the_background(server: Server, map_id: str) -> None:
+    line = {"background": "true", "batch": "a"}
+    assert_problem(send(server, map_id, numbered(0, 1), files(0, 1), params=line), 422, "invalid-request")

@@ -1,0 +1,244 @@
+"""What was acknowledged is there: after SIGKILL, on a full disk, and by the trace of the system calls."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from tests.service.scenes import encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem
+from tests.syscalls import audit, is_success_response, strace, strace_arguments
+
+TRAVERSE = 12
+
+
+def answers(server: Server, map_id: str, frames: list[bytes]) -> list[dict[str, Any]]:
+    """The answers to queries, without their times."""
+    found = [server.query(map_id, frame, k=100) for frame in frames]
+    for answer in found:
+        del answer["milliseconds"]
+    return found
+
+
+def all_places(server: Server, map_id: str) -> dict[str, dict[str, Any]]:
+    """Every place of a map by its id."""
+    places: dict[str, dict[str, Any]] = {}
+    cursor = ""
+    while True:
+        parameters = {"limit": "1000"} | ({"cursor": cursor} if cursor else {})
+        page = server.client.get(f"/v1/maps/{map_id}/places", params=parameters).json()
+        places |= {item["id"]: item for item in page["items"]}
+        cursor = page["next_cursor"]
+        if cursor is None:
+            return places
+
+
+def test_the_main_job(tmp_path: Path) -> None:
+    """A traverse is enrolled, another localized, the process killed and started again: the same answers."""
+    server = Server(tmp_path).wait()
+    server.create_map("lab", description="main job")
+    for number in range(TRAVERSE):
+        stamp = f"2026-11-20T10:00:{number:02}Z"
+        response = server.enrol(
+            "lab", f"p{number:03}", jpeg(number), x=3 * number, y=0, heading=90, sequence="monday", timestamp=stamp
+        )
+        assert response.status_code == 201
+    frames = [encoded(seen_again(scene(number), number)) for number in range(TRAVERSE)]
+    frames += [jpeg(number) for number in range(200, 204)]
+    before, places = answers(server, "lab", frames), all_places(server, "lab")
+    for number in range(TRAVERSE):
+        assert before[number]["matches"][0]["place"]["id"] == f"p{number:03}"
+    assert sum(answer["verdict"] == "recognized" for answer in before[:TRAVERSE]) >= TRAVERSE * 3 // 4
+
+    server.kill()
+    server = Server(tmp_path).wait()
+    assert answers(server, "lab", frames) == before
+    assert all_places(server, "lab") == places
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    assert server.stop() == 0
+
+
+def test_the_corridor(tmp_path: Path) -> None:
+    """The same with two real traverses of a corridor."""
+    corridor = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
+    if not corridor.is_dir():
+        pytest.skip("the corridor data set is not beside the repository")
+    references = [path.read_bytes() for path in sorted((corridor / "ref").iterdir())]
+    queries = [path.read_bytes() for path in sorted((corridor / "query").iterdir())][::3]
+    server = Server(tmp_path).wait()
+    server.create_map("corridor")
+    for number, data in enumerate(references):
+        response = server.enrol("corridor", f"{number}", data, sequence="reference")
+        assert response.status_code == 201
+    before = answers(server, "corridor", queries)
+    right = 0
+    for number, answer in enumerate(before):
+        right += abs(int(answer["matches"][0]["place"]["id"]) - 3 * number) <= 3
+    assert right / len(queries) > 0.5
+    server.kill()
+    server = Server(tmp_path).wait()
+    assert answers(server, "corridor", queries) == before
+    assert server.stop() == 0
+
+
+def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> None:
+    frames = [jpeg(number) for number in range(6)]
+    acknowledged: dict[str, int] = {}
+    server = Server(tmp_path).wait()
+    server.create_map("lab")
+    for round_ in range(2):
+
+        def enrol(worker: int, server: Server = server, round_: int = round_) -> None:
+            with httpx.Client(base_url=server.client.base_url, timeout=10) as client:
+                for number in range(1000):
+                    name, frame = f"r{round_}-w{worker}-{number}", (worker + number) % len(frames)
+                    try:
+                        response = client.put(
+                            f"/v1/maps/lab/places/{name}?x={frame}&y=0",
+                            content=frames[frame],
+                            headers={"Content-Type": "image/jpeg"},
+                        )
+                    except httpx.TransportError:
+                        return
+                    assert response.status_code == 201
+                    acknowledged[name] = frame
+
+        before = len(acknowledged)
+        workers = [threading.Thread(target=enrol, args=(number,)) for number in range(4)]
+        for worker in workers:
+            worker.start()
+        until = time.monotonic() + 60
+        while len(acknowledged) < before + 12 and time.monotonic() < until:
+            time.sleep(0.01)
+        server.kill()
+        for worker in workers:
+            worker.join(30)
+        assert len(acknowledged) >= before + 12
+        server = Server(tmp_path).wait()
+
+    places = all_places(server, "lab")
+    assert set(acknowledged) <= set(places)
+    assert all(places[name]["pose"] == {"x": float(frame), "y": 0.0} for name, frame in acknowledged.items())
+    assert len(places) <= len(acknowledged) + 8, "at most what was under way is there besides"
+    report = server.client.post("/v1/maps/lab/verify").json()
+    assert report["ok"], report
+    for frame, data in enumerate(frames):
+        alike = {name for name, place in places.items() if place["pose"]["x"] == frame}
+        found = [match["place"]["id"] for match in server.query("lab", data, k=100)["matches"]]
+        assert set(found[: len(alike)]) <= alike
+    assert server.enrol("lab", "afterwards", frames[0]).status_code == 201
+    assert server.stop() == 0
+
+
+LIMITED = ("/bin/sh", "-c", 'ulimit -f 2048; exec "$@"', "sh")
+"""No file of the process may grow past 2 MiB: a disk that is full as far as the service can tell."""
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own with room for a dozen frames."""
+    mounted = tmp_path / "disk"
+    mounted.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", str(mounted)], capture_output=True, check=False
+    )
+    if done.returncode != 0:
+        pytest.skip("a small file system cannot be mounted here")
+    yield mounted
+    subprocess.run(["umount", "-l", str(mounted)], check=True)
+
+
+def fill(server: Server) -> dict[str, dict[str, Any]]:
+    """Enrol until the disk is full; the acknowledged places."""
+    for number in range(60):
+        response = server.enrol("lab", f"p{number}", jpeg(number % 10), x=number, y=0)
+        if response.status_code == 507:
+            assert_problem(response, 507, "storage-full")
+            return all_places(server, "lab")
+        assert response.status_code == 201, response.text
+    raise AssertionError("the disk was never full")
+
+
+def check_full_disk(server: Server) -> dict[str, dict[str, Any]]:
+    """507 for every write that needs room, nothing of it kept, and reads go on."""
+    server.create_map("lab")
+    kept = fill(server)
+    assert len(kept) >= 3
+    assert list(kept) == [f"p{number}" for number in range(len(kept))], "exactly the acknowledged ones"
+    before = answers(server, "lab", [jpeg(1)])
+    files = {f"f{number}": (f"f{number}", jpeg(20 + number), "image/jpeg") for number in range(12)}
+    places = "[" + ",".join(f'{{"id": "b{number}", "file": "f{number}"}}' for number in range(12)) + "]"
+    response = server.client.post("/v1/maps/lab/places", data={"places": places}, files=files)
+    assert_problem(response, 507, "storage-full")
+    assert all_places(server, "lab") == kept
+    assert answers(server, "lab", [jpeg(1)]) == before
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    return kept
+
+
+def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path: Path) -> None:
+    server = Server(tmp_path, wrapper=LIMITED).wait()
+    kept = check_full_disk(server)
+    server.kill()
+    server = Server(tmp_path).wait()  # the disk has room again
+    assert all_places(server, "lab") == kept
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    assert server.enrol("lab", "more", jpeg(50)).status_code == 201
+    assert server.query("lab", jpeg(50))["matches"][0]["place"]["id"] == "more"
+    assert server.stop() == 0
+
+
+def test_a_full_file_system_too(tmp_path: Path, small_disk: Path) -> None:
+    server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait()
+    kept = check_full_disk(server)
+    for name in list(kept)[:2]:
+        server.client.delete(f"/v1/maps/lab/places/{name}")  # may need room itself, may not
+    assert server.client.get("/livez").status_code == 200
+    server.kill()
+    server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait("/livez")
+    assert set(all_places(server, "lab")) <= set(kept)
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    server.kill()
+
+
+@pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
+def test_a_2xx_is_sent_after_all_that_was_written_for_it_is_synced(tmp_path: Path) -> None:
+    trace, folder = tmp_path / "trace", tmp_path.resolve() / "server"
+    server = Server(folder, wrapper=strace_arguments(trace)).wait()
+    client = server.client
+    server.create_map("lab", keep="image")
+    writes = 1
+    for number in range(4):
+        assert server.enrol("lab", f"p{number}", jpeg(number), x=number, y=0, sequence="s").status_code == 201
+    assert server.enrol("lab", "p0", jpeg(0), x=9, y=9).json()["change"] == "updated"
+    assert server.enrol("lab", "p0", jpeg(5)).json()["change"] == "replaced"
+    files = {"a": ("a", jpeg(6), "image/jpeg"), "b": ("b", b"bad", "image/jpeg")}
+    batch = '[{"id": "b1", "file": "a"}, {"id": "b2", "file": "b"}]'
+    assert client.post("/v1/maps/lab/places", data={"places": batch}, files=files).status_code == 200
+    assert client.patch("/v1/maps/lab", json={"description": "x"}).status_code == 200
+    assert client.patch("/v1/maps/lab/places/p1", json={"sequence": "t"}).status_code == 200
+    assert client.delete("/v1/maps/lab/places/p2").status_code == 204
+    assert client.delete("/v1/maps/lab/sequences/s").status_code == 200
+    writes += 10
+    server.create_map("gone")
+    assert client.delete("/v1/maps/gone").status_code == 204
+    writes += 2
+    children = Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
+    for child in children:
+        os.kill(int(child), signal.SIGKILL)
+    server.process.wait(30)
+    client.close()
+
+    report = audit(trace.read_text(), server.data_dir, is_success_response)
+    assert report.violations == []
+    assert report.acknowledgements > writes
+    assert report.syncs >= 2 * writes and report.writes >= writes

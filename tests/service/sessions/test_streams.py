@@ -1,0 +1,156 @@
+"""Sessions over a WebSocket, with a client of another make."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.scenes import jpeg
+from tests.service.server import Server
+from tests.service.sessions.test_sessions import again, begin, post, send
+
+
+@contextmanager
+def stream(server: Server, map_id: str, session: str) -> Iterator[ClientConnection]:
+    address = f"ws://127.0.0.1:{server.port}/v1/maps/{map_id}/sessions/{session}/stream"
+    with connect(address, max_size=None, compression=None) as connection:
+        yield connection
+
+
+def ask(connection: ClientConnection, data: bytes, **parameters: object) -> dict[str, Any]:
+    if parameters:
+        connection.send(json.dumps(parameters))
+    connection.send(data)
+    answer: dict[str, Any] = json.loads(connection.recv(timeout=30))
+    return answer
+
+
+def test_a_run_over_one_connection(server: Server, traverse: str) -> None:
+    session, other = begin(server, traverse), begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        for number in range(6):
+            answer = ask(connection, again(number), frame=number, k=3)
+            expected = send(server, traverse, other, again(number), frame=number, k=3)
+            assert answer["candidates"] == expected["candidates"] and len(answer["single"]["matches"]) == 3
+        assert answer["verdict"] == "recognized" and answer["frame"] == 5
+        assert ask(connection, again(5), frame=5)["repeated"]
+        assert ask(connection, again(6))["frames"] == 7, "parameters are not needed"
+    assert send(server, traverse, session, again(7))["frames"] == 8, "the session outlives the connection"
+
+
+def test_frames_sent_ahead_are_answered_in_their_order(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        for number in range(8):
+            connection.send(json.dumps({"frame": number}))
+            connection.send(again(number))
+        answers = [json.loads(connection.recv(timeout=30)) for _ in range(8)]
+    assert [answer["frame"] for answer in answers] == list(range(8))
+    assert [answer["frames"] for answer in answers] == list(range(1, 9))
+
+
+def test_what_is_wrong_is_told_and_the_run_goes_on(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        problems = [
+            ask(connection, b"no picture"),
+            ask(connection, again(1)[:2000]),
+            ask(connection, again(1), frame=-1),
+            ask(connection, again(1), speed=3),
+        ]
+        for message in ("{", "[]"):
+            connection.send(message)
+            problems.append(json.loads(connection.recv(timeout=30)))
+        for _ in range(2):
+            connection.send('{"frame": 1}')
+        problems.append(json.loads(connection.recv(timeout=30)))
+        slugs = [problem["problem"]["type"].rpartition(":")[2] for problem in problems]
+        assert slugs == [
+            "not-an-image", "truncated-image", "invalid-request", "invalid-request", "malformed-body", "malformed-body",
+            "invalid-request",
+        ]  # fmt: skip
+        assert all(problem["problem"]["request_id"] and problem["problem"]["detail"] for problem in problems)
+        good = ask(connection, again(1), frame=9)
+        assert good["frames"] == 1
+        assert ask(connection, again(1), frame=8)["problem"]["status"] == 409
+
+
+def test_a_frame_has_one_message_though_its_parameters_be_refused(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        for texts in (["{"], ['{"frame": 1}', '{"frame": 2}']):
+            for message in texts:
+                connection.send(message)
+            connection.send(again(1))
+        connection.send('{"frame": 3}')
+        connection.send(again(3))
+        answers = [json.loads(connection.recv(timeout=30)) for _ in range(3)]
+        assert ["problem" in answer for answer in answers] == [True, True, False]
+        assert (answers[2]["frame"], answers[2]["frames"]) == (3, 1), "the others were not taken in"
+
+
+def test_a_session_that_is_not_there_is_refused_before_the_handshake(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    for map_id, name, status in ((traverse, "s-0", 404), ("nowhere", session, 404), ("NO", session, 422)):
+        with pytest.raises(InvalidStatus) as refused, stream(server, map_id, name):
+            pass
+        response = refused.value.response
+        assert response.status_code == status
+        assert response.headers["content-type"] == "application/problem+json"
+        assert json.loads(response.body)["status"] == status
+
+
+def test_one_stream_a_session(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        with pytest.raises(InvalidStatus) as refused, stream(server, traverse, session):
+            pass
+        assert refused.value.response.status_code == 409
+        assert ask(connection, again(0))["frames"] == 1
+    with stream(server, traverse, session) as connection:
+        assert ask(connection, again(1))["frames"] == 2
+
+
+def test_a_session_that_is_deleted_under_the_stream(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    with stream(server, traverse, session) as connection:
+        ask(connection, again(0))
+        server.client.delete(f"/v1/maps/{traverse}/sessions/{session}")
+        assert ask(connection, again(1))["problem"]["type"].endswith("unknown-session")
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=30)
+
+
+def test_frames_over_the_limit_and_a_service_that_stops(tmp_path: Path) -> None:
+    install_coarse_encoder(tmp_path / "models")
+    settings = {"encoder": COARSE, "max_image_bytes": 60_000, "root_path": "/placerec"}
+    server = Server(tmp_path, settings=settings).wait()
+    server.create_map("lab")
+    server.enrol("lab", "p", jpeg(1))
+    session = server.client.post("/v1/maps/lab/sessions", json={}).json()["id"]
+    with stream(server, "lab", session) as connection:
+        assert ask(connection, jpeg(1))["frames"] == 1
+        connection.send(bytes(200_000))
+        with pytest.raises(ConnectionClosed) as closed:
+            connection.recv(timeout=30)
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009, "message too big"
+    with stream(server, "lab", session) as connection:
+        assert ask(connection, jpeg(1))["frames"] == 2
+        assert server.stop() == 0
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=30)
+
+
+def test_a_plain_request_to_a_stream(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    response = server.client.get(f"/v1/maps/{traverse}/sessions/{session}/stream")
+    assert response.status_code == 404
+    assert post(server, traverse, session, again(1)).status_code == 200

@@ -1,0 +1,73 @@
+"""A pruning that is killed: what was to go goes once, and no more than that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.storage import MapSettings
+from core.storage.transfer import Transfer
+from service.jobs.jobs import JobInterrupted
+from service.upkeep import pruning
+from tests.service.engines import ENCODER, end_of, engine_at, enrolments
+
+GOING = ("l1", "l3", "l5")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A map of eight places; what is to go is settled, for nothing can be encoded here."""
+    with engine_at(tmp_path) as engine:
+        engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
+    planned = 0
+
+    def plan(engine: Any, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
+        nonlocal planned
+        planned += 1
+        assert planned == 1, "a second plan would thin what was thinned"
+        there = engine.atlas.get("lab").transfer.outline()
+        return {"removed": 3}, {place.id: place.digest.hex() for place in there if place.id in GOING}
+
+    monkeypatch.setattr(pruning, "_plan", plan)
+    return tmp_path
+
+
+@pytest.mark.parametrize("when", ["before it goes", "after it went"])
+def test_a_kill_around_the_commit(folder: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    forget = Transfer.forget
+
+    def broken_off(self: Transfer, frames: dict[str, bytes]) -> int:
+        if when == "after it went":
+            forget(self, frames)
+        engine.jobs.stop_soon()
+        raise JobInterrupted
+
+    with engine_at(folder) as engine, monkeypatch.context() as broken:
+        broken.setattr(Transfer, "forget", broken_off)
+        job = engine.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False})
+        while not engine.jobs.stopping:
+            pass
+    with engine_at(folder) as engine:
+        done = end_of(engine, job)
+        assert (done.state, done.attempt, done.result) == ("succeeded", 2, {"removed": 3, "places_after": 5})
+        left = [place.id for place in engine.atlas.get("lab").transfer.outline()]
+        assert left == ["l0", "l2", "l4", "l6", "l7"]
+
+
+def test_a_place_that_shows_something_else_by_now_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with engine_at(folder) as engine:
+        lab = engine.atlas.get("lab")
+        plan = pruning._plan
+
+        def and_then(*arguments: Any) -> Any:
+            found = plan(*arguments)
+            (other,) = enrolments(100, 1, "l", "monday")
+            lab.enrol([type(other)("l3", other.fields, other.descriptor, 5, other.digest)])
+            return found
+
+        monkeypatch.setattr(pruning, "_plan", and_then)
+        done = end_of(engine, engine.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False}))
+        assert done.result == {"removed": 3, "places_after": 6}
+        assert "l3" in [place.id for place in lab.transfer.outline()]
