@@ -21,7 +21,7 @@ from service.access.keys import KeyStore
 from service.access.rates import Rates
 from service.app.gauges import gauges
 from service.app.routers import ROUTERS
-from service.engine.engine import Engine
+from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
 from service.http.bodies import BodyLimit, UploadMemory
 from service.settings import Settings, read_settings
@@ -128,14 +128,14 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
         with kept_in(chosen.audit_file), keyring or nullcontext():
             tell_exposure(gate, chosen)
-            engine = await to_thread.run_sync(Engine, chosen, metrics)
-            app.state.engine = engine
-            engine.start()
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics)
+            runtime.publish(app.state)
+            runtime.start()
             try:
-                with gauges(engine, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                with gauges(runtime, app.state.upload_memory, to_thread.current_default_thread_limiter()):
                     yield
             finally:
-                await engine.close()
+                await runtime.close()
 
     app = FastAPI(
         title="placerec",

@@ -5,21 +5,25 @@ from __future__ import annotations
 import json
 import platform
 from functools import lru_cache
+from typing import Annotated
 
 import faiss
 import torch
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import APIRouter, Depends, FastAPI, Request
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import HTMLResponse, Response
 
 from service.app.documentation import SECURITY_POLICY, page
+from service.app.runtime import Runtime
 from service.app.schemas import Health, Readiness, Version
 from service.engine.engine import in_thread
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
 from service.http import openapi
-from service.http.dependencies import EngineDep, PrincipalDep
+from service.http.dependencies import EngineDep, FromState, PrincipalDep
 from service.maps.schemas import QuarantinedMap
+
+RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
 
 router = APIRouter(tags=["service"])
 
@@ -31,15 +35,15 @@ async def check_liveness() -> Health:
 
 
 @router.get("/readyz", responses=problem_documentation(NotReady))
-async def check_readiness(engine: EngineDep, principal: PrincipalDep) -> Readiness:
+async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readiness:
     """Whether frames can be served: encoder loaded and true to its golden values, maps open, disk writable.
 
     A damaged map does not make the service unready; it is named here to whoever may use it.
     """
-    checks = await engine.check_readiness()
-    damaged = engine.atlas.quarantined().items()
+    checks = await runtime.check_readiness()
+    damaged = runtime.engine.atlas.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
-    return Readiness(checks=checks, encoder=engine.settings.encoder, quarantined=quarantined)
+    return Readiness(checks=checks, encoder=runtime.settings.encoder, quarantined=quarantined)
 
 
 @router.get(

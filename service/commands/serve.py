@@ -93,14 +93,14 @@ async def _run(application: Any, config: Any, socket: Any, settings: Settings, c
     from service.http.server import DrainingServer
 
     def drain() -> None:
-        application.state.engine.stopping = connections.draining = True
+        application.state.runtime.stopping = connections.draining = True
 
     async with application.router.lifespan_context(application):
         # The server stops at these signals, then sends them again to whoever handled them before:
         # without handlers of ours the process would end there, and not close its maps.
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: None)
-        stop_jobs = application.state.engine.jobs.stop_soon
+        stop_jobs = application.state.jobs.stop_soon
         server = DrainingServer(config, settings.drain_seconds, drain, stop_jobs)
         await server.serve(sockets=[socket])
 

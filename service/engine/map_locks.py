@@ -1,4 +1,4 @@
-"""Possession of a map by one thread, for a write that depends on a look at it."""
+"""A lock for each map, held during a write that depends on what was read before."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class _Claim:
+class _Lock:
     lock: threading.RLock = field(default_factory=threading.RLock)
-    claimed: int = 0
+    users: int = 0
 
 
-class Possession:
-    """One lock a map, there only while somebody has it or waits for it.  From any thread."""
+class MapLocks:
+    """One reentrant lock for each map, which exists only while a thread holds it or waits for it.  Thread-safe."""
 
     def __init__(self) -> None:
-        self._claims: dict[str, _Claim] = {}
+        self._locks: dict[str, _Lock] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
-        return len(self._claims)
+        return len(self._locks)
 
     @contextmanager
     def of(self, map_id: str) -> Iterator[None]:
-        """Have a map; blocks.  Whoever has it may take it again."""
+        """Hold the lock of a map; blocks.  A thread that holds it already may take it again."""
         with self._lock:
-            claim = self._claims.setdefault(map_id, _Claim())
-            claim.claimed += 1
+            lock = self._locks.setdefault(map_id, _Lock())
+            lock.users += 1
         try:
-            with claim.lock:
+            with lock.lock:
                 yield
         finally:
             with self._lock:
-                claim.claimed -= 1
-                if not claim.claimed:
-                    del self._claims[map_id]
+                lock.users -= 1
+                if not lock.users:
+                    del self._locks[map_id]

@@ -6,15 +6,13 @@ import asyncio
 import time
 from collections.abc import Callable, Coroutine, Sequence
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from core.frames.masks import Mask
+from service.engine.engine import Engine
 from service.engine.queue import Encoded, Patience
 from service.errors.faults import ClientGone
-from service.jobs.jobs import JobContext
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext
 
 Result = TypeVar("Result")
 
@@ -50,7 +48,7 @@ def run_behind(engine: Engine, context: JobContext, work: Callable[[Patience], C
     """
 
     async def stopped() -> None:
-        while not (context.cancelled or engine.jobs.stopping):
+        while not context.is_to_stop:
             await asyncio.sleep(POLL_SECONDS)
 
     stand_back(engine, context)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from core.errors import UnknownMap
 from core.storage import Atlas, Map
 from service.jobs.records import Job
-
-if TYPE_CHECKING:
-    from service.jobs.jobs import Jobs
 
 Work = Callable[["JobContext"], Mapping[str, Any]]
 """What a job does; its result is an object of JSON."""
@@ -39,10 +36,21 @@ SLICE_SECONDS = 5.0
 """So long a job that can be taken up again works before it gives way to those that wait."""
 
 
+class Supervisor(Protocol):
+    """What a job reports to, and asks whether it is to stop: all jobs together (:class:`service.jobs.jobs.Jobs`)."""
+
+    stopping: bool
+
+    def get(self, job_id: str) -> Job: ...
+    def others_wait(self, job_id: str) -> bool: ...
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None: ...
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None: ...
+
+
 class JobContext:
     """What a job knows of itself while it runs, in the thread that runs it."""
 
-    def __init__(self, jobs: Jobs, job: Job) -> None:
+    def __init__(self, jobs: Supervisor, job: Job) -> None:
         self._jobs, self._written, self._noticed = jobs, time.monotonic(), 0.0
         self._began = time.monotonic()
         self.id, self.map_id, self.arguments = job.id, job.map_id, job.arguments
@@ -71,7 +79,7 @@ class JobContext:
         writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
         self._written = now if writing else self._written
         self._noticed = now if noticing else self._noticed
-        self._jobs._progress(self.id, writing, noticing, done=done, total=total, message=message[:500])
+        self._jobs.report(self.id, writing, noticing, done=done, total=total, message=message[:500])
 
     def remember(self, **notes: Any) -> None:
         """Write down, on disk when this returns, what the next attempt needs besides the arguments; JSON.
@@ -80,12 +88,17 @@ class JobContext:
             StorageFull, StorageFailure.
         """
         self.notes = {**self.notes, **notes}
-        self._jobs._note(self.id, self.notes)
+        self._jobs.note(self.id, self.notes)
 
     @property
     def cancelled(self) -> bool:
         """Somebody has asked the job to stop."""
         return self._jobs.get(self.id).cancelling
+
+    @property
+    def is_to_stop(self) -> bool:
+        """Whether the job was cancelled, or the service stops."""
+        return self._jobs.stopping or self.cancelled
 
     def check_cancelled(self) -> None:
         """Return unless the job is to stop.

@@ -319,7 +319,7 @@ class Jobs:
 
     # Changes
 
-    def _progress(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
         if writing:
             self._change(job_id, **progress)
             return
@@ -330,7 +330,7 @@ class Jobs:
         if noticing:
             self._notify(job_id)
 
-    def _note(self, job_id: str, notes: Mapping[str, Any]) -> None:
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None:
         with self._changed:
             job = replace(self._jobs[job_id], notes=dict(notes))
             self._records.put(job)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Depends, Request, Response
-from starlette.responses import JSONResponse
 
 from core import errors
 from core.method.encoder import Encoding
@@ -26,7 +25,7 @@ from service.http.dependencies import EngineDep, IfMatch, MapId, PatienceDep, ex
 from service.http.parameters import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
 from service.jobs.context import born
-from service.jobs.routes import router as jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.calibration import KIND, arguments_of, measured, store
 from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
@@ -76,7 +75,7 @@ BODY: dict[str, Any] = {
     responses={202: {"model": JobView, "description": "The job that does it, if `background` is asked for."}},
 )
 async def calibrate_map(
-    map_id: MapId, request: Request, engine: EngineDep, patience: PatienceDep, if_match: IfMatch = None
+    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, patience: PatienceDep, if_match: IfMatch = None
 ) -> CalibrationReport | Response:
     """Measure when a map's answers are to be believed, and make that its calibration.
 
@@ -98,9 +97,8 @@ async def calibrate_map(
     request.state.noted = {"map": map_id, "method": order.method}
     if order.background:
         arguments, maps = arguments_of(map_, order, expected), {map_id: born(map_)}
-        job = await in_thread(engine.jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
-        location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-        return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+        job = await in_thread(jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
+        return accepted(job, engine.settings)
 
     def advance(_done: int, _total: int) -> None:
         if patience.left() <= 0:

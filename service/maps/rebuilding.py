@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import MapQuarantined
 from core.storage.search.reindexing import rebuild as rebuild_index
+from service.engine.engine import Engine
 from service.jobs.background import stand_back
 from service.jobs.context import born
 from service.jobs.jobs import JobContext
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 REBUILD, VERIFY = "rebuild", "verify"
 

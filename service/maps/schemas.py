@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.verdict import Calibration
 from core.places import Timestamp
-from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, SequenceSummary, StorageStatus, TierSetting
+from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM
 from service.http.fields import IDENTITY_EXAMPLE, Cursor
 
@@ -132,17 +132,3 @@ class MapChanges(BaseModel):
         description=f"auto, exact, compact (auto from {COMPACT_FROM} places on) or inverted (from {INVERTED_FROM}).",
     )
     calibration: CalibrationChanges | None = None
-
-
-class SequencePage(BaseModel):
-    """Traverses in the order of their names."""
-
-    items: list[SequenceSummary]
-    next_cursor: Cursor
-
-
-class ForgottenSequence(BaseModel):
-    """A deleted traverse."""
-
-    name: str
-    places: int = Field(description="Places that were forgotten with it.")

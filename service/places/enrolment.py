@@ -7,20 +7,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 from core.errors import NoRegions
 from core.frames.images import encode_thumbnail
 from core.frames.masks import Mask
 from core.places import Place, PlaceFields
 from core.storage import Change, Enrolment, Map, SameFrame
+from service.engine.engine import Engine
 from service.engine.queue import AHEAD, Encoded, Patience
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import Sequel, Stage
 from service.worker_threads import in_thread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 
 @dataclass(frozen=True)

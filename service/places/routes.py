@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 
 from core import errors
 from core.storage.patches import merge_patch
@@ -25,10 +25,12 @@ from service.errors.problems import problem_documentation
 from service.http.bodies import StrictRoute
 from service.http.dependencies import (
     EngineDep,
+    FromState,
     MapId,
     PatienceDep,
     PlaceId,
     PlacePageQuery,
+    frame_for_map,
     json_body,
     milliseconds_since,
     rounded,
@@ -37,14 +39,19 @@ from service.http.dependencies import (
 )
 from service.http.openapi import form_body, frame_body, json_patch
 from service.http.parameters import BatchParameters, EnrolParameters, check_metadata
-from service.http.uploads import json_part, read_frame, read_many
-from service.jobs.routes import router as jobs
+from service.http.uploads import json_part, read_many
+from service.jobs.jobs import Jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.places import bulk_enrolment
-from service.places.batch_order import Sequel
+from service.places.batch_order import BatchOrder, Sequel
 from service.places.batches import candidate_of, check_batch, given_id, item_problem
 from service.places.enrolment import Candidate, enrol
 from service.places.schemas import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+from service.places.staging import Staging
+
+StagingDep = Annotated[Staging, Depends(FromState("staging"))]
+BatchOrderDep = Annotated[BatchOrder, Depends(FromState("batch_order"))]
 
 router = APIRouter(
     prefix="/v1/maps/{map}/places",
@@ -98,14 +105,10 @@ async def enrol_place(
     encoded again, so a request can be repeated until it succeeds. The answer comes when the place is
     on disk and found by every later query.
     """
-    engine.inference.check_room()
-    map_ = await engine.map(map_id)
-    frame = await read_frame(request, engine.settings)
-    options = options.joined(frame.fields)
-    engine.assert_encoder(map_, options.encoder)
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = options.place_fields(engine.settings)
     mask = await camera_mask(map_, fields.camera)
-    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data, mask)], patience))[0]
+    stored = (await enrol(engine, map_, [Candidate(place_id, fields, data, mask)], patience))[0]
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "change": stored.change}
     return EnrolledPlace(
@@ -131,6 +134,9 @@ async def enrol_places(
     options: Annotated[BatchParameters, Query()],
     request: Request,
     engine: EngineDep,
+    jobs: JobsDep,
+    staging: StagingDep,
+    batch_order: BatchOrderDep,
     patience: PatienceDep,
 ) -> BatchResults | Response:
     """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
@@ -145,8 +151,8 @@ async def enrol_places(
     To have the next batch encoded while this one is being stored, name them: `?batch=a`, then `?batch=b&after=a`.
     """
     if options.background:
-        return await _enrol_later(map_id, options, request, engine)
-    with engine.succession.enter(map_id, options.batch, options.after, patience) as sequel:
+        return await _enrol_later(map_id, options, request, engine, jobs, staging)
+    with batch_order.enter(map_id, options.batch, options.after, patience) as sequel:
         return await _enrol_now(map_id, options, request, engine, patience, sequel)
 
 
@@ -199,13 +205,14 @@ async def _enrol_now(
     return BatchResults(items=[result for result in results if result is not None], encoder=map_.record.encoder)
 
 
-async def _enrol_later(map_id: str, options: BatchParameters, request: Request, engine: Engine) -> Response:
+async def _enrol_later(
+    map_id: str, options: BatchParameters, request: Request, engine: Engine, jobs: Jobs, staging: Staging
+) -> Response:
     map_ = await engine.map(map_id)
     engine.assert_encoder(map_, options.encoder)
-    job = await bulk_enrolment.receive(engine, map_, request)
+    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request)
     request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
-    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+    return accepted(job, engine.settings)
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Request
 from core import errors
 from service.errors.problems import problem_documentation
 from service.http.dependencies import EngineDep, MapId, Page, SequenceName, single_values
-from service.maps.schemas import ForgottenSequence, SequencePage
+from service.places.schemas import ForgottenSequence, SequencePage
 
 router = APIRouter(
     prefix="/v1/maps/{map}/sequences",

@@ -17,12 +17,21 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.http.dependencies import (
+    EngineDep,
+    MapId,
+    PatienceDep,
+    frame_for_map,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
 from service.http.openapi import frame_body
-from service.http.uploads import parse_metadata, read_frame
+from service.http.uploads import parse_metadata
 from service.places.enrolment import Candidate
 from service.places.schemas import PlaceView
-from service.queries.answers import answer_of, blank_answer, count_answer
+from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
 from service.queries.closures import close_loop
 from service.queries.parameters import ClosureParameters
 from service.queries.schemas import ClosureAnswer
@@ -54,6 +63,7 @@ async def query_or_enrol(
     request: Request,
     response: Response,
     engine: EngineDep,
+    statistics: StatisticsDep,
     patience: PatienceDep,
 ) -> ClosureAnswer:
     """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
@@ -63,30 +73,26 @@ async def query_or_enrol(
     again. `exclude_frames` and `exclude_seconds` keep a robot from finding what it has just enrolled. A frame without
     regions is not enrolled.
     """
-    engine.inference.check_room()
-    map_ = await engine.map(map_id)
-    frame = await read_frame(request, engine.settings)
-    options = options.joined(frame.fields)
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
     selection = options.selection()
-    engine.assert_encoder(map_, options.encoder)
     check_place_id(options.id)
     metadata = {} if options.metadata is None else parse_metadata(options.metadata)
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
     with engine.inference.place_in_queue():
-        encoded = await engine.encode_for(map_, frame.data, patience, mask)
+        encoded = await engine.encode_for(map_, data, patience, mask)
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:
         answer = blank_answer(map_, encoded)
     else:
-        candidate = Candidate(options.id, fields, frame.data, mask)
+        candidate = Candidate(options.id, fields, data, mask)
         closure = await in_thread(close_loop, engine, map_, candidate, encoded, options.k, selection)
         answer = answer_of(encoded, closure.located)
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"
-    count_answer(engine, map_, answer)
+    count_answer(engine, statistics, map_, answer)
     response.status_code = 201 if change == "created" else 200
     request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})

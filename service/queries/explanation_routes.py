@@ -9,9 +9,12 @@ from starlette.responses import Response
 
 from service.errors.faults import UnknownExplanation
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, MapId, single_values
+from service.http.dependencies import EngineDep, FromState, MapId, single_values
 from service.http.openapi import BINARY
-from service.upkeep.upkeep import key_of
+from service.queries.pictures import ExplanationPictures
+from service.queries.statistics import key_of
+
+PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 
 router = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
 
@@ -28,10 +31,11 @@ def see_explanation(
     map_id: MapId,
     name: Annotated[str, Path(alias="explanation", max_length=64, description="As the answer to the query named it.")],
     engine: EngineDep,
+    pictures: PicturesDep,
 ) -> Response:
     """See a query beside its best match: cells (or regions) that answer each other are joined by lines.
 
     `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
     """
-    picture = engine.pictures.fetch(key_of(engine.atlas.find(map_id)), name)
+    picture = pictures.fetch(key_of(engine.atlas.find(map_id)), name)
     return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

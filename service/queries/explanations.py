@@ -27,8 +27,8 @@ from service.queries.explanation_schemas import (
     RegionPair,
     RelativeBox,
 )
-from service.queries.pictures import Line, Outline, scaled, side_by_side
-from service.upkeep.upkeep import key_of
+from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
+from service.queries.statistics import key_of
 
 LISTED = 30
 """Regions of a frame that are told of."""
@@ -43,7 +43,7 @@ def as_drawn(encoded: Encoded) -> Encoded:
 
 
 async def explained_match(
-    engine: Engine, map_: Map, query: Encoded, place_id: str, patience: Patience
+    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, patience: Patience
 ) -> MatchExplanation | None:
     """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
 
@@ -67,7 +67,7 @@ async def explained_match(
     path = None
     if again is not None:
         drawn = await in_thread(drawing, told, query.pixels, again.pixels)
-        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(key_of(map_), drawn)}"
+        path = f"/v1/maps/{map_.record.id}/explanations/{pictures.keep(key_of(map_), drawn)}"
     return MatchExplanation(**told.__dict__, place=place_id, match_picture=place.picture, picture=path)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, Unknow
 from core.places import PlaceFields, check_place_id
 from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
+from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
 from service.jobs.background import stand_back
 from service.jobs.jobs import JobContext, JobInterrupted
 from service.upkeep.overlap import overlap
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "merge"
 

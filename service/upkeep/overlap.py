@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from core.method.encoder import Encoding
 from core.method.regions import Regions
 from core.recognition.localization import locate
+from core.recognition.self_queries import TOGETHER, spread
 from core.storage import Map
+from service.engine.engine import Engine
 from service.jobs.background import stand_back
 from service.jobs.jobs import JobContext
-from service.places.own_frames import TOGETHER, load_encoder, spread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 NAMED = 20
 
@@ -32,7 +30,7 @@ _NO_REGIONS = Regions(
 
 def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[str, Any]:
     """How many of the other map's places this one recognizes, by a sample of them spread over it."""
-    encoder = load_encoder(engine, map_)
+    encoder = engine.load_encoder(map_)
     outline, snapshot = other.transfer.outline(), other.snapshot()
     outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
     chosen = [outline[i] for i in spread(len(outline))[: context.arguments["sample"]]]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from core.frames.masks import Mask
 from core.places import PlaceFields
 from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
+from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
 from service.jobs.background import encode_behind
 from service.jobs.context import born
 from service.jobs.jobs import JobContext, JobInterrupted
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "re-encode"
 

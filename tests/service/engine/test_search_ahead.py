@@ -16,11 +16,10 @@ from core.frames.preprocessing import Pixels
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage import Map
+from service.engine import searches
 from service.engine.microbatches import MOST_FRAMES, MicroBatches, Then, Turn
 from service.engine.queue import Encoded
-from service.engine.searches import Searches
-from service.queries import answers
-from service.queries.answers import search_ahead
+from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes
 from tests.service.scenes import jpeg, scene, seen_again
@@ -69,7 +68,7 @@ def test_what_may_take_long_is_not(map_: Map, encoder: Encoder, monkeypatch: pyt
     with monkeypatch.context() as patched:
         patched.setattr(map_, "snapshot", lambda: replace(now, holds=False))
         assert search([encoded(encoder, scene(0))]) == [None], "what is on the disk may take long"
-    monkeypatch.setattr(answers, "MOST_AHEAD", 3)
+    monkeypatch.setattr(searches, "MOST_AHEAD", 3)
     assert search_ahead(map_, 3, None) is None
 
 

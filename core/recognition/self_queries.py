@@ -1,24 +1,17 @@
-"""A map held against itself: its places' frames as queries, without encoding anything."""
+"""Queries of a map by the frames of its own places, from what it stores of them: nothing is encoded."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import UnknownEncoder
 from core.judgement.verdict import Neighborhood
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
 from core.storage import Map
 from core.storage.transfer import Outline
-from service.errors.faults import EncoderNotInstalled
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 Positions = NDArray[np.int64]
 
@@ -31,24 +24,12 @@ HEAD = 400
 _GOLDEN = (5**0.5 - 1) / 2
 
 
-def load_encoder(engine: Engine, map_: Map) -> Encoder:
-    """A map's encoder, from a thread that is not the event loop's.
-
-    Raises:
-        EncoderNotInstalled: it is not here.
-    """
-    try:
-        return asyncio.run_coroutine_threadsafe(engine.inference.load(map_.record.encoder), engine.loop).result()
-    except UnknownEncoder as error:
-        raise EncoderNotInstalled(str(error)) from error
-
-
 def spread(count: int) -> Positions:
     """0 … count - 1 in an order of which every beginning is spread evenly over them."""
     return np.argsort((np.arange(count) * _GOLDEN) % 1.0, kind="stable").astype(np.int64)
 
 
-class OwnFrames:
+class SelfQueries:
     """The places of a map at one moment; positions count them in the order of their rows."""
 
     def __init__(self, map_: Map, encoder: Encoder) -> None:

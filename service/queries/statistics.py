@@ -16,9 +16,12 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from core.errors import PlacerecError, UnknownMap
 from core.judgement.verdict import Verdict
+from core.storage import Map
 from core.storage.files.disk import Damage, refusals
 from core.upkeep.drift import SCORE_BINS, Week
+from service.engine.engine import Engine
 
 FILE = "statistics.sqlite"
 VERSION = 1
@@ -33,9 +36,15 @@ SPARE_PLACES = 1000
 """So many more places may be counted than the map has, before those that are gone are looked for."""
 
 MapKey = tuple[str, str]
-"""A map's id and the moment of its making: a new one of the same id begins with nothing."""
+"""A map's id and when it was created, so that a new map of the same id begins with nothing."""
 
 log = logging.getLogger("placerec.statistics")
+
+
+def key_of(map_: Map) -> MapKey:
+    """The key by which the statistics know a map."""
+    return map_.record.id, map_.record.created_at.isoformat()
+
 
 _TABLES = (
     "CREATE TABLE maps (code INTEGER PRIMARY KEY, id TEXT NOT NULL, made TEXT NOT NULL, since TEXT NOT NULL,"
@@ -120,6 +129,29 @@ class QueryStatistics:
         self._connection: sqlite3.Connection | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="statistics", daemon=True)
+
+    @classmethod
+    def of_engine(cls, engine: Engine) -> QueryStatistics:
+        """The statistics of all maps of an engine."""
+
+        def sizes() -> dict[MapKey, int] | None:
+            if engine.atlas.quarantined():
+                return None  # a map that is out of service now may come back
+            found = {}
+            for record in engine.all_records():
+                try:
+                    map_ = engine.atlas.find(record.id)
+                except UnknownMap:
+                    continue  # it was deleted since it was listed
+                except PlacerecError:
+                    return None
+                found[key_of(map_)] = map_.count_places()
+            return found
+
+        def present(map_id: str) -> set[str]:
+            return {place.id for place in engine.atlas.get(map_id).transfer.outline()}
+
+        return cls(engine.settings.data_dir, engine.settings.statistics_seconds, sizes, present)
 
     def start(self) -> None:
         """Write now and then from here on."""

@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from core.upkeep.drift import Week
-from service.upkeep import statistics
-from service.upkeep.statistics import FILE, MOST_WEEKS, SPARE_PLACES, MapKey, QueryStatistics, _Counts
+from service.queries import statistics
+from service.queries.statistics import FILE, MOST_WEEKS, SPARE_PLACES, MapKey, QueryStatistics, _Counts
 
 LAB: MapKey = ("lab", "2026-11-20T09:00:00+00:00")
 HALL: MapKey = ("hall", "2026-11-20T09:00:00+00:00")
