@@ -28,7 +28,7 @@ from core.evaluation.timing import sample_picture
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.localization import locate
+from core.recognition.recognition import locate
 from core.recognition.selection import EVERYTHING, Selection
 from core.storage import Atlas, Map
 from service.queries.filters import FilterParameters

@@ -29,7 +29,7 @@ from core.evaluation.timing import encode_batch
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from core.recognition.localization import locate
+from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
 from service.commands.load import measure

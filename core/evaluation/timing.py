@@ -9,13 +9,14 @@ from collections.abc import Callable, Mapping, Sequence
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, prepare
-from core.judgement.verdict import NO_POSE
+from core.judgement.verdict import NO_POSE, Neighborhood
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import examine
+from core.recognition.stages import examine
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.spots import Spot
@@ -108,7 +109,17 @@ def search_run(encoder: Encoder, places: int) -> Callable[[], object]:
     local = random.integers(-127, 128, (places, *encoder.local_shape), np.int8)
     empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape, halves=True)
     snapshot = empty.appended(list(known), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
-    return lambda: examine(encoder, snapshot, local[middle], snapshot.search(known[middle]))
+
+    def run() -> object:
+        rows, products = snapshot.search(known[middle])
+
+        def gains(positions: NDArray[np.int64]) -> NDArray[np.float32]:
+            return encoder.agreement(local[middle], snapshot.locals_in_place(rows[positions]))
+
+        scores, places_ = encoder.scores_from_inner_products(products), snapshot.whereabouts_at(rows)
+        return examine(scores, places_, Neighborhood(0.0, 0), encoder.candidates, gains)
+
+    return run
 
 
 def better_forward(times: Mapping[str, float]) -> float:

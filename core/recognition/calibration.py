@@ -21,7 +21,7 @@ from core.judgement.trials import Trial, Trials, gathered
 from core.judgement.verdict import NO_POSE, Calibration, Neighborhood, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import neighborhood_of, second_stage
+from core.recognition.stages import agree, neighborhood_of
 from core.storage import Map, Ranking, Snapshot
 
 Item = TypeVar("Item")
@@ -233,9 +233,9 @@ def _trial(
     remaining: Ranking = ranking[0][kept], ranking[1][kept]
     if not len(remaining[0]):
         return []
-    scored = second_stage(map_, encoder, snapshot, question.local, remaining)
-    judgement = judge(scored.ordered, scored.whereabouts, base, neighborhood_of(map_), scored.examined)
-    return [Trial(judgement, known, known and bool(question.true[scored.rows[0]]), number)]
+    candidates = agree(map_, encoder, snapshot, question.local, remaining)
+    judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
+    return [Trial(judgement, known, known and bool(question.true[candidates.rows[0]]), number)]
 
 
 def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:

@@ -1,6 +1,6 @@
 """When and where the frames of requests are searched for in a map.
 
-What a search does is said by :func:`core.recognition.localization.locate`; here is only who does it when:
+What a search does is said by :func:`core.recognition.recognition.locate`; here is only who does it when:
 
 * a frame of a small map is searched for in the thread that encoded it (:class:`SearchAhead`);
 * searches of one map that come together share a thread, so that each place is read from memory once for all of them;
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from anyio import to_thread
 
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import Located, locate
+from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
 from core.threads import cores
@@ -40,7 +40,7 @@ class Recognized:
     """A frame that was encoded and searched for; ``located`` is None for a frame without regions."""
 
     encoded: Encoded
-    located: Located | None
+    located: Answer | None
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class SearchAhead:
     map_: Map
     k: int
 
-    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Located] | None]:
+    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Answer] | None]:
         """What was found for each frame; None for a frame that is left to :meth:`Searches.recognize`."""
         seen = [one for one in encoded if len(one.encoding.regions)]
         if not seen or not self.map_.snapshot().holds:  # it would have to be read from the disk
@@ -78,7 +78,7 @@ class _Purpose:
 @dataclass
 class _Waiting:
     encodings: Sequence[Encoding]
-    answer: asyncio.Future[list[Located]]
+    answer: asyncio.Future[list[Answer]]
 
 
 class Searches:
@@ -103,7 +103,7 @@ class Searches:
         """
         seen = [frame for frame in frames if len(frame.encoding.regions)]
         if len(seen) == 1 and seen[0].followed is not None:
-            located: list[Located] = seen[0].followed
+            located: list[Answer] = seen[0].followed
         else:
             encodings = [frame.encoding for frame in seen]
             located = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
@@ -112,8 +112,8 @@ class Searches:
 
     async def locate(
         self, map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
-    ) -> list[Located]:
-        """What :func:`core.recognition.localization.locate` gives, in a thread and together with what others ask for.
+    ) -> list[Answer]:
+        """What :func:`core.recognition.recognition.locate` gives, in a thread and together with what others ask for.
 
         Raises:
             StorageFailure: the map's files cannot be read.

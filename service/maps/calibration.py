@@ -18,7 +18,7 @@ from core.recognition.calibration import (
     second_traverse,
     warnings_on,
 )
-from core.recognition.localization import calibration_of
+from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
 from service.engine.engine import Engine
 from service.jobs.background import stand_back

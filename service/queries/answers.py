@@ -10,7 +10,8 @@ from fastapi import Depends
 
 from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
-from core.recognition.localization import Located, calibration_of
+from core.recognition.recognition import Answer
+from core.recognition.stages import calibration_of
 from core.storage import Map
 from service.engine.engine import Engine
 from service.engine.queue import Encoded
@@ -49,7 +50,7 @@ def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answ
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
 
 
-def answer_of(encoded: Encoded, located: Located) -> QueryAnswer:
+def answer_of(encoded: Encoded, located: Answer) -> QueryAnswer:
     """The answer to a frame that was searched for."""
     judgement = located.judgement
     weights: Sequence[float | None] = located.weights or [None] * len(located.matches)
@@ -67,7 +68,7 @@ def answer_of(encoded: Encoded, located: Located) -> QueryAnswer:
         margin=judgement.margin,
         decision=judgement.decision,
         threshold=located.calibration.threshold,
-        reason=None if matches else "no-place-allowed" if located.scored.places else "empty-map",
+        reason=None if matches else "no-place-allowed" if located.candidates.places else "empty-map",
         matches=matches,
         encoder=encoded.encoder.identity,
         milliseconds=rounded({**encoded.milliseconds, "search": located.search}),

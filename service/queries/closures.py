@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from core.places import Place
-from core.recognition.localization import Located, locate
+from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
 from service.engine.engine import Engine
 from service.engine.queue import Encoded
 from service.errors.faults import PlaceTaken
-from service.places.enrolment import Candidate, frame_digest, prepare
+from service.places.enrolment import Candidate, describe_candidate, digest_of
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Closure:
     created: whether the place was made now.
     """
 
-    located: Located
+    located: Answer
     enrolled: Place | None
     created: bool
 
@@ -43,8 +43,8 @@ def close_loop(
         PlaceTaken: the candidate's id is that of a place with another frame.
         StorageFull, StorageFailure: nothing was enrolled.
     """
-    digest = frame_digest(candidate)
-    enrolment = prepare(engine, map_, candidate, digest, encoded)
+    digest = digest_of(candidate)
+    enrolment = describe_candidate(engine, map_, candidate, digest, encoded)
     with engine.writing(map_.record.id):
         known = map_.digest(candidate.id)
         if known is not None and known != digest:

@@ -12,7 +12,7 @@ from core.frames.masks import Mask
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import log_odds_per_score
 from core.judgement.verdict import Verdict
-from core.recognition.localization import Located
+from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
@@ -50,7 +50,7 @@ class MapReport:
 
     map_id: str
     map_: Map | None = None
-    located: Located | None = None
+    located: Answer | None = None
     error: Exception | None = None
     frames: tuple[Encoded | Exception, ...] = ()
 
@@ -190,6 +190,6 @@ def match_log_odds(report: MapReport) -> list[float]:
     the match scores less, with what is known of it."""
     located = report.located
     assert located is not None
-    ordered = located.scored.ordered[: len(located.matches)].astype(np.float64)
-    steepness = log_odds_per_score(located.calibration, bool(located.scored.examined.any()))
+    ordered = located.candidates.ordered[: len(located.matches)].astype(np.float64)
+    steepness = log_odds_per_score(located.calibration, bool(located.candidates.examined.any()))
     return (report.log_odds - steepness * (ordered[0] - ordered)).tolist() if len(ordered) else []

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, evidence
-from core.recognition.localization import Located, neighborhood_of
+from core.recognition.recognition import Answer
+from core.recognition.stages import neighborhood_of
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
 from service.engine.queue import Patience
@@ -107,7 +108,7 @@ def _advanced(
     map_: Map,
     session: Session,
     run: Run,
-    located: Located | None,
+    located: Answer | None,
     single: QueryAnswer,
     options: FrameParameters,
     request_id: str | None,
@@ -174,17 +175,17 @@ def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, M
     return Step(odometry, reach, frames), motion
 
 
-def _evidence(map_: Map, located: Located | None) -> Evidence:
+def _evidence(map_: Map, located: Answer | None) -> Evidence:
     if located is None:
         return NOTHING
-    scored = located.scored
+    found = located.candidates
     return evidence(
-        scored.rows,
-        scored.scores,
-        scored.whereabouts,
+        found.rows,
+        found.scores,
+        found.whereabouts,
         located.calibration,
         neighborhood_of(map_),
-        scored.examined,
+        found.examined,
     )
 
 

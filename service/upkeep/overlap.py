@@ -9,7 +9,7 @@ import numpy as np
 
 from core.method.encoder import Encoding
 from core.method.regions import Regions
-from core.recognition.localization import locate
+from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread
 from core.storage import Map
 from service.engine.engine import Engine

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.judgement.examination import examine
 from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.recognition.stages import examine
 from tests.core.judgement.test_verdict import in_sequence
 
 SAME = Neighborhood(radius=5.0, frames=60)

@@ -10,15 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.judgement.verdict import NO_POSE, TOP_PLACES
+from core.errors import NoRegions, UnknownCamera
+from core.frames.images import decode, encode_png
+from core.judgement.verdict import TOP_PLACES
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.localization import ATTEMPTS, examine, locate
+from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
 from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
-from core.storage.search.snapshot import Spot
 from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
-from tests.service.scenes import scene, seen_again
+from tests.service.scenes import jpeg, scene, seen_again
 
 PLACES = 8
 CANDIDATES = SECOND_STAGE.candidates
@@ -129,27 +130,6 @@ def test_what_agrees_cell_by_cell_comes_first_if_it_is_examined(
     assert itself > 0.5 * SECOND_STAGE.share
 
 
-def test_the_ranking_stays_in_order(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
-    snapshot = lab.snapshot()
-    for encoding in seen:
-        ranking = snapshot.search(encoding.descriptor)
-        rows, scores = examine(encoder, snapshot, encoding.local, ranking)
-        assert np.all(np.diff(scores) <= 0)
-        assert rows[CANDIDATES:].tolist() == ranking[0][CANDIDATES:].tolist()
-        assert sorted(rows.tolist()) == list(range(PLACES))
-
-
-def test_without_a_second_stage_a_ranking_is_what_the_search_gave() -> None:
-    encoder = EncoderCatalogue().get("region-vlad")
-    encodings = [encoder.encode(scene(seed)) for seed in range(5)]
-    spots = [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, ordinal) for ordinal in range(5)]
-    snapshot = Snapshot(encoder.dimension, 3).appended([encoding.descriptor for encoding in encodings], spots)
-    rows, products = snapshot.search(encodings[2].descriptor)
-    found, scores = examine(encoder, snapshot, encodings[2].local, (rows, products))
-    assert found.tolist() == rows.tolist()
-    np.testing.assert_array_equal(scores, encoder.scores_from_inner_products(products))
-
-
 class Late:
     """A map whose first snapshots are from before its last writes, as a search sees it under which places go."""
 
@@ -207,3 +187,28 @@ def test_an_empty_map(lab: Map, encoder: Encoder, query: Encoding) -> None:
     for i in range(PLACES):
         lab.forget(f"p{i}")
     assert found(lab, encoder, query) == []
+
+
+def test_a_picture_is_enrolled_and_recognized(lab: Map, encoder: Encoder) -> None:
+    place = enrol(lab, "here", jpeg(40), encoder, PlaceFields(pose=Pose(x=500, y=0), metadata={"floor": 1}))
+    assert place.id == "here" and lab.place("here") == place and lab.count_places() == PLACES + 1
+    answer = recognize(lab, jpeg(40), encoder, k=2)
+    assert answer.matches[0][1] == place and len(answer.matches) == 2
+    assert answer.place == (place if answer.judgement.verdict == "recognized" else None)
+    (located,) = locate(lab, encoder, [encoder.encode(decode(jpeg(40)))], 2)
+    assert located.judgement == answer.judgement and located.matches == answer.matches
+
+
+def test_a_blank_picture_shows_no_place(lab: Map, encoder: Encoder) -> None:
+    blank = encode_png(np.zeros((64, 64, 3), np.uint8))
+    for attempt in (lambda: recognize(lab, blank, encoder), lambda: enrol(lab, "blank", blank, encoder)):
+        with pytest.raises(NoRegions, match="blank"):
+            attempt()
+    assert lab.count_places() == PLACES
+
+
+def test_a_camera_must_be_known(lab: Map, encoder: Encoder) -> None:
+    with pytest.raises(UnknownCamera):
+        recognize(lab, jpeg(40), encoder, camera="rear")
+    with pytest.raises(UnknownCamera):
+        enrol(lab, "here", jpeg(40), encoder, PlaceFields(camera="rear"))
