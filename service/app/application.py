@@ -19,14 +19,24 @@ from service.access.gate import Access, Gate, tell_exposure, ways_of
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
+from service.app import routes as root
 from service.app.gauges import gauges
-from service.app.routers import ROUTERS
 from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
+from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
+from service.jobs import routes as jobs
+from service.maps import calibration_routes, camera_routes, transfer_routes
+from service.maps import routes as maps
+from service.places import routes as places
+from service.queries import loop_closure, several_routes
+from service.queries import routes as queries
+from service.sessions import routes as sessions
+from service.sessions import stream_routes
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
+from service.upkeep import routes as upkeep
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -57,6 +67,26 @@ TAGS = [
     {"name": "encoders", "description": "Models and vocabularies installed."},
     {"name": "service", "description": "Health, counters, version."},
 ]
+
+ROUTERS = (
+    queries.router,  # routes are tried in turn, so the one that robots ask most comes first
+    root.router,
+    maps.router,
+    places.router,
+    places.traverses,
+    camera_routes.router,
+    calibration_routes.router,
+    loop_closure.router,
+    several_routes.router,
+    sessions.router,
+    stream_routes.router,
+    queries.explanations,
+    frames.router,
+    upkeep.router,
+    transfer_routes.router,
+    jobs.router,
+    root.encoders,
+)
 
 
 def _operation_id(route: APIRoute) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import threading
 import time
 from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
+from dataclasses import dataclass, field
 
 from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
 from core.frames.images import Limits
@@ -18,13 +20,45 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.map_locks import MapLocks
 from service.engine.queue import Encoded, Inference, Outcomes, Patience, Then
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.settings import Settings
 from service.telemetry.metrics import MapCollector, Metrics
 from service.worker_threads import in_thread as in_thread
+
+
+@dataclass
+class _Lock:
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    users: int = 0
+
+
+class MapLocks:
+    """One reentrant lock for each map, which exists only while a thread holds it or waits for it.  Thread-safe."""
+
+    def __init__(self) -> None:
+        self._locks: dict[str, _Lock] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._locks)
+
+    @contextmanager
+    def of(self, map_id: str) -> Iterator[None]:
+        """Hold the lock of a map; blocks.  A thread that holds it already may take it again."""
+        with self._lock:
+            lock = self._locks.setdefault(map_id, _Lock())
+            lock.users += 1
+        try:
+            with lock.lock:
+                yield
+        finally:
+            with self._lock:
+                lock.users -= 1
+                if not lock.users:
+                    del self._locks[map_id]
+
 
 log = logging.getLogger("placerec.engine")
 

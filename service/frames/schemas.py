@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from service.http.fields import Milliseconds
-from service.queries.explanation_schemas import ExplanationView
+from service.queries.schemas import ExplanationView
 
 
 class Descriptor(BaseModel):

@@ -18,7 +18,7 @@ from service.errors.problems import MEDIA_TYPE, Problem, document_problems, prob
 from service.http.links import tell_links
 from service.http.parameters import BatchItem
 from service.http.uploads import FORM, FORMATS
-from service.maps.calibration_schemas import CalibrationOrder
+from service.maps.schemas import CalibrationOrder
 from service.settings import Settings
 
 BINARY = {"type": "string", "format": "binary"}

@@ -28,7 +28,7 @@ from service.jobs.context import born
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.calibration import KIND, arguments_of, measured, store
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
+from service.maps.schemas import CalibrationOrder, CalibrationReport
 
 router = APIRouter(
     prefix="/v1/maps/{map}",

@@ -20,8 +20,7 @@ from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.background import run_behind
-from service.jobs.context import JobContext, born
+from service.jobs.context import JobContext, born, run_behind
 from service.jobs.jobs import Jobs
 from service.jobs.records import Job
 from service.places.batches import candidate_of, check_batch, check_own, given_id

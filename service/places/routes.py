@@ -1,4 +1,4 @@
-"""Places: enrol one frame or many, browse, read, edit, forget, see."""
+"""Places and traverses: enrol one frame or many, browse, read, edit, forget, see."""
 
 from __future__ import annotations
 
@@ -27,9 +27,11 @@ from service.http.dependencies import (
     EngineDep,
     FromState,
     MapId,
+    Page,
     PatienceDep,
     PlaceId,
     PlacePageQuery,
+    SequenceName,
     frame_for_map,
     json_body,
     milliseconds_since,
@@ -47,7 +49,16 @@ from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, Sequel
 from service.places.batches import candidate_of, check_batch, given_id, item_problem
 from service.places.enrolment import Candidate, enrol
-from service.places.schemas import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+from service.places.schemas import (
+    BatchResult,
+    BatchResults,
+    EnrolledPlace,
+    ForgottenSequence,
+    PlaceChanges,
+    PlacePage,
+    PlaceView,
+    SequencePage,
+)
 from service.places.staging import Staging
 
 StagingDep = Annotated[Staging, Depends(FromState("staging"))]
@@ -57,6 +68,11 @@ router = APIRouter(
     prefix="/v1/maps/{map}/places",
     tags=["places"],
     route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
+traverses = APIRouter(
+    prefix="/v1/maps/{map}/sequences",
+    tags=["sequences"],
     dependencies=[Depends(single_values)],
 )
 ENROLMENT_PROBLEMS = (
@@ -261,3 +277,18 @@ def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Respon
     """See a place as the map keeps it."""
     picture = engine.atlas.get(map_id).thumbnail(place_id)
     return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})
+
+
+@traverses.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage:
+    """List the traverses of a map in the order of their names."""
+    summaries, next_cursor = engine.atlas.get(map_id).sequences(page.cursor, page.limit)
+    return SequencePage(items=summaries, next_cursor=next_cursor)
+
+
+@traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
+def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
+    """Forget all places of a traverse at once."""
+    count = engine.atlas.get(map_id).forget_sequence(sequence)
+    request.state.noted = {"places": count}
+    return ForgottenSequence(name=sequence, places=count)

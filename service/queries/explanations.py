@@ -19,7 +19,8 @@ from core.places import Place
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
 from service.engine.queue import Encoded, Patience
-from service.queries.explanation_schemas import (
+from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
+from service.queries.schemas import (
     CellPair,
     ExplainedRegion,
     ExplanationView,
@@ -27,7 +28,6 @@ from service.queries.explanation_schemas import (
     RegionPair,
     RelativeBox,
 )
-from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
 from service.queries.statistics import key_of
 
 LISTED = 30

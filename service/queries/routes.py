@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Path, Query, Request
+from starlette.responses import Response
 
 from core import errors
 from service.engine.engine import camera_mask, in_thread
@@ -13,11 +14,13 @@ from service.errors.faults import (
     EncoderNotInstalled,
     InvalidRequest,
     QueueFull,
+    UnknownExplanation,
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
     EngineDep,
+    FromState,
     MapId,
     PatienceDep,
     frame_for_map,
@@ -26,15 +29,16 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.openapi import form_body, frame_body
+from service.http.openapi import BINARY, form_body, frame_body
 from service.http.quick_route import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import item_problem
 from service.queries.answers import StatisticsDep, told_answer
-from service.queries.explanation_routes import PicturesDep
 from service.queries.explanations import as_drawn, explained_match
 from service.queries.parameters import QueryParameters
+from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
+from service.queries.statistics import key_of
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -45,7 +49,9 @@ router = APIRouter(
         errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
     ),
 )
+explanations = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
 QueryOptions = Annotated[QueryParameters, Query()]
+PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 
 
 @router.post(
@@ -124,3 +130,25 @@ async def query_batch(
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)
+
+
+@explanations.get(
+    "/{explanation}",
+    response_class=Response,
+    responses={
+        200: {"description": "Both frames side by side.", "content": {"image/png": {"schema": BINARY}}},
+        **problem_documentation(UnknownExplanation),
+    },
+)
+def see_explanation(
+    map_id: MapId,
+    name: Annotated[str, Path(alias="explanation", max_length=64, description="As the answer to the query named it.")],
+    engine: EngineDep,
+    pictures: PicturesDep,
+) -> Response:
+    """See a query beside its best match: cells (or regions) that answer each other are joined by lines.
+
+    `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
+    """
+    picture = pictures.fetch(key_of(engine.atlas.find(map_id)), name)
+    return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

@@ -33,8 +33,8 @@ from service.places.batches import item_problem
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
 from service.queries.parameters import SeveralParameters
+from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
 from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
-from service.queries.several_schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
 from service.queries.statistics import QueryStatistics
 
 router = APIRouter(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from service.engine.map_locks import MapLocks
+from service.engine.engine import MapLocks
 
 
 def test_one_holder_at_a_time_and_nothing_is_left() -> None:

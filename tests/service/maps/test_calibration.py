@@ -14,7 +14,7 @@ from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.storage import Map
 from service.maps import calibration as calibrating
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
+from service.maps.schemas import CalibrationOrder, CalibrationReport
 from tests.service.engines import ENCODER, end_of, runtime_at
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem

@@ -15,12 +15,12 @@ from starlette.responses import HTMLResponse, Response
 
 from service.app.documentation import SECURITY_POLICY, page
 from service.app.runtime import Runtime
-from service.app.schemas import Health, Readiness, Version
+from service.app.schemas import EncoderPage, Health, Readiness, Version
 from service.engine.engine import in_thread
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
 from service.http import openapi
-from service.http.dependencies import EngineDep, FromState, PrincipalDep
+from service.http.dependencies import EngineDep, FromState, PrincipalDep, single_values
 from service.maps.schemas import QuarantinedMap
 
 RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
@@ -88,3 +88,12 @@ def _written(app: FastAPI) -> bytes:
 @lru_cache(1)
 def _shown(app: FastAPI) -> bytes:
     return page(openapi.document(app)).encode()
+
+
+encoders = APIRouter(prefix="/v1/encoders", tags=["encoders"], dependencies=[Depends(single_values)])
+
+
+@encoders.get("")
+def list_encoders(engine: EngineDep) -> EncoderPage:
+    """List the models and vocabularies installed here, damaged ones too, with what they are made of."""
+    return EncoderPage(items=engine.catalogue.describe(), next_cursor=None)

@@ -1,7 +1,8 @@
-"""Loop closure: one request that looks for a frame and enrols it if nobody knows it."""
+"""Loop closure: look for a frame among the places of a map and, if nobody knows it, make it a place; no HTTP."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -9,7 +10,11 @@ from starlette.responses import Response
 
 from core import errors
 from core.places import Place, check_place_id
-from service.engine.engine import camera_mask, in_thread
+from core.recognition.recognition import Answer, locate
+from core.recognition.selection import Selection
+from core.storage import Map
+from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.queue import Encoded
 from service.errors.faults import (
     EncoderNotInstalled,
     PlaceTaken,
@@ -29,12 +34,58 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frame_body
 from service.http.uploads import parse_metadata
-from service.places.enrolment import Candidate
+from service.places.enrolment import Candidate, describe_candidate, digest_of
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
-from service.queries.closures import close_loop
 from service.queries.parameters import ClosureParameters
 from service.queries.schemas import ClosureAnswer
+
+
+@dataclass(frozen=True)
+class Closure:
+    """What became of a frame.
+
+    enrolled: its place; None if the frame is that of another place, or may be.
+    created: whether the place was made now.
+    """
+
+    located: Answer
+    enrolled: Place | None
+    created: bool
+
+
+def close_loop(
+    engine: Engine, map_: Map, candidate: Candidate, encoded: Encoded, k: int, selection: Selection | None
+) -> Closure:
+    """Locate a frame and, if the verdict is ``unknown``, enrol it: as one step, so that of two frames of one new place
+    that come together the second finds the first.  Blocks; call it in a thread.
+
+    A repeated request finds the same as the first did: its own place is left out of the search.
+
+    Args:
+        encoded: the candidate's frame, which has regions.
+        selection: what is known of the place asked for; None: nothing.
+
+    Raises:
+        PlaceTaken: the candidate's id is that of a place with another frame.
+        StorageFull, StorageFailure: nothing was enrolled.
+    """
+    digest = digest_of(candidate)
+    enrolment = describe_candidate(engine, map_, candidate, digest, encoded)
+    with engine.writing(map_.record.id):
+        known = map_.digest(candidate.id)
+        if known is not None and known != digest:
+            raise PlaceTaken(f"The place {candidate.id!r} has another frame; PUT replaces it.")
+        if known is not None:
+            selection = replace(selection or Selection(), without=candidate.id)
+        (located,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
+        if known is not None:
+            return Closure(located, map_.place(candidate.id), created=False)
+        if located.judgement.verdict != "unknown":
+            return Closure(located, None, created=False)
+        ((place, _),) = map_.enrol([enrolment])
+        return Closure(located, place, created=True)
+
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
