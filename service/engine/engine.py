@@ -20,7 +20,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.queue import Encoded, Inference, Outcomes, Patience, Then
+from service.engine.queue import Encoded, EncoderQueue, Outcomes, Patience, Then
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.settings import Settings
@@ -86,7 +86,7 @@ class Engine:
         self.atlas = Atlas(settings.data_dir)
         self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
-        self.inference = Inference(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
+        self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
         self.searches = Searches()
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
@@ -103,7 +103,7 @@ class Engine:
     def close(self) -> None:
         """Drop the frames that wait, and give the data directory back; blocks."""
         self.metrics.registry.unregister(self._map_collector)
-        self.inference.close()
+        self.queue.close()
         self.atlas.close()
 
     def stop_loading(self) -> None:
@@ -115,7 +115,7 @@ class Engine:
         began = time.perf_counter()
         try:
             identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
-            await self.inference.load(identity)
+            await self.queue.load(identity)
             await in_thread(compile_ahead)
         except PlacerecError as error:
             self.encoder_state = str(error)
@@ -170,7 +170,7 @@ class Engine:
             EncoderNotInstalled: it is not installed.
         """
         try:
-            return asyncio.run_coroutine_threadsafe(self.inference.load(map_.record.encoder), self.loop).result()
+            return asyncio.run_coroutine_threadsafe(self.queue.load(map_.record.encoder), self.loop).result()
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -200,14 +200,14 @@ class Engine:
         mask: Mask | None = None,
         then: Then | None = None,
     ) -> Encoded:
-        """Encode a frame with a map's encoder; call it within ``inference.place_in_queue``.
+        """Encode a frame with a map's encoder; call it within ``queue.place``.
 
         Raises:
             EncoderNotInstalled: the map's encoder is not here (any more).
-            Others: as for ``Inference.encode``.
+            Others: as for ``EncoderQueue.encode``.
         """
         try:
-            return await self.inference.encode(map_.record.encoder, data, patience, mask, then)
+            return await self.queue.encode(map_.record.encoder, data, patience, mask, then)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -232,28 +232,36 @@ class Engine:
             StorageFailure: the map's files cannot be read.
             Others: as for ``encode_for``.
         """
-        with self.inference.place_in_queue():
+        with self.queue.place():
             encoded = await self.encode_for(map_, data, patience, mask, search_ahead(map_, k, selection))
         (recognized,) = await self.searches.recognize(map_, [encoded], k, selection)
         return recognized
 
-    async def encode_many_for(
-        self, map_: Map, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+    async def encode_many(
+        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
     ) -> AsyncGenerator[Outcomes]:
-        """The same for many frames, as ``Inference.encode_many`` yields them; close it, as ``aclosing`` does."""
-        async with aclosing(self.inference.encode_many(map_.record.encoder, frames, patience, masks)) as outcomes:
+        """Encode many frames, as ``EncoderQueue.encode_many`` does; close the generator (``contextlib.aclosing``).
+
+        Args:
+            identity: of the encoder of the map that the frames are for.
+
+        Raises:
+            EncoderNotInstalled: the encoder is not installed (any more).
+            Others: as for ``EncoderQueue.encode_many``.
+        """
+        async with aclosing(self.queue.encode_many(identity, frames, patience, masks)) as outcomes:
             async for some in outcomes:
                 for _, outcome in some:
                     if isinstance(outcome, UnknownEncoder):
                         raise EncoderNotInstalled(str(outcome)) from outcome
                 yield some
 
-    async def encode_all_for(
-        self, map_: Map, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+    async def encode_all(
+        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
     ) -> list[Encoded | Exception]:
-        """What became of each frame, in their order; the pixels, which would fill the memory, are not kept."""
+        """What became of each of many frames, in their order, without the pixels, which would fill the memory."""
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many_for(map_, frames, patience, masks)) as outcomes:
+        async with aclosing(self.encode_many(identity, frames, patience, masks)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()

@@ -54,11 +54,11 @@ async def encode(
     The bytes are little-endian; their encoder and the number of regions stand in the headers
     `X-Encoder` and `X-Regions`.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     identity = await in_thread(engine.resolve, options.joined(frame.fields).encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, patience)
     regions = len(encoded.encoding.regions)
     if regions == 0:
         raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
@@ -85,12 +85,12 @@ async def regions(
     options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
 ) -> Response:
     """The regions of interest of a frame: as JSON, or drawn (`?format=png`, or `Accept: image/png`)."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     options = options.joined(frame.fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, patience)
     found = encoded.encoding.regions
     layers = await in_thread(layer_grids, encoded.encoder)
     chosen = strongest(found, options.limit)
@@ -143,13 +143,13 @@ async def match(
 ) -> Response:
     """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
     itself reach where parts of it are plain."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     first, second, fields = await read_pair(request, engine.settings)
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        a = await in_thread(as_drawn, await engine.inference.encode(identity, first, patience))
-        b = await engine.inference.encode(identity, second, patience)
+    with engine.queue.place():
+        a = await in_thread(as_drawn, await engine.queue.encode(identity, first, patience))
+        b = await engine.queue.encode(identity, second, patience)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
     explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None

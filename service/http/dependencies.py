@@ -140,7 +140,7 @@ async def frame_for_map(request: Request, engine: Engine, map_id: str, options: 
         UnknownMap, MapQuarantined, WrongEncoder.
         Others: as for ``read_frame``.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     map_ = await engine.map(map_id)
     frame = await read_frame(request, engine.settings)
     options = options.joined(frame.fields)

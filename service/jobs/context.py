@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from contextlib import aclosing
 from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
@@ -161,7 +160,7 @@ def stand_back(engine: Engine, context: JobContext) -> None:
     """
     until = time.monotonic() + STANDING_BACK_SECONDS
     context.check_cancelled()
-    while engine.inference.waiting and time.monotonic() < until:
+    while engine.queue.waiting and time.monotonic() < until:
         context.pause(0.01)
 
 
@@ -200,11 +199,6 @@ def encode_behind(
     """
 
     async def encode(patience: Patience) -> list[Encoded | Exception]:
-        made: dict[int, Encoded | Exception] = {}
-        async with aclosing(engine.inference.encode_many(identity, frames, patience, masks)) as outcomes:
-            async for some in outcomes:
-                for index, outcome in some:
-                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
-        return [made[index] for index in range(len(frames))]
+        return await engine.encode_all(identity, frames, patience, masks)
 
     return run_behind(engine, context, encode)

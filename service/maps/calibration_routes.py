@@ -140,7 +140,7 @@ async def _labelled_frames(
         UnknownCamera: the map has none of a label's name.
         InvalidImage, NoRegions: one cannot be used; nothing is calibrated then.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     value, others = json_part(await read_many(request, engine.settings), "calibration")
     json_size(value, "The part 'calibration'")
     order = validated(CalibrationOrder, value)
@@ -153,8 +153,8 @@ async def _labelled_frames(
     for label in wanted:
         check_part(files[label], engine.settings)
     masks = [await camera_mask(map_, label.camera) for label in order.labels]
-    with engine.inference.place_in_queue(len(wanted)):
-        outcomes = await engine.encode_all_for(map_, [files[name].data for name in wanted], patience, masks)
+    with engine.queue.place(len(wanted)):
+        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in wanted], patience, masks)
     encodings = []
     for name, outcome in zip(wanted, outcomes, strict=True):
         if isinstance(outcome, Exception):

@@ -115,8 +115,8 @@ async def enrol(
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [candidates[i].mask for i in new]
-            with engine.inference.place_in_queue(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many_for(map_, bodies, patience, masks)) as outcomes:
+            with engine.queue.place(len(sent)) if queued else nullcontext():
+                async with aclosing(engine.encode_many(map_.record.encoder, bodies, patience, masks)) as outcomes:
                     async for some in outcomes:
                         frames = {new[index]: outcome for index, outcome in some}
                         # Thumbnails are made, and pixels let go, while the encoder is at the next frames.

@@ -175,7 +175,7 @@ async def enrol_places(
 async def _enrol_now(
     map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
 ) -> BatchResults:
-    engine.inference.check_room()
+    engine.queue.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)

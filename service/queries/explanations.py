@@ -48,7 +48,7 @@ async def explained_match(
     """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
 
     Raises:
-        As for ``Inference.encode``: the picture that is kept of the place is encoded again, for its regions.
+        As for ``EncoderQueue.encode``: the picture that is kept of the place is encoded again, for its regions.
     """
     found = await in_thread(_stored, map_, place_id)
     if found is None:
@@ -59,7 +59,7 @@ async def explained_match(
         mask = None
         with suppress(UnknownCamera):  # forgotten since; the place stays as it was enrolled
             mask = await camera_mask(map_, place.camera)
-        with engine.inference.place_in_queue():
+        with engine.queue.place():
             again = await engine.encode_for(map_, picture, patience, mask)
     match = replace(stored, regions=None if again is None else again.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)

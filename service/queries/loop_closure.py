@@ -130,7 +130,7 @@ async def query_or_enrol(
     metadata = {} if options.metadata is None else parse_metadata(options.metadata)
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
-    with engine.inference.place_in_queue():
+    with engine.queue.place():
         encoded = await engine.encode_for(map_, data, patience, mask)
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None

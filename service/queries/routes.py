@@ -99,7 +99,7 @@ async def query_batch(
     patience: PatienceDep,
 ) -> BatchAnswers:
     """Locate many frames in a map; one that is bad fails alone."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     map_ = await engine.map(map_id)
     files, fields = split_form(await read_many(request, engine.settings))
     options = options.joined(fields)
@@ -113,8 +113,10 @@ async def query_batch(
     engine.metrics.batches.labels("query").observe(len(files))
     items = [BatchAnswer(file=part.name, status=200) for part in files]
     encoded: dict[int, Encoded] = {}
-    with engine.inference.place_in_queue(len(files)):
-        outcomes = await engine.encode_all_for(map_, [part.data for part in files], patience, [mask] * len(files))
+    with engine.queue.place(len(files)):
+        outcomes = await engine.encode_all(
+            map_.record.encoder, [part.data for part in files], patience, [mask] * len(files)
+        )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:
                 check_part(part, engine.settings)

@@ -82,7 +82,7 @@ async def ask_maps(
     selection: Selection | None,
     patience: Patience,
 ) -> list[MapReport]:
-    """What each map says of the frames, in the order of the ids; call it within ``inference.place_in_queue``.
+    """What each map says of the frames, in the order of the ids; call it within ``queue.place``.
 
     Raises:
         QueueFull, DeadlineExceeded, ClientGone: of the request as a whole.
@@ -135,8 +135,8 @@ async def _encode(
             continue
         keys = list(wanted[identity])
         try:
-            outcomes = await engine.encode_all_for(
-                map_, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
+            outcomes = await engine.encode_all(
+                identity, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
         except OWN_ERRORS as error:

@@ -65,14 +65,14 @@ async def query_maps(
     needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
     of another place.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
     selection = options.selection()
     map_ids = options.map_ids()
     if map_ids is None:
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
-    with engine.inference.place_in_queue():
+    with engine.queue.place():
         reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)

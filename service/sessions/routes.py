@@ -137,7 +137,7 @@ async def send_frame(
     the same `frame` number or, without one, under the same `X-Request-Id`, is counted once and gets the same answer.
     A frame that is answered with a problem was not taken in.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # before the body is read
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")

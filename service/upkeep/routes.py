@@ -126,7 +126,7 @@ async def check_health(
     """
     map_ = await engine.map(map_id)
     try:
-        encoder = await engine.inference.load(map_.record.encoder)
+        encoder = await engine.queue.load(map_.record.encoder)
     except errors.UnknownEncoder as error:
         raise EncoderNotInstalled(str(error)) from error
     counted = await in_thread(statistics.read, key_of(map_))

@@ -46,7 +46,7 @@ def patience() -> Patience:
 async def walked(engine: Engine) -> Map:
     """A map of four places."""
     identity = engine.resolve(None)
-    encoder = await engine.inference.load(identity)
+    encoder = await engine.queue.load(identity)
     made = engine.atlas.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     await enrol(engine, made, [Candidate(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], patience())
     return made
