@@ -24,9 +24,9 @@ from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, e
 from core.evaluation.timing import jpeg, medians, sample_picture
 from core.frames.images import decode
 from core.judgement.examination import examine
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.storage import MapSettings
 from training.alignment import aligned_truth
 from training.photographs import find_photographs, read

@@ -22,10 +22,11 @@ from core.errors import CalibrationImpossible
 from core.judgement.examination import examine
 from core.judgement.map_calibration import Held, Target, held_figures, recalibrate
 from core.judgement.trials import Trial, Trials, area_under_roc, gathered
-from core.judgement.verdict import Whereabouts, judge
+from core.judgement.verdict import judge
 from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import Whereabouts
 from training.calibration import NEIGHBORHOOD
 from training.validation import Shown, describe, realigned, walk
 

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
-from core.places import EARTH_RADIUS
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 
 NEAREST = 24
 """A place is joined to so many of the nearest, at most; fewer in maps of over FULLY_JOINED places."""

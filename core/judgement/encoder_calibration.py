@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
 from core.judgement.probability import fit_curve
-from core.judgement.verdict import Calibration, Judgement, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Whereabouts
 
 Scores = NDArray[np.float32]
 

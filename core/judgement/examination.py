@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import TOP_PLACES, Neighborhood, Whereabouts
+from core.judgement.verdict import TOP_PLACES
+from core.places import Neighborhood, Whereabouts
 
 Array = NDArray[np.float32]
 Positions = NDArray[np.int64]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
 from core.judgement.map_calibration import Recalibration, Target, recalibrate
 from core.judgement.trials import Trial, Trials, gathered
-from core.judgement.verdict import NO_POSE, Calibration, Neighborhood, judge
+from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
+from core.places import NO_POSE, Neighborhood
 from core.recognition.localization import neighborhood_of, second_stage
 from core.storage import Map, Ranking, Snapshot
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from core.judgement.examination import examine as examined
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import Values, log_odds_per_score, weighed
-from core.judgement.verdict import TOP_PLACES, Calibration, Judgement, Neighborhood, Whereabouts, completed, judge
+from core.judgement.verdict import TOP_PLACES, Calibration, Judgement, completed, judge
 from core.method.agreement import Cells, reranked
 from core.method.encoder import Encoder, Encoding
-from core.places import Place
+from core.places import Neighborhood, Place, Whereabouts
 from core.recognition.selection import EVERYTHING, Choice, Selection
 from core.storage import Map, Ranking, Snapshot
 

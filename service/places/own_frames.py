@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownEncoder
-from core.judgement.verdict import Neighborhood
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
+from core.places import Neighborhood
 from core.storage import Map
 from core.storage.transfer import Outline
 from service.errors.faults import EncoderNotInstalled

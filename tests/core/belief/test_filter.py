@@ -26,7 +26,7 @@ from core.belief.filter import (
     uninformed,
 )
 from core.belief.motion import Pending, Transition, transition
-from core.judgement.verdict import Neighborhood, Whereabouts
+from core.places import Neighborhood, Whereabouts
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
 Matrix = NDArray[np.float64]

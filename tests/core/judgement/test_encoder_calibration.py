@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.judgement.encoder_calibration import calibrate, second_look
-from core.judgement.verdict import Calibration, Judgement, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Whereabouts
 
 N = 60
 

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.judgement.examination import examine
-from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, judge
+from core.places import Neighborhood, Whereabouts
 from tests.core.judgement.test_verdict import in_sequence
 
 SAME = Neighborhood(radius=5.0, frames=60)

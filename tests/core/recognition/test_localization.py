@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.judgement.verdict import NO_POSE, TOP_PLACES
+from core.judgement.verdict import TOP_PLACES
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
-from core.places import PlaceFields, Pose
+from core.places import NO_POSE, PlaceFields, Pose
 from core.recognition.localization import ATTEMPTS, examine, locate
 from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
 from core.storage.search.snapshot import Spot
