@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.encoder_calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
+from core.judgement.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import reliability
 from core.judgement.trials import Trial, Trials, gathered, joined

@@ -19,8 +19,8 @@ import typer
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible
+from core.judgement.calibration import Held, Target, fit_map_calibration, held_figures
 from core.judgement.examination import examine
-from core.judgement.map_calibration import Held, Target, held_figures, recalibrate
 from core.judgement.trials import Trial, Trials, area_under_roc, gathered
 from core.judgement.verdict import judge
 from core.method.agreement import Cells
@@ -105,7 +105,7 @@ def main(
             )
             for wanted in PRECISIONS:
                 try:
-                    found = recalibrate(trials, calibration, Target(rule="precision", value=wanted), name)
+                    found = fit_map_calibration(trials, calibration, Target(rule="precision", value=wanted), name)
                     made[f"precision {wanted}"] = figures(found.measurement.cross_validated)
                 except CalibrationImpossible as error:
                     made[f"precision {wanted}"] = str(error)

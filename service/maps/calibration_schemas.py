@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from core.judgement.map_calibration import Measurement, Target
+from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
 from service.http.parameters import CameraName
 
