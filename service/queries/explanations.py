@@ -11,10 +11,10 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.method.encoder import Encoder
+from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
-from core.method.vlad import assign
 from core.places import Place
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
