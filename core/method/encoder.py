@@ -17,8 +17,7 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
-from core.method.cells import ScatteredCells
+from core.method.agreement import AgreementDefinition, Cells, ScatteredCells, agreement, local_descriptors
 from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
 from core.method.regions import Regions

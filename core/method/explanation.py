@@ -84,7 +84,7 @@ def _cells(encoder: Encoder, a: Cells, b: Cells) -> Correspondences:
     if stage is None or not a.any() or not b.any():
         none = np.empty(0, np.int64)
         return Correspondences(none, none, np.empty(0, np.float32))
-    return correspondences(a, b, encoder.grid[1], stage)
+    return correspondences(a, b, encoder.grid[1], stage.reach)
 
 
 def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from core.kernels.products import ConstantMatrix
 from core.kernels.projections import finish_rows
+from core.method.equations import unit_length
 
 Array = NDArray[np.float32]
 
@@ -34,8 +35,20 @@ class Projection:
     matrix: Array
 
     def __call__(self, features: Array, values: int) -> Array:
-        """Unit-length projections of n features, float32 [n, K] to [n, values]; zero stays zero."""
-        return self.finish(self.products(features), features, values)
+        """Project features f to unit-length p ∝ (f/|f| - m) W; a zero row stays zero.
+
+        The encoder computes the same from products that it already has (:meth:`finish`).
+
+        Args:
+            features: float32 [n, K].
+            values: how many columns of W to use.
+
+        Returns:
+            float32 [n, values].
+        """
+        projected = unit_length((unit_length(features) - self.mean) @ self.matrix[:, :values])
+        projected[~features.any(axis=1)] = 0
+        return projected
 
     def products(self, features: Array) -> Array:
         """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
