@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.kernels.correspondence import WHOLE_WORDS, squared_sums
+from core.kernels.projections import quantize
 
 Array = NDArray[np.float32]
 Cells = NDArray[np.int8]
@@ -64,6 +65,8 @@ class AgreementDefinition(BaseModel):
 def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> Cells:
     """Quantise the projected features of C cells, so that inner products are weighted sums of cosines.
 
+    A value v of a layer with the weight w becomes the whole number nearest to v · √w · RESOLUTION, from -127 to 127.
+
     Args:
         layers: float32 [C, values] each, rows of unit length or zero.
 
@@ -74,7 +77,7 @@ def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> C
     start = 0
     for weight, layer in zip(definition.weights, layers, strict=True):
         stop = start + layer.shape[1]
-        made[:, start:stop] = np.clip(np.rint(layer * (RESOLUTION * np.sqrt(weight))), -127, 127)
+        quantize(layer, RESOLUTION * np.sqrt(weight), made[:, start:stop])
         start = stop
     return made
 
