@@ -21,9 +21,10 @@ from core.frames.images import decode
 from core.frames.traverses import find_images
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import log_odds_per_score
-from core.judgement.verdict import METRIC, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
+from core.places import METRIC, Neighborhood, Whereabouts
 from core.recognition.stages import examine
 
 REACH = 15

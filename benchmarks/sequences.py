@@ -23,9 +23,9 @@ from benchmarks.report import report, verdict
 from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, evidence, place_graph
 from core.evaluation.timing import jpeg, medians, sample_picture
 from core.frames.images import decode
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.recognition.stages import examine
 from core.storage import MapSettings
 from training.alignment import aligned_truth

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from benchmarks.report import report
 from core.evaluation.timing import medians
 from core.index.exact import compare
-from core.judgement.verdict import NO_POSE
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.places import NO_POSE
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.spots import Spot

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.encoder_calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
+from core.judgement.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import reliability
 from core.judgement.trials import Trial, Trials, gathered, joined
-from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, judge
+from core.places import Neighborhood, Whereabouts
 from training.validation import Cameras
 
 Array = NDArray[np.float32]

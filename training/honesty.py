@@ -19,12 +19,13 @@ import typer
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible
-from core.judgement.map_calibration import Held, Target, held_figures, recalibrate
+from core.judgement.calibration import Held, Target, fit_map_calibration, held_figures
 from core.judgement.trials import Trial, Trials, area_under_roc, gathered
-from core.judgement.verdict import Whereabouts, judge
+from core.judgement.verdict import judge
 from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import Whereabouts
 from core.recognition.stages import examine
 from training.calibration import NEIGHBORHOOD
 from training.validation import Shown, describe, realigned, walk
@@ -104,7 +105,7 @@ def main(
             )
             for wanted in PRECISIONS:
                 try:
-                    found = recalibrate(trials, calibration, Target(rule="precision", value=wanted), name)
+                    found = fit_map_calibration(trials, calibration, Target(rule="precision", value=wanted), name)
                     made[f"precision {wanted}"] = figures(found.measurement.cross_validated)
                 except CalibrationImpossible as error:
                     made[f"precision {wanted}"] = str(error)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from core.frames.preprocessing import prepare
+from core.method.equations import unit_length
 from core.method.projection import Projection, fit_projection
-from core.method.regions import unit_length
 from core.networks.network import ShallowNetwork
 from training.contrast import Pairs
 from training.distillation import SIDE

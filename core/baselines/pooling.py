@@ -5,7 +5,7 @@ from __future__ import annotations
 from core.baselines.entry import Entry
 from core.baselines.maps import Array, pooled
 from core.baselines.system import About
-from core.method.vlad import power
+from core.method.equations import power
 
 GAMMA = 0.5
 LAYER, NEXT_LAYER = "conv3", "conv4"

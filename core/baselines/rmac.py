@@ -18,7 +18,7 @@ from core.baselines.entry import Constants, Entry, Ingredients
 from core.baselines.maps import Array, MapsSystem, pooled, unit
 from core.baselines.mutual import MutualRegions
 from core.baselines.system import About, Description, Index
-from core.method.vlad import power
+from core.method.equations import power
 
 if TYPE_CHECKING:
     pass

@@ -14,8 +14,8 @@ from torch import nn
 
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, prepare
-from core.judgement.verdict import NO_POSE, Neighborhood
 from core.method.encoder import Encoder, Encoding
+from core.places import NO_POSE, Neighborhood
 from core.recognition.stages import examine
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
 from core.storage.search.snapshot import Snapshot

@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import Neighborhood
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
+from core.places import Neighborhood
 from core.storage import Map
 from core.storage.transfer import Outline
 

@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.priors import Values, weighed
-from core.judgement.verdict import TOP_PLACES, Calibration, Neighborhood, Whereabouts, completed
+from core.judgement.verdict import TOP_PLACES, Calibration, completed
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
+from core.places import Neighborhood, Whereabouts
 from core.recognition.selection import EVERYTHING, Choice
 from core.storage import Map, Ranking, Snapshot
 

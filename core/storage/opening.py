@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index import Codes, CodeTable
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
-from core.places import Pose, microseconds
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
 from core.storage.database import ledger
 from core.storage.database import row_checksums as seals
 from core.storage.database.columns import read_columns

@@ -18,7 +18,8 @@ from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, spot_of
 from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
-from core.storage.search.snapshot import Snapshot, Spot
+from core.storage.search.snapshot import Snapshot
+from core.storage.search.spots import Spot
 
 
 def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:

@@ -16,12 +16,12 @@ from starlette.responses import HTMLResponse, Response
 from service.app.documentation import SECURITY_POLICY, page
 from service.app.runtime import Runtime
 from service.app.schemas import EncoderPage, Health, Readiness, Version
-from service.engine.engine import in_thread
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
 from service.http import openapi
 from service.http.dependencies import EngineDep, FromState, PrincipalDep, single_values
 from service.maps.schemas import QuarantinedMap
+from service.worker_threads import in_thread
 
 RuntimeDep = Annotated[Runtime, Depends(FromState("runtime"))]
 

@@ -225,7 +225,7 @@ def _calibrate(
     paths: Sequence[Path],
     bar: Progress,
 ) -> Calibration:
-    from core.judgement.encoder_calibration import calibrate, second_look
+    from core.judgement.calibration import fit_encoder_calibration, second_look
     from core.judgement.verdict import Calibration
     from core.method.encoder import Encoder
 
@@ -240,4 +240,4 @@ def _calibrate(
         raise Failure(f"Only {len(looks)} of the images kept out can be decoded; give more images.")
     first, second = (np.stack(side) for side in zip(*looks, strict=True))  # n x D
     score = encoder.scores_from_inner_products
-    return calibrate(score(first @ first.T), score(second @ first.T), NEIGHBOURS, "encoder-default")
+    return fit_encoder_calibration(score(first @ first.T), score(second @ first.T), NEIGHBOURS, "encoder-default")

@@ -20,7 +20,8 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.queue import Encoded, EncoderQueue, Outcomes, Patience, Then
+from service.engine.microbatches import Encoded, Then
+from service.engine.queue import EncoderQueue, Outcomes, Patience
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.settings import Settings

@@ -11,8 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.method.region_drawing import boxes, draw, layer_grids, strongest
-from service.engine.engine import in_thread
-from service.engine.queue import Encoded
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     QueueFull,
     UnsupportedMediaType,
@@ -25,6 +24,7 @@ from service.http.openapi import BINARY, form_body, frame_body
 from service.http.parameters import EncoderParameters, MatchParameters, RegionsParameters
 from service.http.uploads import read_frame, read_pair
 from service.queries.explanations import as_drawn, drawing, explained
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",

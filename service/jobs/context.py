@@ -11,7 +11,8 @@ from core.errors import UnknownMap
 from core.frames.masks import Mask
 from core.storage import Atlas, Map
 from service.engine.engine import Engine
-from service.engine.queue import Encoded, Patience
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
 from service.errors.faults import ClientGone
 from service.jobs.records import Job
 

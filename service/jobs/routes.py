@@ -19,7 +19,8 @@ from service.access.roles import FORGOTTEN, OPERATIONS, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
 from service.http.dependencies import FromState, PageParameters, PrincipalDep, single_values
-from service.jobs.jobs import NOTICE_SECONDS, Jobs
+from service.jobs.context import NOTICE_SECONDS
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings

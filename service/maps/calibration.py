@@ -21,8 +21,7 @@ from core.recognition.calibration import (
 from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
 from service.engine.engine import Engine
-from service.jobs.context import stand_back
-from service.jobs.jobs import JobContext
+from service.jobs.context import JobContext, stand_back
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 
 KIND = "calibrate"

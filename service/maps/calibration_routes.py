@@ -9,7 +9,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from core import errors
 from core.method.encoder import Encoding
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.engine import Engine, camera_mask
 from service.engine.queue import Patience
 from service.errors.faults import (
     DeadlineExceeded,
@@ -29,6 +29,7 @@ from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.calibration import KIND, arguments_of, measured, store
 from service.maps.schemas import CalibrationOrder, CalibrationReport
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",

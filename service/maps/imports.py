@@ -25,7 +25,8 @@ from typing import Any
 from anyio import CapacityLimiter
 
 from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
-from core.frames.images import Limits, read_header
+from core.frames.containers import read_header
+from core.frames.images import Limits
 from core.places import check_map_id
 from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest

@@ -9,8 +9,7 @@ from typing import Any
 from core.errors import MapQuarantined
 from core.storage.search.reindexing import rebuild as rebuild_index
 from service.engine.engine import Engine
-from service.jobs.context import born, stand_back
-from service.jobs.jobs import JobContext
+from service.jobs.context import JobContext, born, stand_back
 
 REBUILD, VERIFY = "rebuild", "verify"
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.frames.masks import Mask
-from core.judgement.map_calibration import Measurement, Target
+from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
 from core.places import Timestamp
 from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, StorageStatus, TierSetting

@@ -13,7 +13,8 @@ from core.places import Place, PlaceFields
 from core.recognition.recognition import describe, frame_digest
 from core.storage import Change, Enrolment, Map, SameFrame
 from service.engine.engine import Engine
-from service.engine.queue import AHEAD, Encoded, Patience
+from service.engine.microbatches import Encoded
+from service.engine.queue import AHEAD, Patience
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import Sequel, Stage
 from service.worker_threads import in_thread

@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from core import errors
 from core.storage.patches import merge_patch
-from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.engine import Engine, camera_mask
 from service.engine.queue import Patience
 from service.errors.faults import (
     BatchOutOfOrder,
@@ -60,6 +60,7 @@ from service.places.schemas import (
     SequencePage,
 )
 from service.places.staging import Staging
+from service.worker_threads import in_thread
 
 StagingDep = Annotated[Staging, Depends(FromState("staging"))]
 BatchOrderDep = Annotated[BatchOrder, Depends(FromState("batch_order"))]

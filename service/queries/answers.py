@@ -14,7 +14,7 @@ from core.recognition.recognition import Answer
 from core.recognition.stages import calibration_of
 from core.storage import Map
 from service.engine.engine import Engine
-from service.engine.queue import Encoded
+from service.engine.microbatches import Encoded
 from service.engine.searches import Recognized
 from service.http.dependencies import FromState, rounded
 from service.places.schemas import PlaceView

@@ -11,14 +11,15 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.method.encoder import Encoder
+from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
-from core.method.vlad import assign
 from core.places import Place
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
 from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
 from service.queries.schemas import (
     CellPair,
@@ -29,6 +30,7 @@ from service.queries.schemas import (
     RelativeBox,
 )
 from service.queries.statistics import key_of
+from service.worker_threads import in_thread
 
 LISTED = 30
 """Regions of a frame that are told of."""

@@ -13,8 +13,8 @@ from core.places import Place, check_place_id
 from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     EncoderNotInstalled,
     PlaceTaken,
@@ -39,6 +39,7 @@ from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
 from service.queries.parameters import ClosureParameters
 from service.queries.schemas import ClosureAnswer
+from service.worker_threads import in_thread
 
 
 @dataclass(frozen=True)

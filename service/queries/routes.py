@@ -8,8 +8,8 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from starlette.responses import Response
 
 from core import errors
-from service.engine.engine import camera_mask, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import camera_mask
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     EncoderNotInstalled,
     InvalidRequest,
@@ -39,6 +39,7 @@ from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
 from service.queries.statistics import key_of
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",

@@ -16,9 +16,11 @@ from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
 from service.errors.faults import EncoderNotInstalled
+from service.worker_threads import in_thread
 
 OWN_ERRORS = (
     errors.UnknownMap,

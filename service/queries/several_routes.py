@@ -10,8 +10,8 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
-from service.engine.engine import Engine, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     InvalidRequest,
     QueueFull,
@@ -36,6 +36,7 @@ from service.queries.parameters import SeveralParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
 from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
 from service.queries.statistics import QueryStatistics
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",

@@ -10,7 +10,7 @@ from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, evide
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
+from service.engine.engine import Engine, camera_mask
 from service.engine.queue import Patience
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.http.dependencies import rounded
@@ -29,6 +29,7 @@ from service.sessions.schemas import (
     SessionView,
 )
 from service.sessions.sessions import Session, Sessions, alive_rows
+from service.worker_threads import in_thread
 
 
 async def take_in(

@@ -8,7 +8,6 @@ from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
 from core.storage.database.cursors import Listing, decode_name, encode_cursor
-from service.engine.engine import in_thread
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,
@@ -39,6 +38,7 @@ from service.sessions.frames import session_report, session_view, take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView
 from service.sessions.sessions import Sessions
 from service.telemetry.requests import REQUEST_ID
+from service.worker_threads import in_thread
 
 SessionsDep = Annotated[Sessions, Depends(FromState("sessions"))]
 

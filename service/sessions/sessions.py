@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
 from core.errors import UnknownSequence
-from core.judgement.verdict import Neighborhood
+from core.places import Neighborhood
 from core.recognition.selection import Knowledge, Selection
 from core.storage import Map, Snapshot
 from core.storage.files.disk import refusals

@@ -21,7 +21,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from core.errors import PlacerecError
 from core.places import check_map_id
-from service.engine.engine import Engine, in_thread
+from service.engine.engine import Engine
 from service.engine.queue import Patience
 from service.errors.faults import (
     BodyTooLarge,
@@ -43,6 +43,7 @@ from service.http.uploads import check_frame
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters
 from service.sessions.sessions import Session, Sessions
+from service.worker_threads import in_thread
 
 router = APIRouter()
 

@@ -25,8 +25,7 @@ from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
-from service.jobs.context import stand_back
-from service.jobs.jobs import JobContext, JobInterrupted
+from service.jobs.context import JobContext, JobInterrupted, stand_back
 
 KIND = "merge"
 

@@ -15,8 +15,7 @@ from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
-from service.jobs.context import stand_back
-from service.jobs.jobs import JobContext
+from service.jobs.context import JobContext, stand_back
 
 KIND = "prune"
 

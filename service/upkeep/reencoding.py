@@ -20,8 +20,7 @@ from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.context import born, encode_behind
-from service.jobs.jobs import JobContext, JobInterrupted
+from service.jobs.context import JobContext, JobInterrupted, born, encode_behind
 
 KIND = "re-encode"
 

@@ -12,7 +12,7 @@ from pydantic import Field
 from core import errors
 from core.places import check_map_id
 from core.storage import Map
-from service.engine.engine import Engine, in_thread
+from service.engine.engine import Engine
 from service.errors.faults import (
     EncoderNotInstalled,
     ImagesMissing,
@@ -37,6 +37,7 @@ from service.queries.statistics import key_of
 from service.upkeep import merging, pruning, reencoding
 from service.upkeep.health import examine_health
 from service.upkeep.schemas import MapHealth, Merging, Pruning, Reencoding
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from core.evaluation.protocol.outcomes import Outcome
-from core.judgement.map_calibration import FEWEST_OUTCOMES, blocks_of
+from core.judgement.calibration import FEWEST_OUTCOMES, blocks_of
 from core.judgement.probability import fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.trials import area_under_roc

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
 from core.storage.files.disk import Damage
 
 _AT_ONCE = 65_536

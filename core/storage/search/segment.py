@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.index.exact import Rows, compare
-from core.judgement.verdict import Whereabouts
+from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.search.spots import Spot, joined, memory_of, whereabouts_of
 

@@ -26,8 +26,8 @@ from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
 from core.index.exact import Rows
 from core.index.ranking import ranked
-from core.judgement.verdict import Whereabouts
-from core.method.cells import ScatteredCells
+from core.method.agreement import ScatteredCells
+from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import Shelf
 from core.storage.files.segment_files import NO_LOCAL

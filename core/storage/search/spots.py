@@ -8,7 +8,7 @@ from math import nan
 
 import numpy as np
 
-from core.judgement.verdict import NO_TIME, Whereabouts
+from core.places import NO_TIME, Whereabouts
 
 
 @dataclass(frozen=True)

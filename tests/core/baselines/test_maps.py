@@ -9,7 +9,7 @@ from core.baselines.catalogue import build
 from core.baselines.maps import PooledSystem, unit
 from core.baselines.system import stack
 from core.method.catalogue import EncoderCatalogue
-from core.method.vlad import power
+from core.method.equations import power
 
 LENGTHS = {
     "sum-pool": 384,

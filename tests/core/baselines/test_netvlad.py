@@ -24,7 +24,7 @@ from core.baselines.netvlad import (
 )
 from core.baselines.netvlad_files import load_netvlad
 from core.errors import InvalidModel
-from core.method.vlad import assign, residuals
+from core.method.equations import assign, residuals
 from core.networks.vgg import torchvision_indices
 from tests.core.networks.vgg_writer import blocks, plain_maps, plain_vgg
 

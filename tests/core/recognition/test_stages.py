@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, judge
+from core.places import Neighborhood, Whereabouts
 from core.recognition.stages import examine
 from tests.core.judgement.test_verdict import in_sequence
 

@@ -17,8 +17,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage import Map
 from service.engine import searches
-from service.engine.microbatches import MOST_FRAMES, MicroBatches, Then, Turn
-from service.engine.queue import Encoded
+from service.engine.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then, Turn
 from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes

@@ -9,7 +9,7 @@ import pytest
 
 from core.storage import MapSettings
 from core.storage.transfer import Transfer
-from service.jobs.jobs import JobInterrupted
+from service.jobs.context import JobInterrupted
 from service.upkeep import pruning
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from core.storage import Snapshot
 from core.storage.search import snapshot as module
 from core.storage.search.segment import flat_index, vectors
-from core.storage.search.snapshot import Spot
+from core.storage.search.spots import Spot
 from tests.core.storage.frames import descriptor_of, local_of
 
 DIMENSION, ROWS, SHAPE = 8, 4, (2, 3)

@@ -1,8 +1,10 @@
-"""The compiled loops that move a belief from place to place (see ``motion.py`` for what they mean).
+"""The compiled loops of beliefs over places: how a motion moves one, which places are one, what a path gathers.
 
-Each takes masses float32 [n].  Forwards a place's mass is shared out among its successors; one of at most ``least``
-is not moved but added to the first result, and what fits no successor to the second.  With ``back`` the matrix is
-turned over, as smoothing needs it: a place gets the mean of what its successors hold, or ``outside`` if it has none.
+The motions (``along_sequence``, ``within_reach``, ``by_odometry``) take masses float32 [n] and multiply them by a
+transition matrix, which ``core.belief.motion`` writes out in plain NumPy.  Forwards, the mass of a place is divided
+among its successors; one of at most ``least`` is not moved but added to the first result, and what fits no successor
+is added to the second.  With ``back`` the matrix is transposed, as smoothing needs it: a place gets the mean of what
+its successors hold, or ``outside`` if it has none.
 """
 
 from __future__ import annotations
@@ -13,6 +15,8 @@ from typing import Any, cast
 
 import numba
 import numpy as np
+
+from core.places import NO_POSE
 
 MISFIT = 12.0
 """Places that fit a motion worse than this (five standard deviations) are no successors."""
@@ -145,3 +149,36 @@ def by_odometry(  # type: ignore[no-untyped-def]
             total += weights[e]
         gone += _settle(p, i, targets, begin, count, weights, total, back, outside, moved)
     return negligible, gone
+
+
+@_compiled
+def add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
+    """Add each place's gain to the end of the path that was at that place ``shift`` frames of the sequence before."""
+    for k in range(len(places)):
+        place = places[k]
+        if place >= 0 and first[place] <= place + shift < last[place]:
+            totals[place + shift] += gains[k]
+
+
+@_compiled
+def same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
+    """As ``Whereabouts.near`` has it, among the places joined and those beside it in its sequence; ascending."""
+    low, high = max(first, place - frames), min(last, place + frames + 1)
+    found = np.empty(len(joined) + high - low, np.int64)
+    count = 0
+    for number in range(len(found)):
+        beside = number >= len(joined)
+        other = low + number - len(joined) if beside else joined[number]
+        if other == place and not beside:
+            continue
+        if kind[other] == kind[place] and kind[place] != NO_POSE:
+            if beside and other != place and np.any(joined == other):
+                continue
+            distance = np.sqrt(np.sum((position[other] - position[place]) ** 2))
+            same = distance <= radius or other == place
+        else:
+            same = beside and abs(ordinal[other] - ordinal[place]) <= frames
+        if same:
+            found[count] = other
+            count += 1
+    return np.sort(found[:count])

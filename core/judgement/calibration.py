@@ -1,8 +1,13 @@
-"""A calibration of a map's own, from trials on it: curve, margin, threshold, and what they are worth.
+"""Calibrations: how a curve, a threshold and a margin are fitted from trials, for an encoder or for one map.
 
-The curve and the margin come first; the threshold follows from what its owner wants.  What is reported of them is
-measured by cross-validation: the frames are cut into blocks in the order in which they were taken, and each block is
-judged by the calibration that the other blocks give, so no frame has a say in its own judgement.
+A calibration says when an answer is believed (see ``verdict.py``).  An encoder ships with one, fitted here from frames
+that were kept out of its training (:func:`fit_encoder_calibration`).  A map may get one of its own, fitted from
+queries whose true place is known (:func:`fit_map_calibration`).  In both, the curve and the margin come from the
+trials; the threshold follows from what it is to achieve.
+
+The figures reported with a map's calibration are cross-validated: the frames are cut into blocks in the order in
+which they were taken, and each block is judged by a calibration fitted to the other blocks, so that no frame
+influences its own judgement.
 """
 
 from __future__ import annotations
@@ -10,27 +15,129 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
+from core.frames.preprocessing import Pixels
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import Flags, Trials, Values, area_under_roc
-from core.judgement.verdict import Calibration
+from core.judgement.trials import Flags, Trial, Trials, Values, area_under_roc, gathered, joined
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Whereabouts
 
-FEWEST_OUTCOMES = 10
-"""Right answers, and wrong ones, that a calibration rests on at least."""
-
-LEAST_AREA = 0.6
-"""Under the ROC of right against wrong answers: below it the decision value says too little to build on."""
+Scores = NDArray[np.float32]
 
 LOST_BY_MARGIN = 0.02
-"""The margin turns at most this share of right answers into ambiguous ones."""
+"""The margin turns at most this share of the right answers into ambiguous ones."""
+
+FALSE_ACCEPTS = 0.10
+"""The threshold of an encoder's calibration accepts at most this share of the unknown places."""
+
+SMALLEST_DEVIATION = 1e-6
+"""Lower bound of the background's standard deviation, in units of the score; identical frames would give zero."""
+
+FEWEST_OUTCOMES = 10
+"""A map's calibration needs at least this many right and this many wrong answers."""
+
+LEAST_AREA = 0.6
+"""Least area under the ROC of right against wrong answers; below it the decision value hardly separates them."""
 
 BLOCKS = 5
+"""Blocks of the cross-validation."""
+
 MOST_POINTS = 101
+"""A reported curve has at most this many points."""
+
+
+def second_look(pixels: Pixels) -> Pixels:
+    """Imitate a second visit: the frame shifted by 8 % of its width, darker and with less contrast.
+
+    Args:
+        pixels: uint8 [H, W, 3].
+
+    Returns:
+        uint8 [H, W, 3].
+    """
+    height, width = pixels.shape[:2]
+    aside = pixels[:, round(0.08 * width) :]
+    darker = cv2.convertScaleAbs(aside, alpha=0.75, beta=6)
+    return np.asarray(cv2.resize(darker, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def fit_encoder_calibration(unknown: Scores, known: Scores, neighbours: int, source: str) -> Calibration:
+    """Fit a calibration for an encoder to n frames in the order in which they were taken.
+
+    Every frame is a query twice: as it is, against the frames that are not its neighbours (an unknown place), and as
+    a second look (:func:`second_look`), against all frames (a known place).  Real second visits differ by more than
+    a second look does, so the probabilities come out too high.  The packaged encoders are calibrated on real second
+    visits; a map that matters deserves a calibration of its own (:func:`fit_map_calibration`).
+
+    Args:
+        unknown: float32 [n, n], the scores of the frames against each other.
+        known: float32 [n, n], row i holds the scores of frame i's second look against all frames.
+        neighbours: frames at most this many positions apart may show the same place.
+        source: recorded in the calibration.
+
+    Raises:
+        ValueError: the frames are so few that all are neighbours of each other.
+    """
+    n = len(unknown)
+    index = np.arange(n)
+    apart = np.abs(index[:, None] - index[None, :]) > neighbours
+    if not apart.any():
+        raise ValueError(f"{n} frames are too few to calibrate on")
+    unrelated = unknown[apart]
+    start = Calibration(
+        source=source,
+        threshold=0.0,
+        margin=0.0,
+        background_mean=float(unrelated.mean()),
+        background_deviation=max(SMALLEST_DEVIATION, float(unrelated.std())),
+        decision="leading",
+        frames=n,
+    )
+    same_place = Neighborhood(radius=0.0, frames=neighbours)
+    strangers = gathered(
+        Trial(_judged(unknown[i], np.flatnonzero(apart[i]), start, same_place), False, False, i)
+        for i in range(n)
+        if apart[i].any()
+    )
+    looks = gathered(
+        Trial(_judged(known[i], index, start, same_place), True, bool(np.argmax(known[i]) == i), i) for i in range(n)
+    )
+    threshold = _just_above(np.quantile(strangers.decision, 1 - FALSE_ACCEPTS, method="higher"))
+    margin = _margin(looks.margin[looks.right & (looks.decision >= threshold)], "linear")
+    trials = joined([strangers, looks], same_frames=True)
+    try:
+        curve = fit_curve(trials.decision, trials.right)
+    except ValueError:  # the frames are all alike: no probability can be told
+        curve = None
+    return start.model_copy(update={"threshold": threshold, "margin": margin, "curve": curve})
+
+
+def _judged(
+    scores: Scores, places: NDArray[np.int64], calibration: Calibration, neighborhood: Neighborhood
+) -> Judgement:
+    """The judgement of one query against a map of the frames ``places``."""
+    order = places[np.argsort(-scores[places], kind="stable")]
+    zeros = np.zeros(len(order), np.int64)
+    frames = Whereabouts(zeros.astype(np.int8), np.zeros((len(order), 3)), zeros.astype(np.int32), order)
+    return judge(scores[order], frames, calibration, neighborhood)
+
+
+def _just_above(decision: float) -> float:
+    """The lowest threshold that rejects a decision value; one equal to the threshold would be accepted."""
+    return float(np.nextafter(decision, np.inf))
+
+
+def _margin(margins: Values, method: Literal["linear", "lower"]) -> float:
+    """The margin that loses the share LOST_BY_MARGIN of right answers, given their leads over their best rivals."""
+    finite = margins[np.isfinite(margins)]
+    return max(0.0, float(np.quantile(finite, LOST_BY_MARGIN, method=method))) if len(finite) else 0.0
+
 
 Rule = Literal["precision", "false_accept_rate", "mean_of_negatives"]
 
@@ -89,23 +196,24 @@ class Measurement(BaseModel):
 
 
 @dataclass(frozen=True)
-class Recalibration:
-    """A calibration made of trials, and what was measured in making it."""
+class FittedCalibration:
+    """A calibration fitted to trials on a map, and what was measured while fitting it."""
 
     calibration: Calibration
     measurement: Measurement
 
 
-def recalibrate(trials: Trials, base: Calibration, target: Target, source: str) -> Recalibration:
-    """A calibration of trials.
+def fit_map_calibration(trials: Trials, base: Calibration, target: Target, source: str) -> FittedCalibration:
+    """Fit a calibration to the trials on one map.
 
     Args:
         trials: judged with ``base``, whose background and kind of decision value are kept.
-        source: said of the calibration.
+        target: what the threshold is to achieve.
+        source: recorded in the calibration.
 
     Raises:
-        CalibrationImpossible: the trials are too few, the decision value hardly tells right from wrong,
-            or no threshold reaches the target; the text says which.
+        CalibrationImpossible: there are too few trials, the decision value hardly separates right from wrong
+            answers, or no threshold reaches the target; the text says which.
     """
     _check(trials, target)
     calibration = _fitted(trials, base, target)
@@ -124,21 +232,21 @@ def recalibrate(trials: Trials, base: Calibration, target: Target, source: str) 
         cross_validated=cross_validated(trials, base, target),
         points=_thinned(points),
     )
-    return Recalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement)
+    return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement)
 
 
 def blocks_of(frame: NDArray[np.int64], count: int = BLOCKS) -> list[Flags]:
-    """The trials of each of ``count`` runs of consecutive frames, bool [n] each; fewer where there are fewer frames."""
+    """Cut the trials into ``count`` blocks of consecutive frames, bool [n] each; fewer if there are fewer frames."""
     frames = np.unique(frame)
     runs = np.array_split(frames, min(count, len(frames)))
     return [np.isin(frame, run) for run in runs]
 
 
 def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
-    """Each block judged by the calibration of the others.
+    """Judge each block by a calibration fitted to the other blocks.
 
     Raises:
-        CalibrationImpossible: the others of a block do not make a calibration.
+        CalibrationImpossible: the blocks besides one do not suffice for a calibration.
     """
     recognized, probabilities = np.zeros(len(trials), np.bool_), np.zeros(len(trials))
     for block in blocks_of(trials.frame):
@@ -149,7 +257,7 @@ def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
 
 
 def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> Held:
-    """The figures of verdicts and probabilities; all [n]."""
+    """The figures of verdicts, bool [n], and probabilities, float64 [n], of n trials."""
     passed, known = recognized & trials.right, trials.known
     return Held(
         precision=wilson(int(passed.sum()), int(recognized.sum())),
@@ -160,9 +268,14 @@ def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> He
 
 
 def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
-    """What every threshold that makes a difference does, by rising threshold; all [n]."""
+    """The effect of every threshold that makes a difference, by rising threshold.
+
+    Args:
+        decision: float64 [n].
+        known, right: bool [n].
+    """
     order = np.argsort(decision, kind="stable")[::-1]
-    ends = np.flatnonzero(np.append(np.diff(decision[order]) != 0, True))  # what is equal passes together
+    ends = np.flatnonzero(np.append(np.diff(decision[order]) != 0, True))  # equal values pass together
     passed, rights = ends + 1, np.cumsum(right[order])[ends]
     strangers, unknown = np.cumsum(~known[order])[ends], int((~known).sum())
     return [
@@ -177,9 +290,13 @@ def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
 
 
 def area_under_pr(decision: Values, right: Flags) -> float:
-    """Under the precision-recall curve by the trapezoid rule, recall over right matches only; 0 without one.
+    """Area under the precision-recall curve by the trapezoid rule, recall over right matches only; 0 without any.
 
-    From recall 0, where precision counts as 1, as everywhere in the evaluation.
+    The curve begins at recall 0 with precision 1, as in the evaluation.
+
+    Args:
+        decision: float64 [n].
+        right: bool [n].
     """
     if not right.any():
         return 0.0
@@ -210,20 +327,17 @@ def _check(trials: Trials, target: Target) -> None:
 
 
 def _fitted(trials: Trials, base: Calibration, target: Target) -> Calibration:
-    """Curve, margin and threshold of trials."""
+    """Fit curve, margin and threshold."""
     try:
         curve = fit_curve(trials.decision, trials.right)
     except ValueError as error:
         raise CalibrationImpossible(f"No probability can be told: {error}.") from error
-    margins = trials.margin[trials.right]
-    margins = margins[np.isfinite(margins)]
-    margin = max(0.0, float(np.quantile(margins, LOST_BY_MARGIN, method="lower"))) if len(margins) else 0.0
-    threshold = _threshold(trials, curve, target)
+    margin, threshold = _margin(trials.margin[trials.right], "lower"), _threshold(trials, curve, target)
     return base.model_copy(update={"curve": curve, "margin": margin, "threshold": threshold})
 
 
 def _threshold(trials: Trials, curve: Curve, target: Target) -> float:
-    """The lowest threshold that reaches the target by itself: the margin makes the verdicts stricter still."""
+    """The lowest threshold that reaches the target without the margin, which makes the verdicts stricter still."""
     if target.rule == "precision":
         assert target.value is not None
         return _for_precision(trials, curve, target.value)
@@ -233,14 +347,13 @@ def _threshold(trials: Trials, curve: Curve, target: Target) -> float:
     if target.rule == "mean_of_negatives":
         return float(strangers.mean())
     assert target.value is not None
-    # What equals the threshold passes, so it lies just above the last one to be kept out.
-    return float(np.nextafter(strangers[int(target.value * len(strangers))], np.inf))
+    return _just_above(strangers[int(target.value * len(strangers))])
 
 
 def _for_precision(trials: Trials, curve: Curve, wanted: float) -> float:
-    """The lowest decision value above which so many answers are right, as counted and as the curve expects.
+    """The lowest decision value above which the wanted share of answers is right, as counted and as the curve expects.
 
-    Counts alone follow the luck of a few frames: of many thresholds some look better than they are.
+    Counts alone depend on chance in a few frames: of many thresholds, some look better than they are.
     """
     order = np.argsort(-trials.decision, kind="stable")
     passed = np.arange(1, len(trials) + 1)
@@ -258,6 +371,6 @@ def _for_precision(trials: Trials, curve: Curve, wanted: float) -> float:
 
 
 def _thinned(points: list[Point]) -> list[Point]:
-    """At most MOST_POINTS of them, spread evenly, the first and the last among them."""
+    """At most MOST_POINTS of the points, evenly spread, with the first and the last."""
     chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST_POINTS, len(points))).round().astype(int))
     return [points[index] for index in chosen]
