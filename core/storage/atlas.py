@@ -19,10 +19,10 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from core.disk.files import Damage, FolderLock, disk_errors, make_folder, sync_file, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.places import check_map_id
 from core.storage.database.cursors import Listing, decode_name, encode_cursor
-from core.storage.files.disk import Damage, FolderLock, make_folder, refusals, sync_file, sync_folder, write_file
 from core.storage.files.row_formats import HALF, Precision
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
@@ -63,7 +63,7 @@ class Atlas:
         self._damaged: dict[str, str] = {}
         self._refused: dict[str, str] = {}
         self._closed = False
-        with refusals(f"open the data directory {directory}"):
+        with disk_errors(f"open the data directory {directory}"):
             make_folder(directory)
             self._lock = FolderLock(directory / "LOCK")
             try:
@@ -102,7 +102,7 @@ class Atlas:
 
     def _adopt_unlisted(self, folder: Path) -> None:
         try:
-            with refusals(f"open map {folder.name!r}"):
+            with disk_errors(f"open map {folder.name!r}"):
                 self._unlisted[folder.name.removeprefix(UNLISTED)] = Map(folder, *read_record(folder))
         except Damage as damage:
             log.error("Removing the unfinished map %s: %s", folder.name, damage)
@@ -113,7 +113,7 @@ class Atlas:
     def _adopt(self, folder: Path) -> None:
         self._refused.pop(folder.name, None)
         try:
-            with refusals(f"open map {folder.name!r}"):
+            with disk_errors(f"open map {folder.name!r}"):
                 self._maps[folder.name] = Map(folder, *read_record(folder))
         except Damage as damage:
             log.error("Map %s is quarantined: %s", folder.name, damage)
@@ -161,7 +161,7 @@ class Atlas:
             updated_at=now,
             **(settings or MapSettings()).model_dump(),
         )
-        with self._making, refusals(f"create map {map_id!r}"):
+        with self._making, disk_errors(f"create map {map_id!r}"):
             self._expect_open()
             self._expect_free(map_id)
             folder = self._folder / map_id
@@ -203,7 +203,7 @@ class Atlas:
             self._reserved.add(map_id)
         unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
         try:
-            with refusals(f"make map {map_id!r}"):
+            with disk_errors(f"make map {map_id!r}"):
                 yield unfinished
                 with self._making:
                     self._expect_open()
@@ -231,7 +231,7 @@ class Atlas:
             UnknownMap: none of this id is being made.
             StorageFull, StorageFailure.
         """
-        with self._making, refusals(f"publish map {map_id!r}"):
+        with self._making, disk_errors(f"publish map {map_id!r}"):
             self._expect_open()
             made = self._unlisted.get(map_id)
             if made is None:
@@ -255,7 +255,7 @@ class Atlas:
         Raises:
             StorageFull, StorageFailure: it is still being made.
         """
-        with self._making, refusals(f"remove map {map_id!r}"):
+        with self._making, disk_errors(f"remove map {map_id!r}"):
             made = self._unlisted.get(map_id)
             if made is None:
                 return
@@ -358,7 +358,7 @@ class Atlas:
         Raises:
             UnknownMap, StorageFull, StorageFailure.
         """
-        with self._making, refusals(f"delete map {map_id!r}"):
+        with self._making, disk_errors(f"delete map {map_id!r}"):
             self._expect_open()
             found = self._maps.get(map_id)
             if found is None and map_id not in self.quarantined():
@@ -377,7 +377,7 @@ class Atlas:
         """
         self._expect_open()
         probe = self._directory / f".probe-{secrets.token_hex(4)}"
-        with refusals(f"write to {self._directory}"):
+        with disk_errors(f"write to {self._directory}"):
             try:
                 probe.write_bytes(b"\x00" * 4096)
                 sync_file(probe)

@@ -11,12 +11,12 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
 from core.frames.masks import Mask
 from core.places import Camera, Timestamp
 from core.storage.database import row_checksums as seals
 from core.storage.database.ledger import moment_text
-from core.storage.files.disk import Damage
 from core.storage.writing import Write
 
 MOST_CAMERAS = 256

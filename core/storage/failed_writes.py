@@ -6,9 +6,9 @@ import logging
 import sqlite3
 from pathlib import Path
 
+from core.disk.files import Damage, primary_code
 from core.storage.database.segment_table import named_segments
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage, primary_code
 from core.storage.opening import OpenMap
 from core.storage.writing import Write
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from core.disk.files import Damage, disk_errors
 from core.errors import (
     MapQuarantined,
     PlacerecError,
@@ -28,7 +29,6 @@ from core.storage.database import ledger
 from core.storage.database.connections import DatabaseClosed
 from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.failed_writes import Doubts
-from core.storage.files.disk import Damage, refusals
 from core.storage.opening import OpenMap, open_map
 from core.storage.patches import patched_fields, patched_record
 from core.storage.pictures import small_picture
@@ -141,9 +141,9 @@ class Map:
 
     @contextmanager
     def _guarded(self, action: str) -> Iterator[None]:
-        """Name the refusals of the disk; take a map that is damaged out of service."""
+        """Name the errors of the disk; take a map that is damaged out of service."""
         try:
-            with refusals(f"{action} map {self._folder.name!r}"):
+            with disk_errors(f"{action} map {self._folder.name!r}"):
                 yield
         except (Damage, StorageFailure) as damage:
             if self._end is not None:

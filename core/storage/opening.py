@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.index import Codes, CodeTable
 from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.places import Pose, microseconds
@@ -29,7 +30,6 @@ from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.arrays import StaleArrays
-from core.storage.files.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.storage.files.row_formats import HALF
 from core.storage.files.row_reader import Shelf
 from core.storage.files.segment_files import Layout

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage
 from core.storage.database import row_checksums as seals
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_aside
@@ -18,7 +19,6 @@ from core.storage.database.schema import check_schema, contradictions
 from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage
 from core.storage.files.segment_files import Layout
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport

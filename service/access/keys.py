@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from core.disk.files import sync_folder
 from core.places import check_map_id
 from service.access.roles import LEVELS, Role
 from service.errors.faults import InvalidRequest, KeysUnreadable
@@ -211,8 +212,6 @@ class KeyStore:
 
     def _make(self) -> None:
         """The file, whole or not at all: one without its tables would be taken for damage."""
-        from core.storage.files.disk import sync_folder  # with it come the index and its compiler, which take a second
-
         temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
         with _refusals(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)

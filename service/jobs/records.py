@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from core.disk.files import Damage, disk_errors
 from core.errors import DataDirectoryTooNew
-from core.storage.files.disk import Damage, refusals
 
 FILE = "jobs.sqlite"
 VERSION = 3
@@ -129,7 +129,7 @@ class JobRecords:
         self.put_aside: str | None = None
         """Under which name the file was put aside because it was damaged, if it was."""
         path = directory / FILE
-        with refusals(f"open {path}"):
+        with disk_errors(f"open {path}"):
             try:
                 self._connection = _open(path)
             except Damage as damage:
@@ -152,7 +152,7 @@ class JobRecords:
 
     def read(self) -> list[Job]:
         """All jobs, the oldest first."""
-        with self._lock, refusals("read the jobs"), closing(self._connection.cursor()) as cursor:
+        with self._lock, disk_errors("read the jobs"), closing(self._connection.cursor()) as cursor:
             cursor.execute("SELECT * FROM jobs ORDER BY number")
             names = [column[0] for column in cursor.description]
             return [_readable(dict(zip(names, values, strict=True))) for values in cursor.fetchall()]
@@ -161,26 +161,26 @@ class JobRecords:
         """Write a job, new or changed."""
         columns = _columns(job)
         names, marks = ", ".join(columns), ", ".join("?" * len(columns))
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"INSERT OR REPLACE INTO jobs ({names}) VALUES ({marks})", tuple(columns.values()))
 
     def update(self, job: Job) -> None:
         """Write what changes of a job as it goes on: all but its arguments and notes, which may be long."""
         columns = {name: value for name, value in _columns(job).items() if name not in ("arguments", "notes")}
         assignments = ", ".join(f"{name} = ?" for name in columns)
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"UPDATE jobs SET {assignments} WHERE number = ?", (*columns.values(), job.number))
 
     def forget(self, numbers: list[int]) -> None:
         """Delete jobs."""
-        with self._lock, refusals("forget a job"):
+        with self._lock, disk_errors("forget a job"):
             self._connection.execute(
                 "DELETE FROM jobs WHERE number IN (SELECT value FROM json_each(?))", (json.dumps(numbers),)
             )
 
     def last_number(self) -> int:
         """The largest number that a job ever had; 0 if there was none."""
-        with self._lock, refusals("read the jobs"):
+        with self._lock, disk_errors("read the jobs"):
             found = self._connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'jobs'").fetchone()
         return 0 if found is None else int(found[0])
 

@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.storage.files.disk import refusals
+from core.disk.files import disk_errors
 
 FILE = "sessions.sqlite"
 APPLICATION_ID = 0x504C5253  # "PLRS"
@@ -88,7 +88,7 @@ class SessionStore:
         """
         path = folder / FILE
         self._lock = threading.Lock()
-        with refusals(f"open {path}"):
+        with disk_errors(f"open {path}"):
             self._connection = self._opened_or_new(path)
 
     def _opened_or_new(self, path: Path) -> sqlite3.Connection:

@@ -16,8 +16,8 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from core.disk.files import Damage, disk_errors
 from core.judgement.verdict import Verdict
-from core.storage.files.disk import Damage, refusals
 from core.upkeep.drift import SCORE_BINS, Week
 
 FILE = "statistics.sqlite"
@@ -183,7 +183,7 @@ class QueryStatistics:
     def _unspoilt(self) -> Iterator[None]:
         """Put the file aside if it turns out to be damaged within: it holds nothing but counts."""
         try:
-            with refusals("use the statistics of queries"):
+            with disk_errors("use the statistics of queries"):
                 yield
         except (Damage, ValueError, TypeError) as damage:
             if self._connection is not None:
@@ -206,7 +206,7 @@ class QueryStatistics:
                 with self._unspoilt():
                     self._write(taken)
                     return
-                with refusals("write down the statistics of queries"):
+                with disk_errors("write down the statistics of queries"):
                     self._write(taken)  # into a new file
             except BaseException:
                 with self._lock:  # in front of what was counted since

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, sync_file, sync_folder
 from core.errors import InvalidArchive, InvalidField, InvalidImage
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
@@ -26,7 +27,6 @@ from core.storage.database.ledger import moment_text
 from core.storage.database.schema import NO_SEQUENCE
 from core.storage.database.segment_table import named_segments
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage, sync_file, sync_folder
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder

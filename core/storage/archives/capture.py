@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from core.disk.files import Damage
 from core.errors import StorageFailure, UnknownMap
 from core.storage.archives.lines import StoredLine, camera_lines, place_lines, sequence_lines
 from core.storage.archives.manifest import (
@@ -39,7 +40,6 @@ from core.storage.cameras import Access
 from core.storage.database import row_checksums as seals
 from core.storage.database.connections import FILE
 from core.storage.database.segment_table import named_segments
-from core.storage.files.disk import Damage
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.opening import OpenMap, read_layout
 
@@ -58,7 +58,7 @@ class Capturing:
         folder: of the map.
         reading: gives a connection to its database.
         opened: the map in use, if it is.
-        guarded: names the refusals of the disk; a map that turns out to be damaged goes out of service.
+        guarded: names the errors of the disk; a map that turns out to be damaged goes out of service.
     """
 
     def __init__(

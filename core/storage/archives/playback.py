@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, disk_errors
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, seal_of
 from core.storage.archives.tar_layout import BLOCK, Member, Tape, header
-from core.storage.files.disk import Damage, refusals
 from core.storage.files.segment_files import HEADER_BYTES, Layout, segment_name
 
 ROWS = "rows.bin"
@@ -119,7 +119,7 @@ class Playback:
         Raises:
             StorageFailure: the disk refuses, or has lost what it held.
         """
-        with refusals("read an export"):
+        with disk_errors("read an export"):
             most = min(most, self.size - start)
             parts = []
             while most > 0:

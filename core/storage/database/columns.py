@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage
 from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Whereabouts
 from core.places import EARTH_RADIUS, Pose
-from core.storage.files.disk import Damage
 
 _AT_ONCE = 65_536
 _NUMBERS = "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading"

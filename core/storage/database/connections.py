@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from core.disk.files import sync_file
 from core.storage.database import row_checksums as seals
 from core.storage.database.schema import check_schema, migrate
-from core.storage.files.disk import sync_file
 
 FILE = "map.sqlite"
 

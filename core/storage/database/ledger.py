@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from core.disk.files import Damage
 from core.errors import InvalidField, UnknownPlace
 from core.places import Place, PlaceFields, Pose
 from core.storage.database import row_checksums as seals
 from core.storage.database.row_checksums import SEALED
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.files.disk import Damage
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 
 DEEPEST_METADATA = 64

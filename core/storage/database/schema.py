@@ -10,9 +10,9 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from core.disk.files import Damage
 from core.errors import DataDirectoryTooNew
 from core.storage.database import row_checksums as seals
-from core.storage.files.disk import Damage
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
 

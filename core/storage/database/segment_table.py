@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from dataclasses import dataclass
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 from core.storage.files.segment_files import Layout
 
 

@@ -14,14 +14,13 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.files.disk import TEMPORARY, sync_folder
+from core.disk.files import replacing
 
 log = logging.getLogger(__name__)
 
@@ -47,11 +46,10 @@ def write_arrays(path: Path, kind: str, made_of: str, arrays: Arrays) -> bool:
     Returns:
         Whether it is there now.
     """
-    temporary = path.with_name(path.name + TEMPORARY)
     listed = [[name, array.dtype.newbyteorder("<").str, list(array.shape)] for name, array in arrays.items()]
     described = json.dumps({"kind": kind, "made_of": made_of, "arrays": listed}).encode()
     try:
-        with temporary.open("wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             running = 0
             for piece in (_MAGIC, _LENGTH.pack(len(described)), described):
                 running = _written(file, piece, running)
@@ -59,14 +57,8 @@ def write_arrays(path: Path, kind: str, made_of: str, arrays: Arrays) -> bool:
                 content = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
                 running = _written(file, content.reshape(-1).view(np.uint8).data, running)
             file.write(_CRC.pack(running))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_folder(path.parent)
     except OSError as error:
         log.warning("The file %s could not be written and will be made again: %s", path.name, error)
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
         return False
     return True
 

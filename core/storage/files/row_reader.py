@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.files.disk import Damage, missing
+from core.disk.files import Damage, missing
 from core.storage.files.row_formats import FULL, Local, inner_products
 from core.storage.files.segment_files import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
 

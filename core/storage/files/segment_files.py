@@ -35,7 +35,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.storage.files.disk import Damage, missing, sync_folder, write_at
+from core.disk.files import Damage, missing, sync_folder, write_at
 from core.storage.files.row_formats import (
     FULL,
     Descriptor,

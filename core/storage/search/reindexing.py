@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 
-from core.storage.files.disk import refusals
+from core.disk.files import disk_errors
 from core.storage.map import Map
 from core.storage.search.indexing import Stopped
 from core.storage.search.tiers import IndexStatus
@@ -24,7 +24,7 @@ def rebuild(map_: Map, progress: Callable[[int, int], None]) -> IndexStatus:
     """
     map_.open()
     if (indexer := map_.indexer) is not None:
-        with refusals(f"read map {map_.record.id!r}"), suppress(Stopped):
+        with disk_errors(f"read map {map_.record.id!r}"), suppress(Stopped):
             indexer.rebuild(progress)
     map_.open()  # says so if it was closed meanwhile
     return map_.index_status()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 from core.storage.files.row_formats import Precision
 from core.storage.files.row_reader import Shelf
 from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name

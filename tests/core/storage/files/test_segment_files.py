@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 from core.storage.files.segment_files import (
     HEADER_BYTES,
     Layout,
