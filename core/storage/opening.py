@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
+from core.disk.sqlite_file import transaction
 from core.index import Codes, CodeTable
 from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.places import Pose, microseconds
@@ -81,9 +82,8 @@ def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> Non
     connection = connect(folder / FILE, create=True)
     try:
         migrate(connection, create=True)
-        connection.execute("BEGIN IMMEDIATE")
-        ledger.insert_record(connection, record, rows_per_segment)
-        connection.execute("COMMIT")
+        with transaction(connection):
+            ledger.insert_record(connection, record, rows_per_segment)
     finally:
         connection.close()  # the log goes into the file and is removed
     sync_file(folder / FILE)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.disk.files import Damage
 from core.storage.database import row_checksums as seals
 from core.storage.database.columns import read_columns
-from core.storage.database.connections import FILE, connect, connect_aside
+from core.storage.database.connections import FILE, connect, connect_without_log
 from core.storage.database.schema import check_schema, contradictions
 from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
@@ -77,7 +77,7 @@ def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
         is_log_sound = True
     with findings.noting():
         # SQLite would put what it can read of a damaged log into the file, and remove the log with all the rest.
-        connection = connect(folder / FILE) if is_log_sound else connect_aside(folder / FILE)
+        connection = connect(folder / FILE) if is_log_sound else connect_without_log(folder / FILE)
         try:
             check_schema(connection)
             report = inspect(folder, connection, None, progress)

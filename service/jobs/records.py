@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.disk.files import Damage, disk_errors
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, TooNew
 from core.errors import DataDirectoryTooNew
 
 FILE = "jobs.sqlite"
-VERSION = 3
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
@@ -50,11 +50,15 @@ _TABLE = """CREATE TABLE jobs (
     asker TEXT NOT NULL DEFAULT '{}'
 ) STRICT"""
 
-_MIGRATIONS = {
-    1: "ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'",
-    2: "ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'",
-}
-"""From a version to the next one."""
+_SCHEMA = Schema(
+    application_id=0,
+    version=3,
+    create=[_TABLE],
+    migrations={
+        1: ["ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'"],
+        2: ["ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'"],
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -116,10 +120,10 @@ class JobRecords:
     """
 
     def __init__(self, directory: Path) -> None:
-        """Open the file of a data directory that this process holds.
+        """Open the file in a data directory that this process has locked.
 
-        One that is damaged is put aside: jobs are work to be done again, not what the maps hold.  What can still be
-        read of it is kept, as jobs that cannot go on.
+        A damaged file is put aside, because jobs can be submitted again and maps do not depend on them.  What can
+        still be read of it is kept as jobs that cannot go on.
 
         Raises:
             DataDirectoryTooNew: a later version of placerec wrote it.
@@ -128,19 +132,19 @@ class JobRecords:
         self._lock = threading.Lock()
         self.put_aside: str | None = None
         """Under which name the file was put aside because it was damaged, if it was."""
-        path = directory / FILE
-        with disk_errors(f"open {path}"):
+        readable = f"SELECT {', '.join(_NAMES)} FROM jobs"
+        file = SqliteFile(directory / FILE, _SCHEMA, {**DURABLE, "journal_size_limit": 1 << 20}, [readable])
+        with disk_errors(f"open {file.path}", FILE):
             try:
-                self._connection = _open(path)
+                self._connection = file.open()
+            except TooNew as error:
+                raise DataDirectoryTooNew(
+                    f"{file.path} was written by a later version of placerec (schema {error.version})."
+                ) from error
             except Damage as damage:
-                aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
-                log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, damage)
-                salvaged = _salvaged(path)
-                path.rename(aside)
-                for suffix in ("-wal", "-shm"):
-                    with suppress(FileNotFoundError):
-                        path.with_name(FILE + suffix).unlink()
-                self._connection, self.put_aside = _open(path), aside.name
+                salvaged = _salvaged(file.path)
+                self.put_aside = file.put_aside(damage).name
+                self._connection = file.open()
                 for job in salvaged:
                     with suppress(sqlite3.IntegrityError, sqlite3.ProgrammingError, ValueError, TypeError):
                         self.put(job)  # unless nothing that a job can be is left of it
@@ -183,53 +187,6 @@ class JobRecords:
         with self._lock, disk_errors("read the jobs"):
             found = self._connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'jobs'").fetchone()
         return 0 if found is None else int(found[0])
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    """A connection to the file, which is made if it is not there.
-
-    Raises:
-        Damage: it is no database, or not one of ours.
-    """
-    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA journal_size_limit = 1048576")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version > VERSION:
-            raise DataDirectoryTooNew(f"{path} was written by a later version of placerec (schema {version}).")
-        if version == 0:
-            if connection.execute("SELECT 1 FROM sqlite_schema").fetchone():
-                raise Damage("it holds tables that are not ours")
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_TABLE)
-            connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
-        for old in range(version or VERSION, VERSION):
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_MIGRATIONS[old])
-            connection.execute(f"PRAGMA user_version = {old + 1}")
-            connection.execute("COMMIT")
-        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
-            if line != "ok":
-                raise Damage(line)
-        connection.execute(f"SELECT {', '.join(_NAMES)} FROM jobs").fetchall()  # can all of it be read?
-        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
-        connection.execute("UPDATE jobs SET id = id WHERE false")
-    except sqlite3.DatabaseError as error:
-        connection.close()
-        told = str(error)
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
-            raise  # the disk refuses
-        raise Damage(str(error)) from error
-    except UnicodeDecodeError as error:
-        connection.close()
-        raise Damage("its text is damaged") from error
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def _columns(job: Job) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage, sync_file, sync_folder
+from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
@@ -137,10 +138,9 @@ class _Building:
 
     def run(self) -> None:
         manifest = self.archive.manifest
-        self.connection.execute("BEGIN IMMEDIATE")
-        self._sequences(manifest.parts[0])
-        self._cameras(manifest.parts[1])
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            self._sequences(manifest.parts[0])
+            self._cameras(manifest.parts[1])
         for number in range(manifest.groups):
             self._group(*manifest.group(number))
         self._check()
@@ -197,12 +197,11 @@ class _Building:
         records = self.layout.sealed(kept, self.rows)
         descriptors.append(self.folder, self.layout, self.rows, records)
         checksums: list[int] = records["checksum"].tolist()
-        self.connection.execute("BEGIN IMMEDIATE")
-        for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
-            self._insert(line, row, checksum, images)
-        seals.seal(self.connection, "places", "row >= ?", self.rows)
-        name_appended(self.connection, self.layout, self.rows, checksums)
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
+                self._insert(line, row, checksum, images)
+            seals.seal(self.connection, "places", "row >= ?", self.rows)
+            name_appended(self.connection, self.layout, self.rows, checksums)
         self.rows += len(chunk)
         self.advance(self.rows, self.archive.manifest.places)
 
