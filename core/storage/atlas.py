@@ -22,13 +22,13 @@ from pathlib import Path
 from core.disk.files import Damage, FolderLock, disk_errors, make_folder, sync_file, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.places import check_map_id
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
 from core.storage.files.row_formats import HALF, Precision
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from core.storage.records import MapRecord, MapSettings, VerifyReport
-from core.storage.verification import Progress, inspect_folder, untold
+from core.storage.verification import Progress, inspect_folder, no_progress
 
 log = logging.getLogger(__name__)
 
@@ -340,7 +340,7 @@ class Atlas:
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
         return {**self._damaged, **self._refused, **found_later}
 
-    def verify(self, map_id: str, progress: Progress = untold) -> VerifyReport:
+    def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
         """Read all of a map again, be it in service or quarantined, and say what is damaged.
 
         Raises:

@@ -5,43 +5,88 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from core.disk.files import Damage, disk_errors
 from core.errors import (
+    InvalidImage,
     MapQuarantined,
+    NoThumbnail,
     PlacerecError,
     RevisionMismatch,
     StorageFailure,
     UnknownMap,
     UnknownSequence,
 )
+from core.frames.images import Limits, decode, encode_thumbnail
 from core.places import Place, PlaceFields
-from core.storage import pages
-from core.storage.archives.capture import Capturing
+from core.storage.archives.exporter import Exporter
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
 from core.storage.database import ledger
 from core.storage.database.connections import DatabaseClosed
-from core.storage.database.segment_table import NamedSegment, named_segments
-from core.storage.failed_writes import Doubts
+from core.storage.database.ledger import NamedSegment, named_segments
 from core.storage.opening import OpenMap, open_map
-from core.storage.patches import patched_fields, patched_record
-from core.storage.pictures import small_picture
-from core.storage.recent_places import Memo
-from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
+from core.storage.pagination import page_of_places, page_of_sequences
+from core.storage.records import (
+    Change,
+    Enrolment,
+    MapRecord,
+    SameFrame,
+    SequenceSummary,
+    VerifyReport,
+    patched_fields,
+    patched_record,
+)
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import IndexStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
-from core.storage.verification import Progress, inspect, untold
-from core.storage.writing import Write, check_enrolment
+from core.storage.verification import Progress, inspect, no_progress
+from core.storage.writing import FailedWrites, Write, check_enrolment
 
 log = logging.getLogger(__name__)
+
+
+MOST_RECENT = 1024
+"""Places of a map that are remembered after they were read …"""
+
+LONGEST_METADATA = 1000
+"""… unless their metadata has more characters, so that all together take five megabytes at most."""
+
+_ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
+"""A picture that was accepted is shown whatever today's limits are; no service can be set to accept a larger one."""
+
+
+class RecentPlaces:
+    """Places of a map that were read since its last write, by row; a query of the same place need not read them again.
+
+    They are forgotten with every write, so that no place is ever returned as it was before.  Any thread may use this.
+    """
+
+    def __init__(self) -> None:
+        self._kept: tuple[object, dict[int, Place]] = (object(), {})
+
+    def places(self, state: object, rows: Iterable[int]) -> dict[int, Place]:
+        """The places of ``rows`` that were read in this state of the map (``Database.state``)."""
+        of, places = self._kept
+        if of is not state:
+            return {}
+        found = ((row, places.get(row)) for row in rows)
+        return {row: place for row, place in found if place is not None}
+
+    def keep(self, state: object, places: Mapping[int, Place]) -> None:
+        """Remember places that were read after the map was found in this state."""
+        small = {row: place for row, place in places.items() if len(str(place.metadata)) <= LONGEST_METADATA}
+        of, kept = self._kept
+        if of is not state or len(kept) + len(small) > MOST_RECENT:
+            self._kept = (state, dict(list(small.items())[:MOST_RECENT]))
+        else:
+            kept.update(small)
 
 
 class Map:
@@ -65,13 +110,13 @@ class Map:
         self._snapshot: Snapshot | None = None
         self._damage: str | None = None
         self._end: PlacerecError | None = None
-        self._doubts = Doubts(folder)
-        self._memo = Memo()
+        self._failed_writes = FailedWrites(folder)
+        self._recent_places = RecentPlaces()
         self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
-        self.capturing = Capturing(folder, self._reading, lambda: self._opened, self._guarded)
+        self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
 
@@ -190,6 +235,24 @@ class Map:
         found = None if indexer is None else indexer.status(lambda: self._snapshot)
         return unopened(self._record.index, self._places) if found is None else found
 
+    def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
+        """Build the codes and lists of a large map again from its descriptors; searches use the present ones meanwhile.
+
+        A map that is searched exactly has neither, so nothing is done.
+
+        Args:
+            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+
+        Raises:
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+        self.open()
+        if (indexer := self.indexer) is not None:
+            with disk_errors(f"read map {self._record.id!r}"), suppress(Stopped):
+                indexer.rebuild(progress)
+        self.open()  # raises if the map was closed meanwhile
+        return self.index_status()
+
     def storage_status(self) -> StorageStatus:
         """What the map takes on disk."""
         with self._guarded("read"):
@@ -214,8 +277,8 @@ class Map:
         with self._lock:
             opened, before = self._expect_open(), self.snapshot()
             with self._guarded("write to"):
-                opened.remains.clear(before)  # it may be this room that is needed
-                self._doubts.resolve(opened, before.rows)
+                opened.removed_segments.clear(before)  # it may be this room that is needed
+                self._failed_writes.repair(opened, before.rows)
                 write = None
                 try:
                     with opened.database.transaction() as connection:
@@ -224,11 +287,11 @@ class Map:
                         after = write.finish()
                 except BaseException as error:
                     if write is not None:
-                        self._doubts.arise(error, write, opened, before.rows)
+                        self._failed_writes.note(error, write, opened, before.rows)
                     raise
             self._snapshot, self._record = after, write.record
             del before
-            opened.remains.clear(after)
+            opened.removed_segments.clear(after)
             if self.indexer is not None and ((write.filled and after.coded) or self.indexer.needs_work(after)):
                 self.indexer.wake()
 
@@ -250,25 +313,36 @@ class Map:
                 write.edit(record)
         return write.record
 
-    def enrol(self, items: Sequence[Enrolment]) -> list[tuple[Place, Change]]:
-        """Remember frames, all of them or, if this raises, none; one sync and one COMMIT for all.
+    @overload
+    def enrol(self, items: Sequence[Enrolment]) -> Sequence[tuple[Place, Change]]: ...
 
-        An id that exists keeps its place and creation time: with the same digest only its fields are
-        applied (``unchanged``, ``updated``), with another its frame is ``replaced``.  An id that
-        occurs twice is taken in order.
+    @overload
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
+
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
+        """Store frames as places, all of them or, if this raises, none, with one sync and one COMMIT.
+
+        The items are stored in the order given, which is the order of the places in their sequences.  An id that
+        exists keeps its place and creation time: if the frame's digest is the same, only its fields are stored
+        (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
+
+        Returns:
+            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame:
+            such an item changes nothing.
 
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
             NoRegions: a descriptor is all zero.
             ValueError: descriptors or a digest of the wrong kind.
         """
-        for item in items:
+        new = [item for item in items if isinstance(item, Enrolment)]
+        for item in new:
             check_enrolment(item, self._record.dimension, self._record.local_shape)
         if not items:
             return []
         with self._writing() as write:
-            write.expect(len(items))
-            return [write.enrol(item) for item in items]
+            write.expect(len(new))
+            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
         """Replace all fields of a place; its frame stays.
@@ -345,7 +419,7 @@ class Map:
             InvalidCursor.
         """
         with self._reading() as connection:
-            return pages.places(connection, self._folder.name, cursor, limit, sequence)
+            return page_of_places(connection, self._folder.name, cursor, limit, sequence)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
         """A page of sequences by name, and the cursor of the next page.
@@ -354,16 +428,16 @@ class Map:
             InvalidCursor.
         """
         with self._reading() as connection:
-            return pages.sequences(connection, self._folder.name, cursor, limit)
+            return page_of_sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         """The places of rows that a search returned; None for one deleted or given another frame since."""
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
-        found = self._memo.places(state, wanted)
+        found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
             with self._reading() as connection:
                 read = ledger.places_of_rows(connection, missing)
-            self._memo.keep(state, read)
+            self._recent_places.keep(state, read)
             found.update(read)
         return [found.get(row) for row in wanted]
 
@@ -373,18 +447,38 @@ class Map:
             found = ledger.rows_of_places(connection, list(place_ids))
         return [found.get(place_id) for place_id in place_ids]
 
+    def picture(self, place_id: str) -> bytes | None:
+        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+
+        Raises:
+            StorageFailure: the picture is damaged.
+        """
+        with self._reading() as connection:
+            stored = ledger.find(connection, place_id)
+            return None if stored is None else ledger.picture(connection, stored.number, place_id)
+
     def thumbnail(self, place_id: str) -> bytes:
         """A small JPEG of a place.
 
         Raises:
-            UnknownPlace, NoThumbnail.
+            UnknownPlace: there is no such place.
+            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            StorageFailure: the picture is damaged.
+            MemoryError: its pixels do not fit into memory.
         """
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
-            kept = ledger.picture(connection, stored.number)
-        return small_picture(stored.place, kept)
+            kept = ledger.picture(connection, stored.number, place_id)
+        if kept is None:
+            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+        if stored.place.picture == "thumbnail":
+            return kept
+        try:
+            return encode_thumbnail(decode(kept, _ANY_SIZE))
+        except InvalidImage as error:
+            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
 
-    def verify(self, progress: Progress = untold) -> VerifyReport:
+    def verify(self, progress: Progress = no_progress) -> VerifyReport:
         """Read all of the map again and check it; writes and searches go on meanwhile.
 
         The report is of the moment of the call.  Damage is reported, not quarantined: what is

@@ -26,21 +26,19 @@ from core.storage.database import ledger
 from core.storage.database import row_checksums as seals
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
+from core.storage.database.ledger import NamedSegment, named_segments
 from core.storage.database.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
-from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.arrays import StaleArrays
 from core.storage.files.row_formats import HALF
-from core.storage.files.row_reader import Shelf
+from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
-from core.storage.patches import complaint
-from core.storage.reclaiming import Remains, clear_folder
-from core.storage.records import MapRecord
+from core.storage.records import MapRecord, complaint
+from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.segment import Held, Segment, flat_index, vectors
+from core.storage.search.segment import Held, Location, Segment, flat_index, vectors
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.spots import Spot
 from core.storage.search.tiers import tier_for
 
 log = logging.getLogger(__name__)
@@ -56,20 +54,20 @@ class OpenMap:
     record: MapRecord
     layout: Layout
     database: Database
-    shelf: Shelf
+    row_reader: RowReader
     files: IndexFiles
-    remains: Remains
+    removed_segments: RemovedSegments
 
 
-def spot_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Spot:
+def location_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Location:
     """A place as the snapshot knows it."""
     timestamp = NO_TIME if moment is None else microseconds(moment)
     if pose is None:
-        return Spot(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
+        return Location(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
     x, y, z = pose.position().tolist()
     kind = METRIC if pose.kind() == "metric" else GEOGRAPHIC
     heading = nan if pose.heading is None else pose.heading
-    return Spot(kind, (x, y, z), sequence, ordinal, heading, timestamp)
+    return Location(kind, (x, y, z), sequence, ordinal, heading, timestamp)
 
 
 def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> None:
@@ -196,7 +194,12 @@ def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
 
 
 def read_snapshot(
-    folder: Path, layout: Layout, connection: sqlite3.Connection, record: MapRecord, shelf: Shelf, files: IndexFiles
+    folder: Path,
+    layout: Layout,
+    connection: sqlite3.Connection,
+    record: MapRecord,
+    row_reader: RowReader,
+    files: IndexFiles,
 ) -> Snapshot:
     """All that is searched, from disk.
 
@@ -234,7 +237,7 @@ def read_snapshot(
             segments.append(Segment(None, first, there, alive[part], checksums[part], removed=True))
             continue
         if not holds:
-            shelf.check(segment.number, segment.rows)
+            row_reader.check(segment.number, segment.rows)
         held = _load_segment(folder, layout, segment, checksums[part]) if holds else None
         segments.append(Segment(held, first, there, alive[part], checksums[part]))
     if holds:
@@ -248,7 +251,7 @@ def read_snapshot(
         layout.rows_per_segment,
         tuple(segments),
         layout.local_shape,
-        shelf,
+        row_reader,
         None if holds else table,
         lists,
         holds,
@@ -271,8 +274,8 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     try:
         with database.reading() as connection:
             record, layout = _adopt(folder, connection)
-            shelf, files = Shelf(folder, layout), IndexFiles(folder, layout)
-            snapshot = read_snapshot(folder, layout, connection, record, shelf, files)
+            row_reader, files = RowReader(folder, layout), IndexFiles(folder, layout)
+            snapshot = read_snapshot(folder, layout, connection, record, row_reader, files)
             clear_folder(folder, named_segments(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # SQLite has made the name of its log
@@ -293,4 +296,4 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     except BaseException:
         database.close()
         raise
-    return OpenMap(record, layout, database, shelf, files, Remains(folder, layout)), snapshot
+    return OpenMap(record, layout, database, row_reader, files, RemovedSegments(folder, layout)), snapshot

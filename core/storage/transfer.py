@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from core.errors import StorageFailure
 from core.places import Place
 from core.storage.cameras import Access
 from core.storage.database import ledger
-from core.storage.records import Change, Enrolment, History, Keep, SameFrame
-from core.storage.writing import Write, check_enrolment
+from core.storage.records import Enrolment, History, Keep
+from core.storage.writing import Write
 
 
 @dataclass(frozen=True)
@@ -89,39 +87,6 @@ class Transfer:
         with self._reading() as connection:
             found = [ledger.find(connection, place_id) for place_id in place_ids]
         return {stored.place.id: (stored.place, stored.row) for stored in found if stored is not None}
-
-    def picture(self, place_id: str) -> bytes | None:
-        """What is kept of a place's frame, as its ``picture`` says; None if it is gone or keeps none.
-
-        Raises:
-            StorageFailure: it is damaged.
-        """
-        with self._reading() as connection:
-            stored = ledger.find(connection, place_id)
-            kept = None if stored is None else ledger.picture(connection, stored.number)
-        if kept is None:
-            return None
-        if hashlib.sha256(kept[0]).digest() != kept[1]:
-            raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
-        return kept[0]
-
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> list[tuple[Place, Change] | None]:
-        """Like :meth:`core.storage.Map.enrol`, with places among them whose frame is known to be there already.
-
-        All in one COMMIT, in the order given, which is their order in their sequences.
-
-        Returns:
-            None for a place that shows another frame by now, or is gone: nothing is done about it.
-
-        Raises:
-            As :meth:`core.storage.Map.enrol`.
-        """
-        with self._writing() as write:
-            for item in items:
-                if isinstance(item, Enrolment):
-                    check_enrolment(item, write.record.dimension, write.record.local_shape)
-            write.expect(sum(isinstance(item, Enrolment) for item in items))
-            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
         """Take places of another map, all of them or, if this raises, none.

@@ -15,8 +15,8 @@ from core.disk.files import Damage
 from core.storage.database import row_checksums as seals
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
+from core.storage.database.ledger import NamedSegment, named_segments
 from core.storage.database.schema import check_schema, contradictions
-from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.segment_files import Layout
@@ -34,12 +34,12 @@ Progress = Callable[[int, int], None]
 """Told of rows done and of all; what it raises ends the reading."""
 
 
-def untold(done: int, total: int) -> None:
+def no_progress(done: int, total: int) -> None:
     """Nobody is told."""
 
 
 class _Findings:
-    def __init__(self, progress: Progress = untold) -> None:
+    def __init__(self, progress: Progress = no_progress) -> None:
         self.progress = progress
         self.problems: list[str] = []
         self.stale_caches: list[str] = []
@@ -68,7 +68,7 @@ class _Findings:
         )
 
 
-def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
+def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyReport:
     """Check a map that is out of service; a log that is damaged is reported, left aside and kept as it is."""
     findings = _Findings(progress)
     is_log_sound = False
@@ -90,7 +90,7 @@ def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
 
 
 def inspect(
-    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = untold
+    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = no_progress
 ) -> VerifyReport:
     """Check a map's files against each other, and against ``snapshot`` if it is in service.
 
@@ -119,7 +119,7 @@ def inspect(
             _check_pictures(connection, findings)
         if snapshot is not None:
             with findings.noting():
-                _check_spots(connection, snapshot, findings)
+                _check_locations(connection, snapshot, findings)
         query = "SELECT row, id, checksum FROM places"
         places = {row: (place, checksum) for row, place, checksum in connection.execute(query).fetchall()}
         if connection.in_transaction:
@@ -233,7 +233,7 @@ def _check_segment(
 def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np.void]) -> list[int]:
     """Which of the rows from ``start`` on are searched otherwise than they are stored.
 
-    Byte for byte, for a bit may be flipped that changes no comparison.  Of a segment on the shelf it is
+    Byte for byte, for a bit may be flipped that changes no comparison.  Of a segment on disk it is
     its checksums in memory that count: whatever is read of it must have them.
     """
     rows = slice(start, start + len(records))
@@ -249,8 +249,8 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
     ]
 
 
-def _check_spots(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
-    """Is what is searched what is stored: the same places, alive, at the same spots?"""
+def _check_locations(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
+    """Is what is searched what is stored: the same places, alive, at the same locations?"""
     columns = read_columns(connection, snapshot.rows)
     searched, stored = snapshot.whereabouts.take(columns.rows), columns.whereabouts
     same = snapshot.alive[columns.rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,16 +10,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
 from core.storage.database import ledger
-from core.storage.database.ledger import StoredPlace
+from core.storage.database.ledger import StoredPlace, named_segments
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
-from core.storage.opening import OpenMap, spot_of
+from core.storage.opening import OpenMap, location_of
 from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
-from core.storage.search.snapshot import Snapshot, Spot
+from core.storage.search.snapshot import Location, Snapshot
+
+log = logging.getLogger(__name__)
 
 
 def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int]) -> None:
@@ -52,8 +56,8 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
         raise ValueError("a frame cannot have fewer than no regions")
 
 
-def _spot(stored: StoredPlace) -> Spot:
-    return spot_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
+def _location(stored: StoredPlace) -> Location:
+    return location_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
 
 
 def name_appended(
@@ -96,12 +100,12 @@ class Write:
         """The segments that became full, and their checksums."""
         self._folder = folder
         self._layout = opened.layout
-        self._remains = opened.remains
+        self._removed_segments = opened.removed_segments
         self._snapshot = snapshot
         self._records: NDArray[np.void] = np.zeros(0, opened.layout.record)
         self._born = 0
-        self._spots: list[Spot] = []
-        self._moved: dict[int, Spot] = {}
+        self._locations: list[Location] = []
+        self._moved: dict[int, Location] = {}
         self._dead: list[int] = []
         self._now = datetime.now(UTC)
 
@@ -135,7 +139,7 @@ class Write:
             now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
             self._bury(stored.row)
         self._born += 1
-        self._spots.append(_spot(now_stored))
+        self._locations.append(_location(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
@@ -149,16 +153,16 @@ class Write:
         stored = ledger.set_history(self.connection, item.id, history)
         born = stored.row - self._snapshot.rows
         if born >= 0:
-            self._spots[born] = _spot(stored)
+            self._locations[born] = _location(stored)
         else:
-            self._moved[stored.row] = _spot(stored)
+            self._moved[stored.row] = _location(stored)
 
     def set_fields(self, stored: StoredPlace, fields: PlaceFields) -> tuple[Place, Change]:
         """Other fields for the same frame."""
         if ledger.same_fields(stored.place, fields):
             return stored.place, "unchanged"
         now_stored = ledger.set_fields(self.connection, stored, fields, self._now)
-        self._moved[stored.row] = _spot(now_stored)
+        self._moved[stored.row] = _location(now_stored)
         return now_stored.place, "updated"
 
     def forget(self, stored: StoredPlace) -> None:
@@ -200,13 +204,62 @@ class Write:
             # In memory as they are at rest, where that is the same.
             vectors = records["descriptor"] if before.halves else self._layout.descriptors_of(records)
             local = self._layout.locals_of(records)
-            after = before.appended(vectors, self._spots, local, records["checksum"].tolist())
+            after = before.appended(vectors, self._locations, local, records["checksum"].tolist())
         else:
             after = before
         after = after.moved(self._moved) if self._moved else after
         after = after.without(self._dead) if self._dead else after
         size, first_new = self._layout.rows_per_segment, max(0, len(before.segments) - 1)
         touched = {row // size for row in self._dead} | set(range(first_new, len(after.segments)))
-        self._snapshot = self._remains.remove(self.connection, after, touched)  # what was before may go
+        self._snapshot = self._removed_segments.remove(self.connection, after, touched)  # what was before may go
         self.committing = True
         return self._snapshot
+
+
+class FailedWrites:
+    """What stands behind what was acknowledged last, in the segment files and in SQLite's log of one map?
+
+    For the thread that writes.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Of the map in ``folder``: none yet."""
+        self._folder = folder
+        self._rows = False
+        self._log = False
+
+    def note(self, error: BaseException, write: Write, opened: OpenMap, rows: int) -> None:
+        """A write to a map of ``rows`` rows failed with ``error``; before it appended or was committed that is nothing.
+
+        A COMMIT that found no room wrote no end of the transaction; after any other failure of
+        one the log must be emptied first, or a crash could bring that transaction to life.
+        """
+        found_no_room = isinstance(error, sqlite3.Error) and primary_code(error) == sqlite3.SQLITE_FULL
+        self._rows |= write.appending
+        self._log |= write.committing and not found_no_room
+        try:
+            self.repair(opened, rows)
+        except (OSError, sqlite3.Error, Damage) as further:
+            log.warning("Map %s takes no writes until its files are in order again: %s", self._folder.name, further)
+
+    def repair(self, opened: OpenMap, rows: int) -> None:
+        """Bring the files back to the ``rows`` rows acknowledged last; no write is begun until this succeeds.
+
+        Raises:
+            OSError, sqlite3.Error: the disk refuses.
+            Damage: what was acknowledged is not there.
+        """
+        if self._log:
+            opened.database.settle()
+            self._log = False
+        if self._rows:
+            descriptors.rewind(self._folder, opened.layout, rows)
+            # The failed sync may have lost a block that holds the end of the last good row, too.
+            with opened.database.reading() as connection:
+                named = named_segments(connection, opened.layout)
+            if sum(segment.rows for segment in named) != rows:
+                raise Damage("map.sqlite names other rows than were acknowledged")
+            for last in named[-1:]:
+                for _ in descriptors.read_checked(self._folder, opened.layout, last.number, last.rows, last.checksum):
+                    pass
+            self._rows = False

@@ -7,7 +7,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from core.errors import MapQuarantined
-from core.storage.search.reindexing import rebuild as rebuild_index
 from service.jobs.background import stand_back
 from service.jobs.context import born
 from service.jobs.jobs import JobContext
@@ -32,7 +31,7 @@ def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     Raises:
         UnknownMap, MapQuarantined, StorageFailure: the map is searched as before.
     """
-    status = rebuild_index(context.map(engine.atlas), _telling(engine, context))
+    status = context.map(engine.atlas).rebuild_index(_telling(engine, context))
     return {"index": status.model_dump(mode="json")}
 
 

@@ -152,7 +152,7 @@ class _Reencoding:
 
     def _move(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
         """Commit some places: new ones with their frames encoded, known ones with their fields and order as of now."""
-        images = {place.id: self.source.transfer.picture(place.id) for place in new}
+        images = {place.id: self.source.picture(place.id) for place in new}
         # Read behind the images: a place that is still in its row shows the frame that was read.  What was changed
         # or forgotten since it was listed is found by the next round.
         fields = self.source.transfer.find([place.id for place in (*new, *known)])

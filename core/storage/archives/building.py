@@ -24,9 +24,8 @@ from core.storage.cameras import MOST_CAMERAS
 from core.storage.database import ledger
 from core.storage.database import row_checksums as seals
 from core.storage.database.connections import FILE, connect
-from core.storage.database.ledger import moment_text
+from core.storage.database.ledger import moment_text, named_segments
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.database.segment_table import named_segments
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout

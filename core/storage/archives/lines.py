@@ -13,7 +13,7 @@ from core.errors import InvalidArchive
 from core.frames.masks import Mask
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
-from core.storage.patches import complaint
+from core.storage.records import complaint
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to take more."""

@@ -28,8 +28,7 @@ from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
-from core.storage.patches import complaint
-from core.storage.records import MapRecord
+from core.storage.records import MapRecord, complaint
 
 FORMAT = "placerec map"
 VERSION = 1

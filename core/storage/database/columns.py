@@ -31,7 +31,7 @@ class Columns:
 
 
 def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
-    """Row, checksum and spot of every place.
+    """Row, checksum and location of every place.
 
     Args:
         rows: that there are.

@@ -142,7 +142,7 @@ _TIERS: Migration = (
 # A checksum in each row that nothing else vouches for.
 _SEALS: Migration = seals.statements()
 
-# Segments of which no place is left, and whose files are gone (:mod:`core.storage.reclaiming`).
+# Segments of which no place is left, and whose files are gone (:mod:`core.storage.removed_segments`).
 _REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
 
 MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)

@@ -25,7 +25,7 @@ Checksums = NDArray[np.uint32]
 """Of rows, as SQLite names them; 0 for rows that no place names."""
 
 
-class Shelf:
+class RowReader:
     """The records of a map.  Any thread may read; rows behind those that are acknowledged are the caller's to avoid.
 
     Every method that reads may raise Damage (a file is missing, short, or a row fails its checksum or is not the one

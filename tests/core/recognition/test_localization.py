@@ -16,7 +16,7 @@ from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.localization import ATTEMPTS, examine, locate
 from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
-from core.storage.search.snapshot import Spot
+from core.storage.search.snapshot import Location
 from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import scene, seen_again
 
@@ -142,7 +142,7 @@ def test_the_ranking_stays_in_order(lab: Map, encoder: Encoder, seen: list[Encod
 def test_without_a_second_stage_a_ranking_is_what_the_search_gave() -> None:
     encoder = EncoderCatalogue().get("region-vlad")
     encodings = [encoder.encode(scene(seed)) for seed in range(5)]
-    spots = [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, ordinal) for ordinal in range(5)]
+    spots = [Location(NO_POSE, (0.0, 0.0, 0.0), -1, ordinal) for ordinal in range(5)]
     snapshot = Snapshot(encoder.dimension, 3).appended([encoding.descriptor for encoding in encodings], spots)
     rows, products = snapshot.search(encodings[2].descriptor)
     found, scores = examine(encoder, snapshot, encodings[2].local, (rows, products))

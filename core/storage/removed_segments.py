@@ -18,14 +18,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from core.storage.database.segment_table import NamedSegment
+from core.storage.database.ledger import NamedSegment
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.search.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
 
 
-class Remains:
+class RemovedSegments:
     """Files of one map that nothing names any more, until nobody reads them.  For the thread that writes."""
 
     def __init__(self, folder: Path, layout: Layout) -> None:
