@@ -1,4 +1,4 @@
-"""One map: its places on disk and its snapshot in memory, kept in step."""
+"""One map: its places on disk, and the snapshot in memory that is searched."""
 
 from __future__ import annotations
 
@@ -90,22 +90,22 @@ class RecentPlaces:
 
 
 class Map:
-    """The places of one environment.  Every method may be called from any thread.
+    """The places of one environment.  Any thread may call any method.
 
-    One thread writes at a time.  A write returns when it is synced, and every snapshot taken from
-    then on shows it; reads and searches never wait for it.
+    One thread writes at a time.  A write returns when it is synced, and every later snapshot contains it; reads and
+    searches never wait for a write.
 
-    Any method may raise MapQuarantined (the map turns out to be damaged), StorageFailure (the disk
-    refuses) and UnknownMap (it was deleted meanwhile); those that write also StorageFull.  A write
-    that raises has changed nothing.
+    Any method may raise MapQuarantined (the map is found to be damaged), StorageFailure (the disk refuses) and
+    UnknownMap (the map was deleted meanwhile); methods that write may also raise StorageFull.  A write that raises has
+    changed nothing.
     """
 
     def __init__(self, folder: Path, record: MapRecord, places: int = 0) -> None:
-        """The map in ``folder``, of which record and number of places are known; the rest is read on first use."""
+        """The map in ``folder``; all but its record and its number of places is read on first use."""
         self._folder = folder
         self._record = record
         self._places = places
-        self._lock = threading.RLock()  # held by the one that writes, opens or closes
+        self._lock = threading.RLock()  # held while the map is written, opened or closed
         self._opened: OpenMap | None = None
         self._snapshot: Snapshot | None = None
         self._damage: str | None = None
@@ -122,31 +122,31 @@ class Map:
 
     @property
     def record(self) -> MapRecord:
-        """As of the last edit."""
+        """The map's record as of its last edit."""
         return self._record
 
     @property
     def damage(self) -> str | None:
-        """Why the map is quarantined; None while it serves."""
+        """Why the map is quarantined; None while it is in service."""
         return self._damage
 
     def check_serving(self) -> None:
-        """Raise MapQuarantined if the map is damaged, as far as is known."""
+        """Raise MapQuarantined if the map is known to be damaged."""
         if self._damage is not None:
             raise self._quarantined()
 
     @property
     def is_open(self) -> bool:
-        """Whether it serves and was read from disk."""
+        """Whether the map is in service and was read from disk."""
         return self._opened is not None
 
     def open(self) -> None:
-        """Read the map from disk, unless that was done already."""
+        """Read the map from disk, unless that was done before."""
         self._expect_open()
 
     def close(self, deleted: bool = False) -> None:
-        """Let the reads and the write under way end, and refuse further ones."""
-        with self._lock:  # from here on it is not opened any more
+        """Wait for the reads and the write under way, and refuse further ones."""
+        with self._lock:  # from here on the map is not opened again
             name = self._folder.name
             if self._end is None:
                 self._end = (
@@ -186,13 +186,13 @@ class Map:
 
     @contextmanager
     def _guarded(self, action: str) -> Iterator[None]:
-        """Name the errors of the disk; take a map that is damaged out of service."""
+        """Turn errors of the disk into ours; quarantine the map if it is damaged."""
         try:
             with disk_errors(f"{action} map {self._folder.name!r}"):
                 yield
         except (Damage, StorageFailure) as damage:
             if self._end is not None:
-                raise type(self._end)(*self._end.args) from damage  # its files are gone, as they must be
+                raise type(self._end)(*self._end.args) from damage  # a closed or deleted map's files may be gone
             if isinstance(damage, StorageFailure):
                 raise
             self._quarantine(damage)
@@ -214,7 +214,7 @@ class Map:
             yield
 
     def _indexed(self, opened: OpenMap) -> IndexedMap:
-        """What is needed of the map to build what it is searched by."""
+        """What the indexer needs of the map."""
 
         def publish(change: Callable[[Snapshot], Snapshot]) -> Snapshot:
             with self._lock:
@@ -230,7 +230,7 @@ class Map:
         return IndexedMap(lambda: self._record.index, self.snapshot, publish, named, self._quarantine)
 
     def index_status(self) -> IndexStatus:
-        """How the map is searched; it is not read from disk for it."""
+        """How the map is searched; this does not read it from disk."""
         indexer = self.indexer
         found = None if indexer is None else indexer.status(lambda: self._snapshot)
         return unopened(self._record.index, self._places) if found is None else found
@@ -254,7 +254,7 @@ class Map:
         return self.index_status()
 
     def storage_status(self) -> StorageStatus:
-        """What the map takes on disk."""
+        """How much room the map takes on disk."""
         with self._guarded("read"):
             return storage_of(self._folder, self._record.precision, self.count_places())
 
@@ -267,7 +267,7 @@ class Map:
                 return
             except DatabaseClosed:
                 pass
-        self._expect_open()  # says why
+        self._expect_open()  # raises the reason
         raise StorageFailure(f"Map {self._folder.name!r} was closed.")
 
     # Writing
@@ -277,7 +277,7 @@ class Map:
         with self._lock:
             opened, before = self._expect_open(), self.snapshot()
             with self._guarded("write to"):
-                opened.removed_segments.clear(before)  # it may be this room that is needed
+                opened.removed_segments.clear(before)  # the write may need this room
                 self._failed_writes.repair(opened, before.rows)
                 write = None
                 try:
@@ -296,13 +296,13 @@ class Map:
                 self.indexer.wake()
 
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
-        """Change settings (those of MapSettings) or ``calibration`` (None: back to the encoder's).
+        """Change settings (the fields of MapSettings) or ``calibration`` (None: use that of the encoder).
 
-        ``keep`` applies to frames enrolled from then on; pictures kept already stay as they are.
-        The revision grows by one, unless nothing changes.
+        ``keep`` applies to frames enrolled later; pictures that are kept already stay.  The revision grows by one if
+        anything changes.
 
         Raises:
-            InvalidField: an unknown or fixed field, or a value that it cannot have.
+            InvalidField: a field is unknown or fixed, or its value is not allowed.
             RevisionMismatch: the record is not at ``expected_revision``.
         """
         with self._writing() as write:
@@ -387,18 +387,18 @@ class Map:
     # Reading
 
     def snapshot(self) -> Snapshot:
-        """All places at this moment, to be searched; later writes do not change it."""
+        """All places at this moment, for searching; later writes do not change the snapshot."""
         while (snapshot := self._snapshot) is None:
             self._expect_open()
         return snapshot
 
     def count_places(self) -> int:
-        """How many places there are; the map is not read from disk for it."""
+        """How many places the map has; this does not read it from disk."""
         snapshot = self._snapshot
         return self._places if snapshot is None else len(snapshot)
 
     def digest(self, place_id: str) -> bytes | None:
-        """SHA-256 of the image of a place; None if there is no such place."""
+        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
         return None if stored is None else stored.digest
@@ -431,7 +431,7 @@ class Map:
             return page_of_sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None for one deleted or given another frame since."""
+        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
         found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
@@ -442,7 +442,7 @@ class Map:
         return [found.get(row) for row in wanted]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
-        """The rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""
+        """The descriptor rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""
         with self._reading() as connection:
             found = ledger.rows_of_places(connection, list(place_ids))
         return [found.get(place_id) for place_id in place_ids]
@@ -479,15 +479,15 @@ class Map:
             raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
 
     def verify(self, progress: Progress = no_progress) -> VerifyReport:
-        """Read all of the map again and check it; writes and searches go on meanwhile.
+        """Read all files of the map again and check them; writes and searches go on meanwhile.
 
-        The report is of the moment of the call.  Damage is reported, not quarantined: what is
-        served is in memory and passed its checks when it was read.
+        The report is about the moment of the call.  A damaged map is reported but not quarantined, because what is
+        searched is in memory and passed its checks when it was read.
         """
         with ExitStack() as stack:
             with self._lock:
                 snapshot = self.snapshot()
                 connection = stack.enter_context(self._reading())
                 connection.execute("BEGIN")
-                connection.execute("SELECT id FROM map").fetchall()  # this is when the transaction begins to see
+                connection.execute("SELECT id FROM map").fetchall()  # a transaction sees the moment of its first read
             return inspect(self._folder, connection, snapshot, progress)

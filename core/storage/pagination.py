@@ -1,4 +1,8 @@
-"""Opaque pagination cursors: where a listing goes on, and which listing it was."""
+"""Pages of listings, and the opaque cursors by which the next page is asked for.
+
+A cursor names its listing and the last entry of the page, so that entries that come or go between two requests shift
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +17,11 @@ from core.storage.database import ledger
 from core.storage.records import SequenceSummary
 
 Listing = list[str | None]
-"""What is listed, such as ``["places", "lab", "monday"]``; a cursor of another listing is refused."""
+"""Names a listing, such as ``["places", "lab", "monday"]``; a cursor of another listing is refused."""
 
 
 def encode_cursor(listing: Listing, after: str | int) -> str:
-    """A cursor that continues ``listing`` behind the entry whose key is ``after``."""
+    """A cursor that continues ``listing`` after the entry whose key is ``after``."""
     text = json.dumps({"listing": listing, "after": after}, separators=(",", ":"))
     return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
 
@@ -34,10 +38,10 @@ def _decode(listing: Listing, cursor: str) -> object:
 
 
 def decode_number(listing: Listing, cursor: str | None) -> int:
-    """The number behind which to go on; -1 without a cursor, which is before all.
+    """The number after which the listing continues; -1, which is before all numbers, without a cursor.
 
     Raises:
-        InvalidCursor: the text is no cursor, or one of another listing.
+        InvalidCursor: the text is not a cursor of this listing.
     """
     after = -1 if cursor is None else _decode(listing, cursor)
     if not isinstance(after, int) or isinstance(after, bool) or not -1 <= after < 2**63:
@@ -46,10 +50,10 @@ def decode_number(listing: Listing, cursor: str | None) -> int:
 
 
 def decode_name(listing: Listing, cursor: str | None) -> str:
-    """The name behind which to go on; empty without a cursor, which is before all.
+    """The name after which the listing continues; empty, which is before all names, without a cursor.
 
     Raises:
-        InvalidCursor: the text is no cursor, or one of another listing.
+        InvalidCursor: the text is not a cursor of this listing.
     """
     after = "" if cursor is None else _decode(listing, cursor)
     if not isinstance(after, str) or any("\ud800" <= letter <= "\udfff" for letter in after):
@@ -88,7 +92,7 @@ def page_of_sequences(
 
 
 def _one_more(limit: int) -> int:
-    """To ask for one more than a page tells whether there is a next one."""
+    """An entry more than the page has tells whether there is a next page."""
     if limit < 1:
         raise ValueError("a page has at least one entry")
     return limit + 1

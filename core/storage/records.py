@@ -1,4 +1,4 @@
-"""What goes into a map and what comes out of it, as plain typed values."""
+"""The values that go into a map and come out of it, and merge patches (RFC 7396) of places and of a map's record."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class MapRecord(MapSettings):
         return self.local_cells, self.local_values
 
     def settings(self) -> MapSettings:
-        """The part that its owner chose."""
+        """The settings that its owner chose."""
         return MapSettings.model_validate(self.model_dump(include=set(MapSettings.model_fields)))
 
 
@@ -86,11 +86,12 @@ class SequenceSummary(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Enrolment:
-    """One frame to be remembered.
+    """One frame to be stored as a place.
 
-    descriptor, local: float32 [D] and int8 [C, L] of the map's encoder; [0, 0] where it has no second stage.
+    descriptor, local: float32 [D] and int8 [C, L], made by the map's encoder; local is [0, 0] without a second stage.
+    regions: how many regions of interest the frame has.
     digest: SHA-256 of the image's bytes, 32 bytes.
-    thumbnail, image: JPEG made from the frame, and the bytes as received; the map keeps what it is set to keep.
+    thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
     """
 
     id: str
@@ -105,7 +106,7 @@ class Enrolment:
 
 @dataclass(frozen=True)
 class SameFrame:
-    """Other fields for a place, if it still shows the frame of this digest; its descriptor need not be sent again."""
+    """New fields for a place that still shows the frame with this digest; the frame need not be encoded again."""
 
     id: str
     fields: PlaceFields
@@ -114,10 +115,10 @@ class SameFrame:
 
 @dataclass(frozen=True)
 class History:
-    """What a place brings along from another map besides its frame and fields.
+    """What is copied of a place from another map besides its frame and fields.
 
-    picture: what is kept of its frame there.
-    ordinal: its order in its sequence here; None puts it at the end.
+    picture: what is kept of its frame.
+    ordinal: its position in its sequence in the new map; None puts it at the end.
     """
 
     picture: Keep
@@ -138,14 +139,14 @@ class VerifyReport(BaseModel):
 
 
 MOST_FAULTS = 10
-"""Are told of one at a time; the others are counted."""
+"""Invalid values that an error message describes; further ones are only counted."""
 
 MOST_LISTED = 1000
-"""Of more not even the first are told: pydantic gives all of them or none."""
+"""With more invalid values a message only counts them, because pydantic can only describe all of them at once."""
 
 
 def merge_patch(target: Any, patch: Any) -> Any:
-    """RFC 7396: objects are merged member by member, null removes, all else replaces.
+    """Apply a JSON merge patch (RFC 7396): objects are merged by member, null removes a member, all else replaces.
 
     Neither argument is changed.
     """
@@ -160,12 +161,12 @@ def merge_patch(target: Any, patch: Any) -> Any:
     return merged
 
 
-def complaint(error: ValueError) -> str:
-    """What is wrong, on one line: the first faults of many."""
+def validation_message(error: ValueError) -> str:
+    """The first invalid values of many, on one line."""
     if not isinstance(error, ValidationError):
         return str(error)
     if (count := error.error_count()) > MOST_LISTED:
-        return f"{count} values are not what they have to be"
+        return f"{count} values are invalid"
     parts = []
     for fault in error.errors(include_url=False, include_context=False, include_input=False)[:MOST_FAULTS]:
         where = ".".join(str(step) for step in fault["loc"])
@@ -179,7 +180,7 @@ def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFiel
     """``fields`` after a merge patch.
 
     Raises:
-        InvalidField: the result is not what a place may have, or the patch is no object.
+        InvalidField: the result is not valid for a place, or the patch is no object.
     """
     if not isinstance(changes, Mapping):
         raise InvalidField("A patch is a JSON object.")
@@ -191,18 +192,18 @@ def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFiel
     try:
         return PlaceFields.model_validate(merge_patch(document, changes))
     except ValidationError as error:
-        raise InvalidField(f"The place cannot be changed so: {complaint(error)}.") from error
+        raise InvalidField(f"The place cannot be changed like this: {validation_message(error)}.") from error
     except RecursionError as error:
         raise InvalidField("The patch is nested too deeply.") from error
 
 
 def patched_record(record: MapRecord, changes: Mapping[str, Any]) -> MapRecord:
-    """``record`` with other settings or another calibration (None: that of its encoder).
+    """``record`` with other settings or another calibration (None: use that of its encoder).
 
-    Each value given replaces the one before; settings cannot be removed.
+    Each value given replaces the present one; settings cannot be removed.
 
     Raises:
-        InvalidField: an unknown or fixed field, or a value that it cannot have.
+        InvalidField: a field is unknown or fixed, or its value is not allowed.
     """
     if not isinstance(changes, Mapping):
         raise InvalidField("The changes of a map are a JSON object.")
@@ -211,4 +212,4 @@ def patched_record(record: MapRecord, changes: Mapping[str, Any]) -> MapRecord:
     try:
         return MapRecord.model_validate({**record.model_dump(), **changes})
     except ValidationError as error:
-        raise InvalidField(f"The map cannot be changed so: {complaint(error)}.") from error
+        raise InvalidField(f"The map cannot be changed like this: {validation_message(error)}.") from error

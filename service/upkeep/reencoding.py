@@ -108,10 +108,10 @@ class _Reencoding:
     def run(self) -> Mapping[str, Any]:
         for _ in range(ROUNDS):
             self._catch_up()
-            with self.source.transfer.quiet():
+            with self.source.transfer.paused_writes():
                 if self._is_level():
                     return self._publish()
-        with self.source.transfer.quiet():  # it is changed faster than it can be encoded
+        with self.source.transfer.paused_writes():  # it is changed faster than it can be encoded
             self._catch_up()
             if not self._is_level():
                 raise RuntimeError("the new map is not what the old one is")

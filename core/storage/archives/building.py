@@ -193,7 +193,7 @@ class _Building:
             return
         kept = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
         self._check_descriptors(kept, chunk, rows.name)
-        records = self.layout.sealed(kept, self.rows)
+        records = self.layout.records_of(kept, self.rows)
         descriptors.append(self.folder, self.layout, self.rows, records)
         checksums: list[int] = records["checksum"].tolist()
         with transaction(self.connection):

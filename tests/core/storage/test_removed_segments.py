@@ -162,7 +162,7 @@ def test_places_are_never_given_up_for_a_flipped_bit(three: Map, atlas: Atlas, d
         again.get("lab").open()
     assert files(directory) == names(0, 1, 2)
     report = again.verify("lab")
-    assert not report.ok and any("said to be removed" in problem for problem in report.problems)
+    assert not report.ok and any("recorded as removed" in problem for problem in report.problems)
     again.close()
 
 

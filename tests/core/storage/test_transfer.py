@@ -160,7 +160,7 @@ def test_nobody_writes_in_the_quiet(lab: Map) -> None:
         lab.enrol([frame("b")])
         done.set()
 
-    with lab.transfer.quiet():
+    with lab.transfer.paused_writes():
         writer = threading.Thread(target=write)
         writer.start()
         assert not done.wait(0.2)

@@ -13,7 +13,7 @@ from core.disk.files import Damage
 from core.storage.files.row_formats import Precision
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
-from tests.core.storage.frames import descriptor_of, local_of
+from tests.core.storage.frames import descriptor_of, local_of, packed
 
 SHAPE, ROWS = (3, 5), 10
 
@@ -26,7 +26,7 @@ def filled(folder: Path, precision: Precision) -> tuple[RowReader, NDArray[np.vo
     """A shelf of ten rows in three segments, and its records."""
     layout = layout_of(precision)
     names = [f"row {row}" for row in range(ROWS)]
-    records = layout.packed([descriptor_of(name, 32) for name in names], [local_of(name) for name in names], 0)
+    records = packed(layout, [descriptor_of(name, 32) for name in names], [local_of(name) for name in names], 0)
     append(folder, layout, 0, records)
     return RowReader(folder, layout), records
 
@@ -50,7 +50,7 @@ def test_rows_come_in_the_order_asked_for(tmp_path: Path, precision: Precision, 
 @pytest.mark.parametrize("precision", EVERY)
 def test_a_map_without_local_descriptors_has_none_to_read(tmp_path: Path, precision: Precision) -> None:
     layout = Layout(dimension=32, identity="encoder@1", rows_per_segment=4, precision=precision)
-    records = layout.packed([descriptor_of("a", 32)], [np.empty((0, 0), np.int8)], 0)
+    records = packed(layout, [descriptor_of("a", 32)], [np.empty((0, 0), np.int8)], 0)
     append(tmp_path, layout, 0, records)
     shelf, row = RowReader(tmp_path, layout), np.array([0])
     np.testing.assert_array_equal(shelf.descriptors(row, records["checksum"]), layout.descriptors_of(records))
