@@ -22,8 +22,8 @@ import numpy as np
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from core.storage.archives.building import build
-from core.storage.archives.playback import CHUNK_BYTES
 from core.storage.archives.reading import Archive, check
+from core.storage.archives.virtual_archive import CHUNK_BYTES
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
 BATCH = 64
@@ -61,11 +61,11 @@ def measured(folder: Path) -> None:
     atlas, file = Atlas(folder / "data"), folder / "lab.tar"
     lab = atlas.get("lab")
     before, began = peak(), time.perf_counter()
-    playback = lab.capturing.into(folder / "kept")
+    virtual = lab.exporter.into(folder / "kept")
     taken = time.perf_counter()
     with file.open("wb") as out:
         position = 0
-        while data := playback.read(position, CHUNK_BYTES):
+        while data := virtual.read(position, CHUNK_BYTES):
             out.write(data)
             position += len(data)
     sent = time.perf_counter()
@@ -75,14 +75,14 @@ def measured(folder: Path) -> None:
         with atlas.building("copy") as unfinished:
             build(archive, unfinished, "copy")
     built = time.perf_counter()
-    mb, kept = playback.size / 1e6, sum(p.stat().st_size for p in playback.folder.iterdir() if p.suffix != ".seg") / 1e6
+    mb, kept = virtual.size / 1e6, sum(p.stat().st_size for p in virtual.folder.iterdir() if p.suffix != ".seg") / 1e6
     print(
         f"{lab.count_places()} places, {mb:.0f} MB: taken in {taken - began:.1f} s ({kept:.0f} MB on disk), "
         f"read in {sent - taken:.1f} s, checked in {checked - sent:.1f} s, built in {built - checked:.1f} s; "
         f"memory +{peak() - before:.0f} MB",
         flush=True,
     )
-    playback.discard()
+    virtual.discard()
     atlas.close()
 
 

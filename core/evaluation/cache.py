@@ -6,7 +6,6 @@ or not at all; one that cannot be read counts as absent.  The folder can be dele
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
@@ -22,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import replacing
 from core.errors import InvalidTraverse
 from core.networks.identity import canonical_json, json_digest
 
@@ -30,7 +30,7 @@ VALUES = "values"
 LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "torch")
 
 # What shows, keeps or transports figures but cannot change one.
-NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/data/datasets.py", "models", "storage")
+NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/data/datasets.py", "models", "storage", "disk")
 
 DIGEST_BYTES = 32
 
@@ -85,12 +85,10 @@ class EvaluationCache:
         partial = self.folder / f"{key}.{secrets.token_hex(4)}.tmp"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(hashlib.sha256(data).digest() + data)
-            os.replace(partial, self._file(key))
+            with replacing(self._file(key), partial, durable=False):
+                partial.write_bytes(hashlib.sha256(data).digest() + data)
         except OSError:
             self.writable = False
-            with contextlib.suppress(OSError):
-                partial.unlink()
 
     def _file(self, key: str) -> Path:
         assert self.folder is not None

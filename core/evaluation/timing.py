@@ -18,8 +18,8 @@ from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE, Neighborhood
 from core.recognition.stages import examine
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
+from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.spots import Spot
 from core.threads import each
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
@@ -108,7 +108,7 @@ def search_run(encoder: Encoder, places: int) -> Callable[[], object]:
     known = random.standard_normal((places, encoder.dimension), np.float32)
     local = random.integers(-127, 128, (places, *encoder.local_shape), np.int8)
     empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape, halves=True)
-    snapshot = empty.appended(list(known), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
+    snapshot = empty.appended(list(known), [Location(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
 
     def run() -> object:
         rows, products = snapshot.search(known[middle])

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from core.disk.files import replacing
 from service.commands.console import Commands, Failure, remark, show, table
 from service.commands.models import ModelsDir, check_free_name, models_directory
 
@@ -43,12 +44,11 @@ def import_model(
     check_free_name(folder, name, "network", overwrite)
     definition, weights = import_caffe(file, mean, name=name, input_size=_size(input_size))
     path = folder / f"{name}{NETWORK_SUFFIX}"
-    partial = path.with_name(path.name + ".tmp")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        save_network(partial, definition, weights)
-        partial.chmod(0o644)
-        partial.replace(path)
+        with replacing(path) as temporary:
+            save_network(temporary, definition, weights)
+            temporary.chmod(0o644)
     except OSError as error:
         raise Failure(f"{path} cannot be written: {error.strerror or error}.") from error
 

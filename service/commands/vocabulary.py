@@ -14,6 +14,7 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
 
+from core.disk.files import replacing
 from core.errors import InvalidImage
 from core.frames.traverses import SUPPORTED_SUFFIXES, natural_key
 from service.commands.connection.client import read_bytes
@@ -183,9 +184,8 @@ def _install_network(name: str, file: Path, folder: Path) -> None:
         return
     if target.exists() and target.read_bytes() != file.read_bytes():
         raise Failure(f"{target} is another network of the same name.")
-    partial = target.with_name(target.name + ".tmp")
-    shutil.copyfile(file, partial)
-    os.replace(partial, target)
+    with replacing(target) as temporary:
+        shutil.copyfile(file, temporary)
 
 
 def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from pydantic import Field
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
-from core.storage.database.cursors import Listing, decode_number, encode_cursor
+from core.storage.pagination import Listing, decode_number, encode_cursor
 from service.access.principals import Principal
 from service.access.roles import FORGOTTEN, OPERATIONS, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob

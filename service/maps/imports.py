@@ -24,6 +24,7 @@ from typing import Any
 
 from anyio import CapacityLimiter
 
+from core.disk.files import Damage, disk_errors, sync_folder, write_at
 from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
 from core.frames.containers import read_header
 from core.frames.images import Limits
@@ -32,7 +33,6 @@ from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tar_layout import BLOCK
-from core.storage.files.disk import Damage, refusals, sync_folder, write_at
 from service.engine.engine import Engine
 from service.errors.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
 from service.http.bodies import in_pieces
@@ -196,7 +196,7 @@ class Imports:
         advance: Callable[[int, int], None],
         before_listing: Callable[[Archive], None] = lambda _archive: None,
     ) -> None:
-        with refusals("read what was sent"):
+        with disk_errors("read what was sent"):
             archive = Archive(self._folder / name)
         with archive:
             self.check_encoder(archive.manifest)
@@ -300,7 +300,7 @@ class _Arriving:
 
     def open(self) -> None:
         path, announced = self._path, self._announced
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             path.parent.mkdir(exist_ok=True)
             # As a file and as a map it is there twice for a moment.
             if shutil.disk_usage(path.parent).free < 2 * announced:
@@ -314,7 +314,7 @@ class _Arriving:
         return self._found
 
     def add(self, data: bytes) -> None:
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             write_at(self._file, data, self.size)
         self._hash.update(data)
         self.size += len(data)
@@ -334,7 +334,7 @@ class _Arriving:
             raise DigestMismatch("The body does not have the SHA-256 that its header says.")
         if self._found is None:
             raise InvalidArchive(f"The file ends after {self.size} bytes, within its manifest.")
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             os.fsync(self._file)
             os.rename(self._path, there)
             sync_folder(there.parent)

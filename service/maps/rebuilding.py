@@ -7,7 +7,6 @@ from contextlib import suppress
 from typing import Any
 
 from core.errors import MapQuarantined
-from core.storage.search.reindexing import rebuild as rebuild_index
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, born, stand_back
 
@@ -28,7 +27,7 @@ def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     Raises:
         UnknownMap, MapQuarantined, StorageFailure: the map is searched as before.
     """
-    status = rebuild_index(context.map(engine.atlas), _telling(engine, context))
+    status = context.map(engine.atlas).rebuild_index(_telling(engine, context))
     return {"index": status.model_dump(mode="json")}
 
 

@@ -11,7 +11,7 @@ from core import errors
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
 from core.storage import Map, MapRecord, MapSettings, VerifyReport
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.errors.problems import problem_documentation

@@ -91,19 +91,19 @@ async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports
     export = exports.find(map_id, named_tags(request.headers))
     if export is None:
         export = await exports.take(await engine.map(map_id))
-    playback = export.playback
+    archive = export.archive
     headers = {
-        "ETag": f'"{playback.tag}"',
+        "ETag": f'"{archive.tag}"',
         "Accept-Ranges": "bytes",
         "Cache-Control": "private, no-cache",
         "Content-Disposition": f'attachment; filename="{map_id}.tar"',
     }
-    check_match(request.headers, playback.tag)
-    if is_known(request.headers, playback.tag):
+    check_match(request.headers, archive.tag)
+    if is_known(request.headers, archive.tag):
         return Response(status_code=304, headers=headers)
     # A range is of what GET gives (RFC 9110, section 14.2).
     alone = request.state.method == "HEAD"
-    part = wanted_slice({**request.headers, **({"range": ""} if alone else {})}, playback.tag, playback.size)
+    part = wanted_slice({**request.headers, **({"range": ""} if alone else {})}, archive.tag, archive.size)
     headers["Content-Length"] = str(part.stop - part.start)
     if alone:
         return Response(None, headers={**headers, "Content-Type": MEDIA_TYPE})

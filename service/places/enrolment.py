@@ -177,7 +177,7 @@ def _commit(
     with engine.writing(map_.record.id):
         if enrolments:
             check_places(engine, map_, [enrolment.id for enrolment in enrolments.values()])
-        found = zip(items, map_.transfer.enrol(list(items.values())), strict=True)
+        found = zip(items, map_.enrol(list(items.values())), strict=True)
         done = {i: stored for i, stored in found if stored is not None}
     engine.metrics.commits.observe(time.perf_counter() - began)
     return done

@@ -16,15 +16,15 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from core.disk.files import Damage, disk_errors
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import PlacerecError, UnknownMap
 from core.judgement.verdict import Verdict
 from core.storage import Map
-from core.storage.files.disk import Damage, refusals
 from core.upkeep.drift import SCORE_BINS, Week
 from service.engine.engine import Engine
 
 FILE = "statistics.sqlite"
-VERSION = 1
 
 MOST_WEEKS = 260
 """Of a map; older ones are forgotten."""
@@ -58,6 +58,7 @@ _TABLES = (
     f" {', '.join(f'bin{number} INTEGER NOT NULL' for number in range(SCORE_BINS))}, PRIMARY KEY (map, monday))"
     " STRICT, WITHOUT ROWID",
 )
+_SCHEMA = Schema(application_id=0, version=1, create=_TABLES)
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,10 @@ class QueryStatistics:
         sizes: Callable[[], Mapping[MapKey, int] | None],
         present: Callable[[str], set[str]],
     ) -> None:
-        self._path, self._seconds, self._sizes, self._present = directory / FILE, seconds, sizes, present
+        settings = {**DURABLE, "foreign_keys": "ON", "journal_size_limit": 1 << 20}
+        readable = ["SELECT last FROM places LIMIT 0"]
+        self._database = SqliteFile(directory / FILE, _SCHEMA, settings, readable, check_whole=False)
+        self._seconds, self._sizes, self._present = seconds, sizes, present
         self._lock = threading.Lock()
         self._counts: dict[MapKey, _Counts] = {}
         self._waiting = 0
@@ -215,13 +219,13 @@ class QueryStatistics:
     def _unspoilt(self) -> Iterator[None]:
         """Put the file aside if it turns out to be damaged within: it holds nothing but counts."""
         try:
-            with refusals("use the statistics of queries"):
+            with disk_errors("use the statistics of queries", FILE):
                 yield
         except (Damage, ValueError, TypeError) as damage:
             if self._connection is not None:
                 self._connection.close()
                 self._connection = None
-            _put_aside(self._path, damage)
+            self._database.put_aside(damage)
 
     def flush(self) -> None:
         """Write down what was counted.
@@ -238,7 +242,7 @@ class QueryStatistics:
                 with self._unspoilt():
                     self._write(taken)
                     return
-                with refusals("write down the statistics of queries"):
+                with disk_errors("write down the statistics of queries", FILE):
                     self._write(taken)  # into a new file
             except BaseException:
                 with self._lock:  # in front of what was counted since
@@ -257,13 +261,14 @@ class QueryStatistics:
 
     def _open(self) -> sqlite3.Connection:
         if self._connection is None:
-            self._connection = _connect(self._path)
+            self._connection = self._database.open_or_replace()
+            # A crash may lose the last counts, but never damages the file.
+            self._connection.execute("PRAGMA synchronous = NORMAL")
         return self._connection
 
     def _write(self, counts: Mapping[MapKey, _Counts]) -> None:
         connection, sizes = self._open(), self._sizes()
-        connection.execute("BEGIN IMMEDIATE")
-        try:
+        with transaction(connection):
             if sizes is not None:
                 for code, *key in connection.execute("SELECT code, id, made FROM maps").fetchall():
                     if tuple(key) not in sizes:
@@ -271,11 +276,6 @@ class QueryStatistics:
             for key, counted in counts.items():
                 if sizes is None or key in sizes:
                     self._add(connection, key, counted, None if sizes is None else sizes[key])
-            connection.execute("COMMIT")
-        except BaseException:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
-            raise
 
     def _add(self, connection: sqlite3.Connection, key: MapKey, counted: _Counts, places: int | None) -> None:
         connection.execute(
@@ -302,52 +302,6 @@ class QueryStatistics:
             known = connection.execute("SELECT id FROM places WHERE map = ?", (code,)).fetchall()
             gone = [(code, place) for (place,) in known if place not in there]
             connection.executemany("DELETE FROM places WHERE map = ? AND id = ?", gone)
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    """The file, which is made if need be; one that cannot be used is put aside, for it holds nothing but counts."""
-    try:
-        return _opened(path)
-    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        told = str(error)
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
-            raise
-        _put_aside(path, error)
-        return _opened(path)
-
-
-def _put_aside(path: Path, error: Exception) -> None:
-    aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
-    log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, error)
-    path.rename(aside)
-    for suffix in ("-wal", "-shm"):
-        path.with_name(FILE + suffix).unlink(missing_ok=True)
-
-
-def _opened(path: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")  # for the tables
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA journal_size_limit = 1048576")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version == 0:
-            connection.execute("BEGIN IMMEDIATE")
-            for table in _TABLES:
-                connection.execute(table)
-            connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
-        elif version != VERSION:
-            raise sqlite3.DatabaseError(f"its schema is {version}, not {VERSION}")
-        connection.execute("SELECT last FROM places LIMIT 0")
-        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
-        connection.execute("UPDATE places SET id = id WHERE false")
-        connection.execute("PRAGMA synchronous = NORMAL")  # a crash may lose the last counts, never the file
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def _monday(day: date) -> date:

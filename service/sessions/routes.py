@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,

@@ -257,7 +257,7 @@ def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str
 def _adopt(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
     """One commit."""
     names, ends = context.notes["report"]["renamed"], context.notes["ends"]
-    pictures = {place.id: other.transfer.picture(place.id) for place, _ in due}
+    pictures = {place.id: other.picture(place.id) for place, _ in due}
     # Read behind the pictures: a place that is still in its row shows the frame that was read.  What was changed or
     # forgotten since it was listed is for the next round.
     found = other.transfer.find([place.id for place, _ in due])

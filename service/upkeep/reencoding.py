@@ -104,10 +104,10 @@ class _Reencoding:
     def run(self) -> Mapping[str, Any]:
         for _ in range(ROUNDS):
             self._catch_up()
-            with self.source.transfer.quiet():
+            with self.source.transfer.paused_writes():
                 if self._is_level():
                     return self._publish()
-        with self.source.transfer.quiet():  # it is changed faster than it can be encoded
+        with self.source.transfer.paused_writes():  # it is changed faster than it can be encoded
             self._catch_up()
             if not self._is_level():
                 raise RuntimeError("the new map is not what the old one is")
@@ -148,7 +148,7 @@ class _Reencoding:
 
     def _move(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
         """Commit some places: new ones with their frames encoded, known ones with their fields and order as of now."""
-        images = {place.id: self.source.transfer.picture(place.id) for place in new}
+        images = {place.id: self.source.picture(place.id) for place in new}
         # Read behind the images: a place that is still in its row shows the frame that was read.  What was changed
         # or forgotten since it was listed is found by the next round.
         fields = self.source.transfer.find([place.id for place in (*new, *known)])

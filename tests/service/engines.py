@@ -54,7 +54,7 @@ def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
     rows = np.array([place.row for place in outline], np.int64)
     descriptors = snapshot.descriptors_at(rows)
     return [
-        (map_.place(place.id), place.ordinal, map_.transfer.picture(place.id), descriptor.tobytes())
+        (map_.place(place.id), place.ordinal, map_.picture(place.id), descriptor.tobytes())
         for place, descriptor in zip(outline, descriptors, strict=True)
     ]
 

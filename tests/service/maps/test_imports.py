@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from core.disk.files import write_at
 from core.storage import MapSettings
 from core.storage.archives import building
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import write_at
 from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
 from service.maps import imports

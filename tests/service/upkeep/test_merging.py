@@ -184,7 +184,7 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
         done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert done.state == "succeeded"
         lab = runtime.engine.atlas.get("lab")
-        assert lab.digest(last) == newer.digest and lab.transfer.picture(last) == b"newer"
+        assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
         assert runtime.engine.atlas.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
 
@@ -203,7 +203,7 @@ def test_what_somebody_enrols_meanwhile_is_never_replaced(
 
         after_two_commits(monkeypatch, enrol)
         done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED | {"on_conflict": rule}))
-        assert lab.digest(last) == own.digest and lab.transfer.picture(last) == b"theirs"
+        assert lab.digest(last) == own.digest and lab.picture(last) == b"theirs"
         if rule == "skip":
             assert done.state == "succeeded" and lab.count_places() == len(before) + COUNT
         else:

@@ -14,7 +14,7 @@ from core.storage import Atlas, Map
 from core.storage.database.connections import FILE
 from core.storage.files.segment_files import segment_name
 from core.storage.opening import open_map
-from core.storage.reclaiming import Remains
+from core.storage.removed_segments import RemovedSegments
 from core.storage.search.snapshot import Snapshot
 from tests.core.storage.frames import frame
 from tests.core.storage.search.test_tier_memory import become
@@ -138,12 +138,12 @@ def test_a_transaction_that_fails_takes_no_file(three: Map, atlas: Atlas, direct
     atlas.close()
     folder = directory / "maps/lab"
     opened, before = open_map(folder)
-    remains = Remains(folder, opened.layout)
+    removed_segments = RemovedSegments(folder, opened.layout)
     with pytest.raises(ZeroDivisionError), opened.database.transaction() as connection:
         connection.execute("DELETE FROM places WHERE row < 4")
-        assert remains.remove(connection, before.without([0, 1, 2, 3])).segments[0].removed
+        assert removed_segments.remove(connection, before.without([0, 1, 2, 3])).segments[0].removed
         raise ZeroDivisionError
-    remains.clear(before)
+    removed_segments.clear(before)
     opened.database.close()
     assert files(directory) == names(0, 1, 2)
     again = Atlas(directory)
@@ -162,14 +162,14 @@ def test_places_are_never_given_up_for_a_flipped_bit(three: Map, atlas: Atlas, d
         again.get("lab").open()
     assert files(directory) == names(0, 1, 2)
     report = again.verify("lab")
-    assert not report.ok and any("said to be removed" in problem for problem in report.problems)
+    assert not report.ok and any("recorded as removed" in problem for problem in report.problems)
     again.close()
 
 
 def test_no_file_goes_while_somebody_links_them(three: Map, directory: Path) -> None:
     opened = three._opened
     assert opened is not None
-    with opened.remains.kept():
+    with opened.removed_segments.kept():
         forget(three, 0, 1, 2, 3)
         three.enrol([frame("new")])
         assert files(directory) == names(0, 1, 2)

@@ -14,8 +14,8 @@ import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.storage import Atlas, Map, MapSettings
-from core.storage.archives import capture
-from core.storage.archives.capture import Capturing
+from core.storage.archives import exporter
+from core.storage.archives.exporter import Exporter
 from tests.core.storage.archives.files import exported, imported, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 from tests.core.storage.test_opening import flip
@@ -47,7 +47,7 @@ def test_what_comes_back_is_what_was_there(
         np.testing.assert_array_equal(ours.descriptors_at(row), theirs.descriptors_at(other_row))
         np.testing.assert_array_equal(ours.locals_at(row), theirs.locals_at(other_row))
         assert copy.digest(place.id) == source.digest(place.id)
-        assert copy.transfer.picture(place.id) == source.transfer.picture(place.id)
+        assert copy.picture(place.id) == source.picture(place.id)
     assert copy.verify().ok
     # Written again it is the same file, to the last bit: nothing was lost, nothing added, no order changed.
     assert exported(copy, tmp_path / "again") == path.read_bytes()
@@ -57,19 +57,19 @@ def test_what_comes_back_is_what_was_there(
 
 
 def test_any_range_at_any_time(full: Map, atlas: Atlas, tmp_path: Path) -> None:
-    playback = full.capturing.into(tmp_path / "kept")
-    whole = playback.read(0, playback.size)
+    export = full.exporter.into(tmp_path / "kept")
+    whole = export.read(0, export.size)
     full.enrol([frame("p1", "another"), *(frame(f"later{i}") for i in range(9))])
     full.forget("p2")
     full.cameras.forget("rear")
-    assert playback.read(0, 1 << 30) == whole
+    assert export.read(0, 1 << 30) == whole
     atlas.delete("lab")
-    for start in range(0, playback.size, 311):
-        assert playback.read(start, 401) == whole[start : start + 401]
-    assert playback.read(playback.size, 10) == b""
+    for start in range(0, export.size, 311):
+        assert export.read(start, 401) == whole[start : start + 401]
+    assert export.read(export.size, 10) == b""
     _, parts = parts_of(whole)
     assert b"later" not in parts["places-000001.jsonl"]
-    playback.discard()
+    export.discard()
     assert not (tmp_path / "kept").exists()
 
 
@@ -82,7 +82,7 @@ def test_rows_of_forgotten_places_are_left_behind(content: bytes) -> None:
 
 def test_segments_of_which_nothing_lives_any_more(full: Map, directory: Path, tmp_path: Path) -> None:
     """Their files go: those that a moment was taken of before are still there for it, later ones do without."""
-    before = full.capturing.into(tmp_path / "before")
+    before = full.exporter.into(tmp_path / "before")
     whole = before.read(0, before.size)
     for name in ("p0", "p1", "p2"):  # the fourth of the first segment was replaced
         full.forget(name)
@@ -99,7 +99,7 @@ def test_segments_of_which_nothing_lives_any_more(full: Map, directory: Path, tm
 
 def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = exported(full, tmp_path / "whole")
-    monkeypatch.setattr(capture, "PLACES_PER_GROUP", 4)
+    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 4)
     grouped = exported(full, tmp_path / "grouped")
     manifest, parts = parts_of(grouped)
     assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 6 + [1] * 3
@@ -128,15 +128,15 @@ def test_enrolment_goes_on_while_it_is_read(full: Map, tmp_path: Path) -> None:
         going.set()
         assert done.wait(10), "a write waits for an export"
 
-    playback = full.capturing.into(tmp_path / "kept", advance)
+    export = full.exporter.into(tmp_path / "kept", advance)
     thread.join()
-    assert playback.manifest.places == 9 and len(full.snapshot()) == 10
+    assert export.manifest.places == 9 and len(full.snapshot()) == 10
 
 
 def test_a_map_that_is_deleted_does_not_wait_for_its_export(
     full: Map, atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture, "PLACES_PER_GROUP", 2)
+    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 2)
     going = threading.Event()
 
     def delete() -> None:
@@ -152,13 +152,13 @@ def test_a_map_that_is_deleted_does_not_wait_for_its_export(
             threading.Event().wait(0.001)
 
     with pytest.raises(UnknownMap):
-        full.capturing.into(tmp_path / "kept", advance)
+        full.exporter.into(tmp_path / "kept", advance)
     thread.join(10)
     assert not thread.is_alive() and not (tmp_path / "kept").exists()
 
 
 def test_the_state_changes_with_every_write(full: Map) -> None:
-    seen = [full.capturing.state()]
+    seen = [full.exporter.state()]
     for write in (
         lambda: full.enrol([frame("z")]),
         lambda: full.forget("z"),
@@ -166,19 +166,19 @@ def test_the_state_changes_with_every_write(full: Map) -> None:
         lambda: full.edit({"description": "other"}),
     ):
         write()
-        seen.append(full.capturing.state())
+        seen.append(full.exporter.state())
     assert len(set(map(id, seen))) == len(seen)
     full.snapshot()
-    assert full.capturing.state() is seen[-1]
+    assert full.exporter.state() is seen[-1]
 
 
 def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(capture, "_write_group", refuse)
+    monkeypatch.setattr(exporter, "_write_group", refuse)
     with pytest.raises(StorageFull):
-        full.capturing.into(tmp_path / "kept")
+        full.exporter.into(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()
     assert full.verify().ok
 
@@ -194,12 +194,12 @@ def test_where_there_are_no_links_files_are_copied(full: Map, tmp_path: Path, mo
 
 
 def test_damage_is_found_and_not_exported(full: Map, directory: Path, tmp_path: Path) -> None:
-    playback = full.capturing.into(tmp_path / "kept")
+    export = full.exporter.into(tmp_path / "kept")
     flip(directory / "maps" / "lab" / "descriptors-000001.seg", 4096 + 3)
     with pytest.raises(StorageFailure, match="row 0 does not match its checksum"):
-        playback.read(0, playback.size)
+        export.read(0, export.size)
     with pytest.raises(MapQuarantined, match="row 0"):
-        full.capturing.into(tmp_path / "other")
+        full.exporter.into(tmp_path / "other")
     assert not (tmp_path / "other").exists()
 
 
@@ -207,8 +207,8 @@ def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, a
     atlas.close()
     again = Atlas(directory)
     found = again.find("lab")
-    assert found.capturing.state() is None
-    assert exported(found, tmp_path / "kept") and isinstance(found.capturing, Capturing)
+    assert found.exporter.state() is None
+    assert exported(found, tmp_path / "kept") and isinstance(found.exporter, Exporter)
     again.close()
     shutil.rmtree(directory)
 
@@ -220,13 +220,13 @@ def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: p
         connection.execute("ROLLBACK")
         raise RuntimeError("the first of it")
 
-    monkeypatch.setattr(capture, "read_layout", ended)
+    monkeypatch.setattr(exporter, "read_layout", ended)
     with pytest.raises(RuntimeError, match="the first of it"):
-        full.capturing.into(tmp_path / "kept")
+        full.exporter.into(tmp_path / "kept")
 
 
 def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture, "MOST_MANIFEST_BYTES", 500)
+    monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
     with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
-        full.capturing.into(tmp_path / "kept")
+        full.exporter.into(tmp_path / "kept")
     assert not (tmp_path / "kept").exists()

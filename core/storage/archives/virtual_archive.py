@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, disk_errors
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, seal_of
-from core.storage.archives.tar_layout import BLOCK, Member, Tape, header
-from core.storage.files.disk import Damage, refusals
+from core.storage.archives.tar_layout import BLOCK, Member, TarLayout, header
 from core.storage.files.segment_files import HEADER_BYTES, Layout, segment_name
 
 ROWS = "rows.bin"
@@ -25,7 +25,7 @@ CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
-class Links:
+class LinkedSegments:
     """The segment files of that moment."""
 
     folder: Path
@@ -82,7 +82,7 @@ def _read_at(path: Path, offset: int, size: int) -> bytes:
 
 
 @dataclass(frozen=True, eq=False)
-class Playback:
+class VirtualArchive:
     """An export file that is nowhere written as one.  From any thread.
 
     text: the bytes of the manifest; their SHA-256 is ``tag``, which names all bytes of the file.
@@ -92,12 +92,12 @@ class Playback:
     manifest: Manifest
     text: bytes
     tag: str
-    links: Links
+    links: LinkedSegments
 
     @cached_property
-    def tape(self) -> Tape:
+    def tape(self) -> TarLayout:
         """Where in the file each part lies."""
-        return Tape(self.manifest, len(self.text))
+        return TarLayout(self.manifest, len(self.text))
 
     @property
     def size(self) -> int:
@@ -119,7 +119,7 @@ class Playback:
         Raises:
             StorageFailure: the disk refuses, or has lost what it held.
         """
-        with refusals("read an export"):
+        with disk_errors("read an export"):
             most = min(most, self.size - start)
             parts = []
             while most > 0:

@@ -1,4 +1,4 @@
-"""The file system as durability needs it: files and folders synced, refusals told apart, one owner.
+"""Writing files durably, naming the errors of the disk, and locking a folder for one process.
 
 A file is durable when it was synced *and* the folder in which its name was made was synced.
 """
@@ -16,24 +16,24 @@ from pathlib import Path
 from core.errors import DataDirectoryLocked, PlacerecError, StorageFailure, StorageFull
 
 DISK_IS_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""No space, no quota, or past the largest file that this process may write: more room mends each."""
+"""There is no space, no quota, or the file would exceed the process's limit on file sizes: making room helps."""
 
 _SQLITE_IS_FULL = frozenset({sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_SHMSIZE})
 _SQLITE_IS_DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_FORMAT})
 
 TEMPORARY = ".tmp"
-"""Suffix of a file that was not finished; such files are removed when a map is opened."""
+"""Suffix of a file that is being written; a map removes such files from its folder when it is opened."""
 
 
 class Damage(Exception):
-    """What the disk holds of a map is not what was written there; the text says where."""
+    """A file does not hold what was written to it; the text says which file and where."""
 
 
 def missing(path: Path, error: FileNotFoundError) -> Damage:
-    """What it is that a file of a map is missing: damage, unless all of its folder is out of reach.
+    """The error to raise for a missing file: damage, unless the whole folder is missing.
 
     Raises:
-        FileNotFoundError: the folder is missing, too: a disk that was taken away may be put back.
+        FileNotFoundError: the folder is missing too; its disk may have been unplugged and can come back.
     """
     if not path.parent.is_dir():
         raise error
@@ -41,7 +41,7 @@ def missing(path: Path, error: FileNotFoundError) -> Damage:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names within ``folder`` durable."""
+    """Make the file names in ``folder`` durable."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(descriptor)
@@ -50,7 +50,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, as far as they are missing, and sync every name made."""
+    """Make a folder and its missing parents, and sync the name of each folder made."""
     if not folder.is_dir():
         make_folder(folder.absolute().parent)
         folder.mkdir(exist_ok=True)
@@ -67,38 +67,54 @@ def sync_file(path: Path) -> None:
 
 
 def write_at(descriptor: int, data: bytes | memoryview, offset: int) -> None:
-    """Write all of ``data``; a disk that takes only a part of it raises at the rest."""
+    """Write all of ``data`` at ``offset``, in several steps if the system takes only a part at a time."""
     remaining = memoryview(data)
     while remaining:
         written = os.pwrite(descriptor, remaining, offset)
         remaining, offset = remaining[written:], offset + written
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Put ``data`` at ``path`` whole or not at all, durably: temporary name, sync, rename, sync of the folder."""
-    temporary = path.with_name(path.name + TEMPORARY)
+@contextmanager
+def replacing(path: Path, temporary: Path | None = None, durable: bool = True) -> Iterator[Path]:
+    """Replace the file at ``path`` whole or not at all.
+
+    The block writes a file at the temporary path that it is given.  When the block ends, that file is synced, renamed
+    to ``path``, and the folder is synced; when the block raises, the file is removed and ``path`` is as it was.
+
+    Args:
+        temporary: where to write; by default ``path`` with the suffix ``.tmp``.
+        durable: sync the file and the folder.  A file that can be made again needs no sync.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    temporary = path.with_name(path.name + TEMPORARY) if temporary is None else temporary
     try:
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
-        try:
-            write_at(descriptor, data, 0)
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        yield temporary
+        if durable:
+            sync_file(temporary)
         os.replace(temporary, path)
     except BaseException:
         with suppress(OSError):
             temporary.unlink()
         raise
-    sync_folder(path.parent)
+    if durable:
+        sync_folder(path.absolute().parent)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """Put ``data`` at ``path`` whole or not at all, durably; see :func:`replacing`."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def primary_code(error: sqlite3.Error) -> int | None:
-    """SQLite's result code without its extension; None for errors that Python's module makes itself."""
+    """SQLite's primary result code; None for errors that Python's sqlite3 module raises by itself."""
     code: int | None = getattr(error, "sqlite_errorcode", None)
     return None if code is None else code & 0xFF
 
 
-def _refusal(error: OSError | sqlite3.Error, action: str) -> Exception:
+def _named(error: OSError | sqlite3.Error, action: str, database: str) -> Exception:
     if isinstance(error, OSError):
         if error.errno in DISK_IS_FULL:
             return StorageFull(f"The disk is full ({error.strerror}): could not {action}. Make room and try again.")
@@ -106,17 +122,21 @@ def _refusal(error: OSError | sqlite3.Error, action: str) -> Exception:
     if getattr(error, "sqlite_errorcode", None) in _SQLITE_IS_FULL:
         return StorageFull(f"The disk is full: could not {action}. Make room and try again.")
     if primary_code(error) in _SQLITE_IS_DAMAGED or str(error).startswith("Could not decode to UTF-8"):
-        return Damage(f"map.sqlite cannot be read: {error}")
+        return Damage(f"{database} cannot be read: {error}")
     return StorageFailure(f"The disk refused to {action}: {error}.")
 
 
 @contextmanager
-def refusals(action: str) -> Iterator[None]:
-    """Turn what the system says into our errors; ``action`` is an infinitive for the message.
+def disk_errors(action: str, database: str = "map.sqlite") -> Iterator[None]:
+    """Turn the errors of the file system and of SQLite in the block into ours.
+
+    Args:
+        action: what the block does, as an infinitive for the message.
+        database: the SQLite file that the block uses.
 
     Raises:
-        StorageFull: no space left, no quota left, or the file may not grow.
-        StorageFailure: any other refusal of the system or of SQLite.
+        StorageFull: there is no space or quota left, or the file may not grow.
+        StorageFailure: any other error of the file system or of SQLite.
         Damage: SQLite finds its file damaged.
     """
     try:
@@ -124,21 +144,21 @@ def refusals(action: str) -> Iterator[None]:
     except PlacerecError:
         raise
     except (sqlite3.IntegrityError, sqlite3.ProgrammingError, sqlite3.InterfaceError):
-        raise  # our own mistake, not the disk's
-    except UnicodeDecodeError as error:  # SQLite names what it finds damaged, in letters that are damaged, too
-        raise Damage("map.sqlite cannot be read: its text is damaged") from error
+        raise  # a programming error, not an error of the disk
+    except UnicodeDecodeError as error:  # SQLite's message quotes the damaged text
+        raise Damage(f"{database} cannot be read: its text is damaged") from error
     except (OSError, sqlite3.Error) as error:
-        raise _refusal(error, action) from error
+        raise _named(error, action, database) from error
 
 
 class FolderLock:
-    """Exclusive possession of a folder by one process, by an advisory lock on a file in it."""
+    """Locks a folder for one process by an advisory lock on a file in it."""
 
     def __init__(self, path: Path) -> None:
         """Take the lock without waiting.
 
         Raises:
-            DataDirectoryLocked: another holder has it.
+            DataDirectoryLocked: another process holds it.
         """
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
@@ -151,7 +171,7 @@ class FolderLock:
             raise
 
     def release(self) -> None:
-        """Give the lock back; more than once does nothing."""
+        """Release the lock; releasing it again does nothing."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1

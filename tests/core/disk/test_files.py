@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
+from core.disk.files import TEMPORARY, Damage, FolderLock, disk_errors, write_at, write_file
 from core.errors import DataDirectoryLocked, StorageFailure, StorageFull, UnknownPlace
-from core.storage.files.disk import TEMPORARY, Damage, FolderLock, refusals, write_at, write_file
 
 
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
 def test_a_full_disk_has_its_own_error(code: int) -> None:
-    with pytest.raises(StorageFull, match="could not enrol"), refusals("enrol"):
+    with pytest.raises(StorageFull, match="could not enrol"), disk_errors("enrol"):
         raise OSError(code, os.strerror(code))
 
 
 @pytest.mark.parametrize("code", [errno.EIO, errno.EROFS, errno.EACCES])
 def test_other_refusals_are_failures(code: int) -> None:
-    with pytest.raises(StorageFailure, match=os.strerror(code)), refusals("enrol"):
+    with pytest.raises(StorageFailure, match=os.strerror(code)), disk_errors("enrol"):
         raise OSError(code, os.strerror(code))
 
 
@@ -27,7 +27,7 @@ def test_a_full_database_is_a_full_disk() -> None:
     connection = sqlite3.connect(":memory:", isolation_level=None)
     connection.execute("PRAGMA max_page_count = 3")
     connection.execute("CREATE TABLE t (b BLOB)")
-    with pytest.raises(StorageFull), refusals("enrol"):
+    with pytest.raises(StorageFull), disk_errors("enrol"):
         connection.execute("INSERT INTO t VALUES (zeroblob(100000))")
     connection.close()
 
@@ -36,17 +36,17 @@ def test_a_file_that_is_no_database_is_damage(tmp_path: Path) -> None:
     path = tmp_path / "garbage"
     path.write_bytes(os.urandom(8192))
     connection = sqlite3.connect(path)
-    with pytest.raises(Damage), refusals("open"):
+    with pytest.raises(Damage), disk_errors("open"):
         connection.execute("SELECT * FROM sqlite_schema")
     connection.close()
 
 
 def test_our_own_mistakes_and_errors_pass() -> None:
-    with pytest.raises(UnknownPlace), refusals("enrol"):
+    with pytest.raises(UnknownPlace), disk_errors("enrol"):
         raise UnknownPlace("no")
     connection = sqlite3.connect(":memory:")
     connection.close()
-    with pytest.raises(sqlite3.ProgrammingError), refusals("enrol"):
+    with pytest.raises(sqlite3.ProgrammingError), disk_errors("enrol"):
         connection.execute("SELECT 1")
 
 

@@ -18,6 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from core.disk.files import Damage
 from core.errors import StorageFailure, UnknownMap
 from core.storage.archives.lines import StoredLine, camera_lines, place_lines, sequence_lines
 from core.storage.archives.manifest import (
@@ -34,12 +35,12 @@ from core.storage.archives.manifest import (
     tag_of,
     written,
 )
-from core.storage.archives.playback import ROW, ROWS, Links, Playback
+from core.storage.archives.virtual_archive import ROW, ROWS, LinkedSegments, VirtualArchive
 from core.storage.cameras import Access
+from core.storage.database import ledger
 from core.storage.database import row_checksums as seals
 from core.storage.database.connections import FILE
-from core.storage.database.segment_table import named_segments
-from core.storage.files.disk import Damage
+from core.storage.database.ledger import named_segments
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.opening import OpenMap, read_layout
 
@@ -51,14 +52,14 @@ Advance = Callable[[int], None]
 """Is told how many places were read; may raise to break the work off."""
 
 
-class Capturing:
+class Exporter:
     """What can be asked of a map by whoever makes it a file; from any thread.
 
     Args:
         folder: of the map.
         reading: gives a connection to its database.
         opened: the map in use, if it is.
-        guarded: names the refusals of the disk; a map that turns out to be damaged goes out of service.
+        guarded: names the errors of the disk; a map that turns out to be damaged goes out of service.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Capturing:
         opened = self._opened()
         return None if opened is None else opened.database.state
 
-    def into(self, folder: Path, advance: Advance = lambda _read: None) -> Playback:
+    def into(self, folder: Path, advance: Advance = lambda _read: None) -> VirtualArchive:
         """Keep this moment of the map in ``folder``, which is made; nothing of it is left if this raises.
 
         The map is read in one transaction of SQLite, which keeps no writer waiting; then its descriptors are read
@@ -139,7 +140,7 @@ class Capturing:
     def _files_kept(self) -> AbstractContextManager[None]:
         """The file of no segment is removed within."""
         opened = self._opened()
-        return nullcontext() if opened is None else opened.remains.kept()
+        return nullcontext() if opened is None else opened.removed_segments.kept()
 
     def _expect_there(self) -> None:
         if self._opened() is None:
@@ -186,7 +187,8 @@ def _write_group(
     with (folder / pictures_name).open("wb") as file:
         for line in group:
             if line.picture_bytes:
-                content = _picture(connection, line)
+                content = ledger.picture(connection, line.number, line.id)
+                assert content is not None
                 file.write(content)
                 digest.update(content)
                 size += len(content)
@@ -194,19 +196,10 @@ def _write_group(
     return places, Part(name=pictures_name, rows=len(group), bytes=size, sha256=digest.hexdigest())
 
 
-def _picture(connection: sqlite3.Connection, line: StoredLine) -> bytes:
-    query = "SELECT bytes, digest FROM pictures WHERE place = ?"
-    content: bytes
-    content, digest = connection.execute(query, (line.number,)).fetchone()
-    if hashlib.sha256(content).digest() != digest:
-        raise StorageFailure(f"The picture kept of place {line.id!r} is damaged.")
-    return content
-
-
-def _described(taken: _Taken, folder: Path, advance: Advance) -> Playback:
+def _described(taken: _Taken, folder: Path, advance: Advance) -> VirtualArchive:
     """Read all descriptors, each checked, for their SHA-256; write the manifest."""
     parts = list(taken.parts)
-    links, first = Links(folder, taken.layout), 0
+    links, first = LinkedSegments(folder, taken.layout), 0
     for number, (places, pictures) in enumerate(taken.groups):
         digest, size = hashlib.sha256(), 0
         rows = np.fromfile(folder / ROWS, ROW, places.rows, offset=first * ROW.itemsize)
@@ -223,4 +216,4 @@ def _described(taken: _Taken, folder: Path, advance: Advance) -> Playback:
     if len(text) > MOST_MANIFEST_BYTES:
         raise StorageFailure(f"The map has too many places for one file: {len(parts)} parts, which no import takes.")
     (folder / MANIFEST).write_bytes(text)
-    return Playback(folder, manifest, text, tag_of(text), links)
+    return VirtualArchive(folder, manifest, text, tag_of(text), links)
