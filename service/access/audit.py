@@ -14,14 +14,11 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from logging.handlers import WatchedFileHandler
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import StorageFailure
 from service.access.principals import ASKER, Asker, Principal
 from service.telemetry.requests import JsonLines
-
-if TYPE_CHECKING:
-    from service.jobs.records import Job
 
 LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
@@ -66,17 +63,31 @@ def note_change(asker: Asker, path: Mapping[str, str], noted: Mapping[str, Any],
     log.info("change", extra={**named, **noted, **told(asker), "status": status})
 
 
-def note_job(job: Job, event: str) -> None:
-    """Tell that a job begins to change a map, or how it has ended."""
-    line: dict[str, Any] = {"job": job.id, "kind": job.kind, "map": job.map_id, "attempt": job.attempt}
+def note_job(
+    event: str,
+    job: Mapping[str, Any],
+    arguments: Mapping[str, Any],
+    problem: Mapping[str, Any] | None,
+    asker: Mapping[str, Any],
+) -> None:
+    """Write that a job begins to change a map, or how it has ended.
+
+    Args:
+        event: "running", or the state in which the job has ended.
+        job: the fields that tell which job it is, such as its id and its map.
+        arguments: what the job was asked to do; the line names other maps and ``dry_run`` if they are among them.
+        problem: the problem object of a job that has failed.
+        asker: who asked for the job, as :func:`now_asking` gave it.
+    """
+    line = dict(job)
     for name in ("from", "to"):
-        if isinstance(job.arguments.get(name), str):
-            line[name] = job.arguments[name]
-    if isinstance(job.arguments.get("dry_run"), bool):
-        line["dry_run"] = job.arguments["dry_run"]
-    if job.problem is not None:
-        line["problem"] = job.problem.get("type")
-    log.info("job %s", event, extra={**line, **dict(job.asker)})
+        if isinstance(arguments.get(name), str):
+            line[name] = arguments[name]
+    if isinstance(arguments.get("dry_run"), bool):
+        line["dry_run"] = arguments["dry_run"]
+    if problem is not None:
+        line["problem"] = problem.get("type")
+    log.info("job %s", event, extra={**line, **dict(asker)})
 
 
 def now_asking() -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
+from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
@@ -24,6 +25,9 @@ from service.app.routers import ROUTERS
 from service.engine.engine import Engine
 from service.errors.problems import install_problems, problem_response
 from service.http.bodies import BodyLimit, UploadMemory
+from service.http.openapi import document
+from service.http.parameters import BatchItem
+from service.maps.calibration_schemas import CalibrationOrder
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
@@ -62,6 +66,14 @@ TAGS = [
 def _operation_id(route: APIRoute) -> str:
     """An operation is called as the function that does it."""
     return route.name
+
+
+class Application(FastAPI):
+    """FastAPI with an OpenAPI document that also says what every operation can answer."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The document, with the models of bodies that routes read by hand."""
+        return document(self, (BatchItem, CalibrationOrder))
 
 
 class Published:
@@ -137,7 +149,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
             finally:
                 await engine.close()
 
-    app = FastAPI(
+    app = Application(
         title="placerec",
         version=importlib.metadata.version("placerec"),
         summary=SUMMARY,

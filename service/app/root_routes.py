@@ -17,7 +17,6 @@ from service.app.schemas import Health, Readiness, Version
 from service.engine.engine import in_thread
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
-from service.http import openapi
 from service.http.dependencies import EngineDep, PrincipalDep
 from service.maps.schemas import QuarantinedMap
 
@@ -78,9 +77,9 @@ async def read_documentation(request: Request) -> Response:
 
 @lru_cache(1)  # everybody may ask, and making it anew takes as long as a query
 def _written(app: FastAPI) -> bytes:
-    return json.dumps(openapi.document(app), ensure_ascii=False, separators=(",", ":")).encode()
+    return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
 
 
 @lru_cache(1)
 def _shown(app: FastAPI) -> bytes:
-    return page(openapi.document(app)).encode()
+    return page(app.openapi()).encode()

@@ -311,7 +311,7 @@ def install_problems(app: FastAPI) -> None:
 def problem_documentation(*kinds: type[Exception]) -> dict[int | str, dict[str, Any]]:
     """OpenAPI ``responses`` that name, under each status, the problems that a route can answer with.
 
-    Those that all operations share are added by ``service.http.openapi``: a route names what is its own.
+    Those that all operations share are added by ``service.http.openapi``: a route names only its own.
     """
     documented: dict[int | str, dict[str, Any]] = {}
     document_problems(documented, kinds)

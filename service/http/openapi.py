@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import sys
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Any
 
 from fastapi import FastAPI
@@ -16,10 +14,7 @@ from service.access.roles import FORGOTTEN, OPERATIONS, Rule, needs
 from service.errors import faults
 from service.errors.problems import MEDIA_TYPE, Problem, document_problems, problem_examples
 from service.http.links import tell_links
-from service.http.parameters import BatchItem
 from service.http.uploads import FORM, FORMATS
-from service.maps.calibration_schemas import CalibrationOrder
-from service.settings import Settings
 
 BINARY = {"type": "string", "format": "binary"}
 NAMED = {"minLength": 1}
@@ -164,8 +159,12 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
 
 
-def document(app: FastAPI) -> dict[str, Any]:
-    """The application's OpenAPI document; made once."""
+def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
+    """The application's OpenAPI document; it is made once and kept.
+
+    Args:
+        models: what routes read by hand, so that the framework does not find it; the schemas refer to it by name.
+    """
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title,
@@ -176,7 +175,8 @@ def document(app: FastAPI) -> dict[str, Any]:
             routes=app.routes,
         )
         schemas = made["components"]["schemas"]
-        for model in (Problem, BatchItem, CalibrationOrder):
+        unseen: list[type[BaseModel]] = [Problem, *models]
+        for model in unseen:
             described = model.model_json_schema(ref_template=COMPONENT + "{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described
@@ -190,15 +190,3 @@ def document(app: FastAPI) -> dict[str, Any]:
                 _complete(path, operation)
         app.openapi_schema = made
     return app.openapi_schema
-
-
-def write_document(path: Path) -> None:
-    """Write the document of an application with default settings."""
-    from service.app.application import create_app  # the application is made of routes, which need this module
-
-    made = document(create_app(Settings(host="127.0.0.1")))
-    path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n")
-
-
-if __name__ == "__main__":
-    write_document(Path(sys.argv[1]))

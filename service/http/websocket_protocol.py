@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import SecurityError
@@ -17,10 +17,7 @@ from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
 from service.errors.faults import Fault, HeadTooLarge, MalformedHead, MemoryFull
-from service.http.connections import Connections
-
-if TYPE_CHECKING:
-    from service.http.protocol import HttpConnection
+from service.http.connections import Connection, Connections
 
 POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1008, 1013, 1012
 
@@ -58,13 +55,13 @@ class StreamConnection(WebSocketsSansIOProtocol):
         super().__init__(**more)
         self.logger = logging.getLogger("uvicorn.streams")  # whose lines would hold whole query strings
         self._connections, self._settings = connections, connections.settings
-        self._origin: HttpConnection | None = None
+        self._origin: Connection | None = None
         self._at_work = self._stopping = False
         self._arriving = 0  # bytes of an unfinished message
         self._held = deque[int]()  # those of the message at work, and of each that waits
         self._write_timer: asyncio.TimerHandle | None = None
 
-    def came_from(self, origin: HttpConnection) -> None:
+    def came_from(self, origin: Connection) -> None:
         """Take the place of the connection that asked for the upgrade in the register."""
         self._origin = origin
         self._connections.stream(self)

@@ -10,7 +10,6 @@ import pytest
 from service.access.gate import Way, ways_of
 from service.access.roles import OPERATIONS, ROLES, Role, Rule, covers
 from service.app.application import create_app
-from service.http.openapi import document
 from service.settings import Settings
 
 OPEN = {"check_liveness", "check_readiness", "read_version", "read_openapi", "read_documentation"}
@@ -24,7 +23,7 @@ def ways() -> list[Way]:
 
 @pytest.fixture(scope="module")
 def described() -> dict[str, Any]:
-    return document(create_app(Settings(host="127.0.0.1")))
+    return create_app(Settings(host="127.0.0.1")).openapi()
 
 
 def test_every_route_has_a_row_and_every_row_a_route(ways: list[Way]) -> None:
