@@ -26,8 +26,8 @@ from service.engine.engine import Engine
 from service.errors.problems import install_problems, problem_response
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
-from service.http.parameters import BatchItem
 from service.maps.calibration_schemas import CalibrationOrder
+from service.places.parameters import BatchItem
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry

@@ -6,12 +6,10 @@ import asyncio
 import json
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
-from fastapi.routing import APIRoute
 from starlette.requests import Request
-from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
@@ -191,24 +189,3 @@ def json_size(value: Any, what: str) -> int:
         raise InvalidRequest(f"{what} holds half a character (a lone surrogate).") from None
     except ValueError:
         raise InvalidRequest(f"{what} holds a number that is not finite.") from None
-
-
-class StrictRequest(Request):
-    """A request whose JSON body holds only what JSON can hold."""
-
-    async def json(self) -> Any:
-        value = parse_json(await self.body(), "The body")
-        json_size(value, "The body")
-        return value
-
-
-class StrictRoute(APIRoute):
-    """A route that reads JSON bodies strictly."""
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handler = super().get_route_handler()
-
-        async def strict(request: Request) -> Response:
-            return await handler(StrictRequest(request.scope, request.receive))
-
-        return strict

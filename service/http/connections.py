@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-import socket
 import struct
 import sys
 import termios
@@ -151,18 +150,6 @@ class _Gauges(Collector):
         ):
             gauge.add_metric([state], count)
         yield gauge
-
-
-def patient(listener: socket.socket, settings: Settings) -> None:
-    """Let the system end connections, of all that come over ``listener``, whose other end is gone without a word."""
-    seconds = max(1, round(settings.write_timeout))
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # what was written and is not taken
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 2000 * seconds)
-    if hasattr(socket, "TCP_KEEPIDLE"):  # nothing was written
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, seconds))
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, max(1, seconds // 3))
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
 
 
 def untaken(transport: asyncio.Transport) -> int:

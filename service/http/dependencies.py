@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping
 from typing import Annotated
 
 from fastapi import Depends, Header, Path, Query, Request
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
-from core.errors import RevisionMismatch
 from core.places import check_map_id, check_place_id
 from service.access.principals import Principal
 from service.engine.engine import Engine
 from service.engine.queue import Patience
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of
-from service.http.parameters import Parameters
+from service.http.schemas import PageParameters
 from service.http.uploads import media_type
 
 JSON_TYPES = ("application/json", "application/merge-patch+json")
@@ -76,42 +74,6 @@ async def json_body(request: Request) -> None:
         raise UnsupportedMediaType(f"The body is sent as {' or '.join(JSON_TYPES)}, not as {kind[:80] or 'nothing'}.")
 
 
-class PageParameters(Parameters):
-    """Which part of a listing."""
-
-    cursor: str | None = Field(default=None, max_length=1024, description="next_cursor of the page before.")
-    limit: int = Field(default=100, ge=1, le=1000, description="Most items of a page.")
-
-
-class PlacePageParameters(PageParameters):
-    """Which places."""
-
-    sequence: str | None = Field(default=None, max_length=128, description="Only the places of this traverse.")
-
-
-def expected_revision(if_match: str | None, current: int) -> int | None:
-    """The revision that an edit insists on, None for any.
-
-    Args:
-        if_match: value of the If-Match header.
-        current: the map's revision now.
-
-    Raises:
-        RevisionMismatch: the header names only other revisions.
-    """
-    if if_match is None or if_match.strip() == "*":
-        return None
-    strong = re.findall(r'(?<!W/)"([^"]*)"', if_match)
-    if str(current) not in strong:
-        raise RevisionMismatch(f"The map is at revision {current}; its ETag is {entity_tag(current)}.")
-    return current
-
-
-def entity_tag(revision: int) -> str:
-    """The ETag of a map's revision."""
-    return f'"{revision}"'
-
-
 def started(request: Request) -> float:
     """When the request arrived (``time.monotonic``)."""
     moment: float = request.state.started
@@ -140,4 +102,3 @@ IfMatch = Annotated[
     str | None, Header(alias="If-Match", description="ETag of the map as it was read; 412 if it has changed since.")
 ]
 Page = Annotated[PageParameters, Query()]
-PlacePageQuery = Annotated[PlacePageParameters, Query()]

@@ -19,7 +19,8 @@ from service.access.roles import FORGOTTEN, OPERATIONS, covers
 from service.engine.engine import Engine
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, PageParameters, PrincipalDep, single_values
+from service.http.dependencies import EngineDep, PrincipalDep, single_values
+from service.http.schemas import PageParameters
 from service.jobs.jobs import NOTICE_SECONDS, Jobs
 from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView

@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.judgement.map_calibration import Measurement, Target
 from core.judgement.verdict import Calibration
-from service.http.parameters import CameraName
+from service.http.schemas import CameraName
 
 Method = Literal["frames", "sequence", "map"]
 

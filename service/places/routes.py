@@ -22,13 +22,11 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute
 from service.http.dependencies import (
     EngineDep,
     MapId,
     PatienceDep,
     PlaceId,
-    PlacePageQuery,
     json_body,
     milliseconds_since,
     rounded,
@@ -36,7 +34,7 @@ from service.http.dependencies import (
     started,
 )
 from service.http.openapi import form_body, frame_body, json_patch
-from service.http.parameters import BatchParameters, EnrolParameters, check_metadata
+from service.http.route_classes import StrictRoute
 from service.http.uploads import json_part, read_frame, read_many
 from service.jobs.routes import router as jobs
 from service.jobs.schemas import JobView
@@ -44,6 +42,7 @@ from service.places import bulk_enrolment
 from service.places.batch_order import Sequel
 from service.places.batches import candidate_of, check_batch, given_id, item_problem
 from service.places.enrolment import Candidate, enrol
+from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
 from service.places.schemas import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
 
 router = APIRouter(

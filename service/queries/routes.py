@@ -18,7 +18,7 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
 from service.http.openapi import form_body, frame_body
-from service.http.quick_route import QuickRoute
+from service.http.route_classes import QuickRoute
 from service.http.uploads import check_part, read_frame, read_many, split_form
 from service.places.batches import item_problem
 from service.queries.answers import answer_queries, search_ahead

@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.verdict import Verdict
 from service.errors.problems import Problem
-from service.http.fields import Milliseconds
+from service.http.schemas import Milliseconds
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
 from service.queries.schemas import EstimatedPose, Reason
 

@@ -19,7 +19,6 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute
 from service.http.dependencies import (
     EngineDep,
     MapId,
@@ -32,6 +31,7 @@ from service.http.dependencies import (
     started,
 )
 from service.http.openapi import frame_body
+from service.http.route_classes import StrictRoute
 from service.http.uploads import read_frame
 from service.sessions.frames import session_report, session_view, take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView

@@ -16,7 +16,7 @@ from uvicorn.server import ServerState
 
 from service.http.bodies import UploadMemory
 from service.http.connections import Connections, untaken
-from service.http.protocol import HttpConnection
+from service.http.http_connection import HttpConnection
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
 from tests.service.wire import get, post

@@ -43,7 +43,7 @@ def handshake_fault(head: bytes) -> Fault | None:
     )
 
 
-class StreamConnection(WebSocketsSansIOProtocol):
+class WebSocketConnection(WebSocketsSansIOProtocol):
     """A WebSocket that holds a bounded number of messages, of fragments and of bytes.
 
     Args:

@@ -20,7 +20,7 @@ from starlette.responses import Response
 from core.errors import InvalidIdentifier
 from core.places import check_map_id
 from service.engine.queue import Patience
-from service.http.bodies import intake_of
+from service.http.bodies import intake_of, json_size, parse_json
 
 EXPECTED = {"map_id", "options", "request", "engine", "patience"}
 DEADLINE = "x-request-timeout"
@@ -92,3 +92,24 @@ class _Reader:
                 self._kept.clear()
             self._kept[query] = made
         return made
+
+
+class StrictRequest(Request):
+    """A request whose JSON body holds only what JSON can hold."""
+
+    async def json(self) -> Any:
+        value = parse_json(await self.body(), "The body")
+        json_size(value, "The body")
+        return value
+
+
+class StrictRoute(APIRoute):
+    """A route that reads JSON bodies strictly."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        handler = super().get_route_handler()
+
+        async def strict(request: Request) -> Response:
+            return await handler(StrictRequest(request.scope, request.receive))
+
+        return strict

@@ -14,7 +14,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from service.errors.faults import Fault, HeadTooLarge, HeadTooSlow, MalformedHead, TooManyConnections, UrlTooLong
 from service.errors.problems import MEDIA_TYPE, RETRY_LATER, declared, problem_of, retry_after
 from service.http.connections import LEAST_PROGRESS, Connections, untaken
-from service.http.websocket_protocol import StreamConnection, handshake_fault
+from service.http.websocket_connection import WebSocketConnection, handshake_fault
 
 LINGER_SECONDS = 2.0
 """So long what a refused caller still sends is read and thrown away: a connection that is closed before might take the
@@ -221,7 +221,7 @@ class HttpConnection(HttpToolsProtocol):
         if self._write_timer is not None:
             self._write_timer.cancel()
         protocol: object = self.transport.get_protocol()
-        if isinstance(protocol, StreamConnection):
+        if isinstance(protocol, WebSocketConnection):
             protocol.came_from(self)
             if self.flow.write_paused:  # by the answer before
                 self.transport.set_write_buffer_limits()

@@ -1,35 +1,20 @@
-"""What callers say about a frame beside its bytes: in the query string, in form fields, in a batch's JSON."""
+"""What callers say about a place beside its frame: in the query string, in form fields, in the JSON of a batch."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from fastapi import Query
+from pydantic import BeforeValidator, Field, model_validator
 
-from core.places import Camera, Coordinate, PlaceFields, Pose, Sequence, Timestamp
+from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
-from service.errors.problems import invalid_request
 from service.http.bodies import json_size
+from service.http.schemas import CameraName, EncoderAssertion, PageParameters, Parameters, validated
 from service.http.uploads import parse_metadata
 from service.settings import Settings
 
 POSE = ("x", "y", "z", "latitude", "longitude", "heading")
-
-
-Model = TypeVar("Model", bound=BaseModel)
-
-
-def validated(model: type[Model], value: Any) -> Model:
-    """``value`` as a model.
-
-    Raises:
-        InvalidRequest: it does not fit.
-    """
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        raise invalid_request(error.errors(include_url=False)) from error
 
 
 def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
@@ -40,31 +25,6 @@ def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
     """
     if json_size(metadata, "metadata") > settings.max_metadata_bytes:
         raise InvalidRequest(f"metadata: it has more than {settings.max_metadata_bytes} bytes.")
-
-
-class Parameters(BaseModel):
-    """Base of the parameters of one operation; a name that it does not know is refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def joined(self, fields: Mapping[str, str]) -> Self:
-        """These, from the query string, together with the fields of a form.
-
-        Raises:
-            InvalidRequest: a field is unknown, malformed, or stands in the query string too.
-        """
-        if not fields:
-            return self
-        given = self.model_dump(exclude_unset=True)
-        twice = sorted(set(given) & set(fields))
-        if twice:
-            raise InvalidRequest(f"{twice[0]} stands in the query string and in the form.")
-        return validated(type(self), {**given, **fields})
-
-
-CameraName = Annotated[
-    Camera | None, Field(description="The camera of the map that took the frame; its mask is applied.")
-]
 
 
 class PlaceDescription(Parameters):
@@ -108,12 +68,6 @@ class PlaceDescription(Parameters):
             camera=self.camera,
             metadata=metadata,
         )
-
-
-EncoderAssertion = Annotated[
-    str | None,
-    Field(max_length=256, description="Name or identity that the map's encoder must have (409 otherwise)."),
-]
 
 
 class EnrolParameters(PlaceDescription):
@@ -177,32 +131,10 @@ class BatchItem(PlaceDescription):
         return self
 
 
-Matches = Annotated[int, Field(ge=1, le=100, description="How many matches to list.")]
+class PlacePageParameters(PageParameters):
+    """Which places."""
+
+    sequence: str | None = Field(default=None, max_length=128, description="Only the places of this traverse.")
 
 
-class EncoderParameters(Parameters):
-    """Beside a frame that is encoded for no map."""
-
-    encoder: str | None = Field(
-        default=None, max_length=256, description="Name or identity; the default encoder if left out."
-    )
-
-
-class MatchParameters(EncoderParameters):
-    """How to compare two frames."""
-
-    explain: bool = Field(default=False, description="Say which words, regions and cells carried the score.")
-    format: Literal["json", "png"] | None = Field(
-        default=None,
-        description="png: both frames side by side, what answers each other joined by lines; if left out, the Accept "
-        "header decides, and json is the default.",
-    )
-
-
-class RegionsParameters(EncoderParameters):
-    """How to show regions."""
-
-    limit: int | None = Field(default=None, ge=1, le=10_000, description="Only so many, those of the highest energy.")
-    format: Literal["json", "png"] | None = Field(
-        default=None, description="json or png; if left out, the Accept header decides, and json is the default."
-    )
+PlacePageQuery = Annotated[PlacePageParameters, Query()]
