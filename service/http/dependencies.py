@@ -1,4 +1,4 @@
-"""What routes ask for."""
+"""Dependencies of routes: the engine, the caller, the time that a request has, the parts of a path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.engine.queue import Patience
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of
 from service.http.schemas import PageParameters
-from service.http.uploads import media_type
+from service.http.uploads import instead_of, media_type
 
 JSON_TYPES = ("application/json", "application/merge-patch+json")
 
@@ -51,27 +51,27 @@ async def _patience(
 
 
 async def single_values(request: Request) -> None:
-    """Refuse a query parameter that is given twice: one of the two would be ignored.
+    """Refuse a query parameter that is given twice, since one of the two would be ignored.
 
     Raises:
-        InvalidRequest: there is one.
+        InvalidRequest: a parameter is given twice.
     """
     seen: set[str] = set()
     for name, _ in request.query_params.multi_items():
         if name in seen:
-            raise InvalidRequest(f"{name[:80]} stands in the query string twice.")
+            raise InvalidRequest(f"{name[:80]} is given twice in the query string.")
         seen.add(name)
 
 
 async def json_body(request: Request) -> None:
-    """Refuse a body that does not say it is JSON.
+    """Refuse a body whose content type is not that of JSON.
 
     Raises:
-        UnsupportedMediaType: it does not.
+        UnsupportedMediaType: the content type is another one, or missing.
     """
     kind = media_type(request)
     if kind not in JSON_TYPES:
-        raise UnsupportedMediaType(f"The body is sent as {' or '.join(JSON_TYPES)}, not as {kind[:80] or 'nothing'}.")
+        raise UnsupportedMediaType(f"Send the body as {' or '.join(JSON_TYPES)}{instead_of(kind)}.")
 
 
 def started(request: Request) -> float:
@@ -86,7 +86,7 @@ def milliseconds_since(moment: float) -> float:
 
 
 def rounded(milliseconds: Mapping[str, float]) -> dict[str, float]:
-    """Times as they are shown: to the microsecond."""
+    """Durations in milliseconds, rounded to the microsecond, as answers show them."""
     return {stage: round(duration, 3) for stage, duration in milliseconds.items()}
 
 

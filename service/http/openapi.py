@@ -1,4 +1,4 @@
-"""How bodies that are read by hand stand in the OpenAPI document, and what every operation can answer."""
+"""The OpenAPI document: bodies that routes parse themselves, common problems, required roles, and links."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.http.uploads import FORM, FORMATS
 
 BINARY = {"type": "string", "format": "binary"}
 NAMED = {"minLength": 1}
-"""Parts of a form have names."""
+"""Every part of a form has a name."""
 
 COMPONENT = "#/components/schemas/"
 REQUEST_ID = {
@@ -25,8 +25,8 @@ REQUEST_ID = {
     "schema": {"type": "string"},
 }
 
-# What all operations of a group can answer with, in one place: whoever adds a layer before all resources (keys, rates,
-# limits of the connection) names its problems here, once, and no route has to.  A route names only its own.
+# The problems that all operations of a group have in common.  Those of a layer before all resources (keys, rates, the
+# limits of a connection) are named here, so that a route names only its own.
 COMMON: tuple[type[Exception], ...] = (
     faults.MalformedHead,
     faults.HeadTooSlow,
@@ -38,7 +38,7 @@ COMMON: tuple[type[Exception], ...] = (
 """Problems of every operation."""
 
 COMMON_V1: tuple[type[Exception], ...] = (faults.InvalidRequest,)
-"""Of every operation under /v1: its parameters can be wrong at least."""
+"""Problems of every operation under /v1."""
 
 COMMON_OF_BODIES: tuple[type[Exception], ...] = (
     faults.MalformedBody,
@@ -46,7 +46,7 @@ COMMON_OF_BODIES: tuple[type[Exception], ...] = (
     faults.MemoryFull,
     faults.DeadlineExceeded,
 )
-"""Of every operation that takes a body."""
+"""Problems of every operation that takes a body."""
 
 COMMON_OF_MAPS: tuple[type[Exception], ...] = (
     errors.UnknownMap,
@@ -54,7 +54,7 @@ COMMON_OF_MAPS: tuple[type[Exception], ...] = (
     errors.StorageFailure,
     errors.MapQuarantined,
 )
-"""Of every operation on one map."""
+"""Problems of every operation on one map."""
 
 
 SECURITY_SCHEME = {
@@ -75,7 +75,7 @@ def _access_problems(rule: Rule) -> list[type[Exception]]:
 
 
 def _tell_access(operation: dict[str, Any], rule: Rule) -> None:
-    """Say what key an operation needs; without any keys it needs none."""
+    """Document what key an operation needs."""
     operation["x-role"] = rule.role
     operation["security"] = [] if rule.role == "open" else [{"key": []}, {}]
     if rule.role != "open":
@@ -96,7 +96,7 @@ def _form_fields(parameters: type[BaseModel]) -> dict[str, Any]:
 
 
 def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
-    """The body of an operation on one frame: raw, or a form with the parameters as fields."""
+    """The body of an operation on one frame: the raw frame, or a form with the parameters as fields."""
     form = {
         "type": "object",
         "propertyNames": NAMED,
@@ -109,7 +109,7 @@ def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
 
 
 def frames_body(parameters: type[BaseModel]) -> dict[str, Any]:
-    """The body of an operation on the frames of one moment: a raw one, or a form of one part for each camera."""
+    """The body of an operation on the frames of one moment: a raw frame, or a form with one part for each camera."""
     form = {
         "type": "object",
         "propertyNames": NAMED,
@@ -134,7 +134,7 @@ def form_body(description: str, properties: dict[str, Any], required: list[str])
 
 
 def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
-    """The body of an edit may also say that it is a merge patch."""
+    """The body of an edit, which may also have the content type of a merge patch."""
     schema = {"$ref": COMPONENT + changes.__name__}
     return {"requestBody": {"content": {"application/merge-patch+json": {"schema": schema}}}}
 
@@ -142,7 +142,7 @@ def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
 def _complete(path: str, operation: dict[str, Any]) -> None:
     responses = operation["responses"]
     invalid = responses.get("422", {}).get("content", {}).get("application/json")
-    if invalid is not None:  # the framework's own form of validation errors, which is never sent
+    if invalid is not None:  # the framework's own format of validation errors, which is never sent
         del responses["422"]["content"]["application/json"]
         if not responses["422"]["content"]:
             del responses["422"]
@@ -162,7 +162,7 @@ def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, 
     """The application's OpenAPI document; it is made once and kept.
 
     Args:
-        models: what routes read by hand, so that the framework does not find it; the schemas refer to it by name.
+        models: models of bodies that routes parse themselves, which the framework therefore does not find.
     """
     if app.openapi_schema is None:
         made = get_openapi(
@@ -235,7 +235,10 @@ LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
     "merge_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
     "cancel_job": {"200": {"read_job": _JOB}},
 }
-"""Operation -> status -> operation that can follow -> its parameters, as runtime expressions."""
+"""The links of the document: for an operation and a status, which operations can follow and with which parameters.
+
+The parameters are runtime expressions of OpenAPI.
+"""
 
 
 def tell_links(operation: dict[str, Any]) -> None:

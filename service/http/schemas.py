@@ -28,10 +28,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def validated(model: type[Model], value: Any) -> Model:
-    """``value`` as a model.
+    """Validate a value with a model.
 
     Raises:
-        InvalidRequest: it does not fit.
+        InvalidRequest: the value does not fit the model.
     """
     try:
         return model.model_validate(value)
@@ -40,22 +40,22 @@ def validated(model: type[Model], value: Any) -> Model:
 
 
 class Parameters(BaseModel):
-    """Base of the parameters of one operation; a name that it does not know is refused."""
+    """Base of the parameters of one operation; unknown names are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def joined(self, fields: Mapping[str, str]) -> Self:
-        """These, from the query string, together with the fields of a form.
+        """These parameters, from the query string, together with the fields of a form.
 
         Raises:
-            InvalidRequest: a field is unknown, malformed, or stands in the query string too.
+            InvalidRequest: a field is unknown, invalid, or given in the query string too.
         """
         if not fields:
             return self
         given = self.model_dump(exclude_unset=True)
         twice = sorted(set(given) & set(fields))
         if twice:
-            raise InvalidRequest(f"{twice[0]} stands in the query string and in the form.")
+            raise InvalidRequest(f"{twice[0]} is given both in the query string and in the form.")
         return validated(type(self), {**given, **fields})
 
 

@@ -18,13 +18,13 @@ POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 
 
 def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
-    """See that metadata can be kept and shown.
+    """Check that metadata can be stored.
 
     Raises:
-        InvalidRequest: it is too large, or JSON cannot say it.
+        InvalidRequest: the metadata is too large, or cannot be written as JSON.
     """
     if json_size(metadata, "metadata") > settings.max_metadata_bytes:
-        raise InvalidRequest(f"metadata: it has more than {settings.max_metadata_bytes} bytes.")
+        raise InvalidRequest(f"metadata: the value has more than {settings.max_metadata_bytes} bytes.")
 
 
 class PlaceDescription(Parameters):
@@ -54,10 +54,10 @@ class PlaceDescription(Parameters):
     camera: CameraName = None
 
     def fields(self, metadata: dict[str, Any], settings: Settings) -> PlaceFields:
-        """What of it a place keeps.
+        """The fields of a place with this description.
 
         Raises:
-            InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be kept.
+            InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be stored.
         """
         check_metadata(metadata, settings)
         pose = {name: value for name in POSE if (value := getattr(self, name)) is not None}
@@ -77,7 +77,7 @@ class EnrolParameters(PlaceDescription):
     encoder: EncoderAssertion = None
 
     def place_fields(self, settings: Settings) -> PlaceFields:
-        """The fields of the place; errors as for ``PlaceDescription.fields``."""
+        """The fields of the place; it raises what ``PlaceDescription.fields`` raises."""
         metadata = {} if self.metadata is None else parse_metadata(self.metadata)
         return self.fields(metadata, settings)
 
