@@ -15,8 +15,8 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import kept_in
-from service.access.gate import Access, Gate, tell_exposure, ways_of
+from service.access.audit import audit_file
+from service.access.gate import Access, Gate, warn_if_exposed, ways_of
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
@@ -138,8 +138,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with kept_in(chosen.audit_file), keyring or nullcontext():
-            tell_exposure(gate, chosen)
+        with audit_file(chosen.audit_file), keyring or nullcontext():
+            warn_if_exposed(gate, chosen)
             engine = await to_thread.run_sync(Engine, chosen, metrics)
             app.state.engine = engine
             engine.start()

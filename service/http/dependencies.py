@@ -10,7 +10,7 @@ from fastapi import Depends, Header, Path, Query, Request
 from pydantic import AfterValidator
 
 from core.places import check_map_id, check_place_id
-from service.access.principals import Principal
+from service.access.roles import Principal
 from service.engine.engine import Engine
 from service.engine.queue import Patience
 from service.errors.faults import InvalidRequest, UnsupportedMediaType

@@ -10,7 +10,7 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 
 from core import errors
-from service.access.roles import FORGOTTEN, OPERATIONS, Rule, needs
+from service.access.roles import OPERATIONS, UNLISTED, Rule, needs
 from service.errors import faults
 from service.errors.problems import MEDIA_TYPE, Problem, document_problems, problem_examples
 from service.http.uploads import FORM, FORMATS
@@ -146,7 +146,7 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         del responses["422"]["content"]["application/json"]
         if not responses["422"]["content"]:
             del responses["422"]
-    rule = OPERATIONS.get(operation["operationId"], FORGOTTEN)
+    rule = OPERATIONS.get(operation["operationId"], UNLISTED)
     _tell_access(operation, rule)
     document_problems(responses, _common_problems(path, operation, rule), str)
     tell_links(operation)

@@ -14,8 +14,7 @@ from starlette.responses import Response, StreamingResponse
 
 from core import errors
 from core.storage.database.cursors import Listing, decode_number, encode_cursor
-from service.access.principals import Principal
-from service.access.roles import FORGOTTEN, OPERATIONS, covers
+from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.engine.engine import Engine
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
@@ -128,7 +127,7 @@ def cancel_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep) -> Job
     stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
     """
     job = _job_for(engine, principal, job_id)
-    needed = OPERATIONS.get(str(job.asker.get("operation")), FORGOTTEN).role
+    needed = OPERATIONS.get(str(job.asker.get("operation")), UNLISTED).role
     if not covers(principal.role, needed):
         raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this job needs {needed}.")
     return JobView.of(engine.jobs.cancel(job_id))

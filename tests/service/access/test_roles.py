@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from service.access.gate import Way, ways_of
-from service.access.roles import OPERATIONS, ROLES, Role, Rule, covers
+from service.access.roles import OPERATIONS, Role, Rule, covers
 from service.app.application import create_app
 from service.settings import Settings
 
@@ -40,7 +40,7 @@ def test_no_two_operations_have_one_name(ways: list[Way]) -> None:
 
 
 def test_what_is_open_to_all_is_named_here_too() -> None:
-    assert {operation for operation, role in ROLES.items() if role == "open"} == OPEN
+    assert {operation for operation, rule in OPERATIONS.items() if rule.role == "open"} == OPEN
 
 
 def test_a_route_below_a_map_is_held_to_it(ways: list[Way]) -> None:
@@ -87,7 +87,7 @@ def test_the_interface_says_what_each_operation_needs(described: dict[str, Any])
     assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
     for item in described["paths"].values():
         for operation in item.values():
-            name, role = operation["operationId"], ROLES[operation["operationId"]]
+            name, role = operation["operationId"], OPERATIONS[operation["operationId"]].role
             assert operation["x-role"] == role
             answers = set(operation["responses"])
             if role == "open":
