@@ -163,15 +163,15 @@ UNLISTED = Rule("admin", "all", changes=True)
 """The rule of a route that has none, which the tests do not let pass."""
 
 _LIMITS: dict[MapScope, str] = {
-    "path": "; if it is limited to maps, this has to be one of them",
-    "named": "; if it is limited to maps, all that are named have to be among them",
-    "shown": "; if it is limited to maps, there is nothing else here for it",
-    "all": ", without a limit to maps",
+    "path": "; a key that is limited to certain maps must include this one",
+    "named": "; a key that is limited to certain maps must include all that are named",
+    "shown": "; a key that is limited to certain maps sees only those",
+    "all": " that is not limited to certain maps",
     "none": "",
 }
 
 
 def needs(rule: Rule) -> str:
-    """What key an operation needs, as a sentence."""
+    """A sentence that tells which key an operation needs."""
     role = "any role" if rule.role == "query" else f"the role `{rule.role}`"
-    return f"Where keys are asked for: a key of {role}{_LIMITS[rule.maps]}."
+    return f"If the service has keys, this needs a key of {role}{_LIMITS[rule.maps]}."

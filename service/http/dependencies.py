@@ -39,8 +39,8 @@ async def _patience(
             gt=0,
             le=3600,
             allow_inf_nan=False,
-            description="Seconds, from its arrival, after which the request is to be dropped if its frame is not "
-            "being encoded yet; at most the service's own limit.",
+            description="Seconds after which the request is dropped if its frame is not being encoded yet; at most the "
+            "service's own limit.",
         ),
     ] = None,
 ) -> Patience:
@@ -99,6 +99,7 @@ PlaceId = Annotated[
 ]
 SequenceName = Annotated[str, Path(alias="sequence", description="Name of the traverse.", examples=["monday"])]
 IfMatch = Annotated[
-    str | None, Header(alias="If-Match", description="ETag of the map as it was read; 412 if it has changed since.")
+    str | None,
+    Header(alias="If-Match", description="The ETag of the map as it was read; 412 if the map has changed since."),
 ]
 Page = Annotated[PageParameters, Query()]

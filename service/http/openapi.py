@@ -21,7 +21,7 @@ NAMED = {"minLength": 1}
 
 COMPONENT = "#/components/schemas/"
 REQUEST_ID = {
-    "description": "Taken from the request or made; it stands in the log.",
+    "description": "The id of the request: the one that it was sent with, or a new one. It is also in the log.",
     "schema": {"type": "string"},
 }
 
@@ -60,8 +60,8 @@ COMMON_OF_MAPS: tuple[type[Exception], ...] = (
 SECURITY_SCHEME = {
     "type": "http",
     "scheme": "bearer",
-    "description": "A key of this service, `placerec_…`. Asked for as soon as one was ever created; without keys, "
-    "requests from pages of elsewhere are refused.",
+    "description": "A key of this service, `placerec_…`. It is needed as soon as a key was ever created. Without "
+    "keys, requests from web pages of other sites are refused.",
 }
 
 
@@ -101,7 +101,10 @@ def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
         "type": "object",
         "propertyNames": NAMED,
         "required": ["image"],
-        "properties": {"image": {**BINARY, "description": "The frame; any name will do."}, **_form_fields(parameters)},
+        "properties": {
+            "image": {**BINARY, "description": "The frame; its part may have any name."},
+            **_form_fields(parameters),
+        },
     }
     content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
     content[FORM] = {"schema": form, "encoding": {"image": {"contentType": ", ".join(FORMATS)}}}
@@ -114,7 +117,7 @@ def frames_body(parameters: type[BaseModel]) -> dict[str, Any]:
         "type": "object",
         "propertyNames": NAMED,
         "properties": _form_fields(parameters),
-        "additionalProperties": {**BINARY, "description": "One camera's frame, under any name."},
+        "additionalProperties": {**BINARY, "description": "The frame of one camera, under any name."},
     }
     content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
     content[FORM] = {"schema": form}

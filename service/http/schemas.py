@@ -14,7 +14,7 @@ from service.errors.problems import invalid_request
 IDENTITY_EXAMPLE = "m-region-vlad@3c9d…"
 
 Milliseconds = Annotated[dict[str, float], Field(description="Milliseconds spent in each stage.")]
-Cursor = Annotated[str | None, Field(description="Give it as ?cursor= for the next page; null on the last.")]
+Cursor = Annotated[str | None, Field(description="Send it as ?cursor= to get the next page; null on the last page.")]
 CameraName = Annotated[
     Camera | None, Field(description="The camera of the map that took the frame; its mask is applied.")
 ]
@@ -62,5 +62,5 @@ class Parameters(BaseModel):
 class PageParameters(Parameters):
     """Which part of a listing."""
 
-    cursor: str | None = Field(default=None, max_length=1024, description="next_cursor of the page before.")
-    limit: int = Field(default=100, ge=1, le=1000, description="Most items of a page.")
+    cursor: str | None = Field(default=None, max_length=1024, description="The next_cursor of the previous page.")
+    limit: int = Field(default=100, ge=1, le=1000, description="Most items on a page.")

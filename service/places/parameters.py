@@ -92,33 +92,36 @@ class BatchParameters(Parameters):
     background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
     batch: BatchName = Field(
         default=None,
-        description="A name for this batch, a random one for example, by which another can say that it comes after it.",
+        description="A name for this batch, for example a random one, to which another batch can refer with after.",
     )
     after: BatchName = Field(
         default=None,
-        description="The batch of this map after which this one is to be stored. It may be under way still: this one "
-        "is encoded meanwhile. 409 batch-out-of-order if it is not stored in time, and nothing of this one is then.",
+        description="The batch of this map after which this one is to be stored. It may still be under way: this one "
+        "is encoded meanwhile. If it is not stored in time, the answer is 409 batch-out-of-order, and nothing of "
+        "this batch is stored.",
     )
 
     @model_validator(mode="after")
     def _can_follow(self) -> BatchParameters:
         if self.background and (self.batch, self.after) != (None, None):
-            raise ValueError("batch and after are for requests that are answered once all is stored, not in background")
+            raise ValueError(
+                "batch and after cannot be used with background, only in requests that are answered once all is stored"
+            )
         if self.batch is not None and self.batch == self.after:
             raise ValueError("a batch cannot come after itself")
         return self
 
 
 class BatchItem(PlaceDescription):
-    """One place of a batch: its frame is in a part of the form, or is the one that the place holds already."""
+    """One place of a batch: its frame is in a part of the form, or is the one that the place already has."""
 
     id: str = Field(description="Id of the place.", examples=["p7"])
     file: str | None = Field(default=None, description="Name of the file part.", examples=["frame7"])
     sha256: str | None = Field(
         default=None,
         pattern="^[0-9a-f]{64}$",
-        description="Instead of a file: digest of the bytes of the frame that the place holds. If it does, its fields "
-        "are replaced and nothing has to be sent; 409 frame-needed if it does not.",
+        description="Instead of a file: the SHA-256 of the frame that the place already has. If it does have it, "
+        "only its fields are replaced; otherwise the answer is 409 frame-needed, and the frame has to be sent.",
     )
     metadata: Annotated[dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)] = Field(
         default_factory=dict
@@ -127,7 +130,7 @@ class BatchItem(PlaceDescription):
     @model_validator(mode="after")
     def _names_its_frame(self) -> BatchItem:
         if (self.file is None) == (self.sha256 is None):
-            raise ValueError("name the frame's part as file, or give its digest as sha256")
+            raise ValueError("give either the name of its part as file, or the digest of its frame as sha256")
         return self
 
 
