@@ -20,7 +20,8 @@ from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, location_of
 from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
-from core.storage.search.snapshot import Location, Snapshot
+from core.storage.search.segment import Location
+from core.storage.search.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
 

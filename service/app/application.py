@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
+from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
@@ -14,8 +15,8 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import kept_in
-from service.access.gate import Access, Gate, tell_exposure, ways_of
+from service.access.audit import audit_file
+from service.access.gate import Access, Gate, warn_if_exposed, ways_of
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
@@ -25,10 +26,13 @@ from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
+from service.http.openapi import document
 from service.jobs import routes as jobs
 from service.maps import calibration_routes, camera_routes, transfer_routes
 from service.maps import routes as maps
+from service.maps.schemas import CalibrationOrder
 from service.places import routes as places
+from service.places.parameters import BatchItem
 from service.queries import loop_closure, several_routes
 from service.queries import routes as queries
 from service.sessions import routes as sessions
@@ -94,6 +98,14 @@ def _operation_id(route: APIRoute) -> str:
     return route.name
 
 
+class Application(FastAPI):
+    """FastAPI with an OpenAPI document that also says what every operation can answer."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The document, with the models of bodies that routes read by hand."""
+        return document(self, (BatchItem, CalibrationOrder))
+
+
 class Published:
     """ASGI layer that tells the application under which path a proxy publishes it.
 
@@ -156,8 +168,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with kept_in(chosen.audit_file), keyring or nullcontext():
-            tell_exposure(gate, chosen)
+        with audit_file(chosen.audit_file), keyring or nullcontext():
+            warn_if_exposed(gate, chosen)
             runtime = await to_thread.run_sync(Runtime, chosen, metrics)
             runtime.publish(app.state)
             runtime.start()
@@ -167,7 +179,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
             finally:
                 await runtime.close()
 
-    app = FastAPI(
+    app = Application(
         title="placerec",
         version=importlib.metadata.version("placerec"),
         summary=SUMMARY,

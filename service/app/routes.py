@@ -18,7 +18,6 @@ from service.app.runtime import Runtime
 from service.app.schemas import EncoderPage, Health, Readiness, Version
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
-from service.http import openapi
 from service.http.dependencies import EngineDep, FromState, PrincipalDep, single_values
 from service.maps.schemas import QuarantinedMap
 from service.worker_threads import in_thread
@@ -82,12 +81,12 @@ async def read_documentation(request: Request) -> Response:
 
 @lru_cache(1)  # everybody may ask, and making it anew takes as long as a query
 def _written(app: FastAPI) -> bytes:
-    return json.dumps(openapi.document(app), ensure_ascii=False, separators=(",", ":")).encode()
+    return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
 
 
 @lru_cache(1)
 def _shown(app: FastAPI) -> bytes:
-    return page(openapi.document(app)).encode()
+    return page(app.openapi()).encode()
 
 
 encoders = APIRouter(prefix="/v1/encoders", tags=["encoders"], dependencies=[Depends(single_values)])

@@ -17,11 +17,20 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.frames.schemas import Box, Descriptor, Layer, MatchScore, Region, RegionsView
+from service.frames.schemas import (
+    Box,
+    Descriptor,
+    EncoderParameters,
+    Layer,
+    MatchParameters,
+    MatchScore,
+    Region,
+    RegionsParameters,
+    RegionsView,
+)
 from service.http.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
-from service.http.negotiation import preferred
+from service.http.headers import preferred
 from service.http.openapi import BINARY, form_body, frame_body
-from service.http.parameters import EncoderParameters, MatchParameters, RegionsParameters
 from service.http.uploads import read_frame, read_pair
 from service.queries.explanations import as_drawn, drawing, explained
 from service.worker_threads import in_thread

@@ -77,7 +77,7 @@ class Job:
     problem: why it failed, as a problem object.
     maps: the maps that it was asked for, by id, and when each was created: one of the same id that was created at
         another time is another map.
-    asker: who asked for it, as ``service.access.principals.Asker`` has it; for the audit trail.
+    asker: who asked for it, as ``service.access.audit.Asker`` has it; for the audit trail.
     """
 
     number: int

@@ -14,11 +14,11 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
 from core.storage.pagination import Listing, decode_number, encode_cursor
-from service.access.principals import Principal
-from service.access.roles import FORGOTTEN, OPERATIONS, covers
+from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
-from service.http.dependencies import FromState, PageParameters, PrincipalDep, single_values
+from service.http.dependencies import FromState, PrincipalDep, single_values
+from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
 from service.jobs.jobs import Jobs
 from service.jobs.records import Job, JobState
@@ -141,7 +141,7 @@ def cancel_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep) -> JobView
     stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
     """
     job = _job_for(jobs, principal, job_id)
-    needed = OPERATIONS.get(str(job.asker.get("operation")), FORGOTTEN).role
+    needed = OPERATIONS.get(str(job.asker.get("operation")), UNLISTED).role
     if not covers(principal.role, needed):
         raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this job needs {needed}.")
     return JobView.of(jobs.cancel(job_id))

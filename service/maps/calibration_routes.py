@@ -21,8 +21,9 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import json_size, parse_json
-from service.http.dependencies import EngineDep, IfMatch, MapId, PatienceDep, expected_revision, single_values
-from service.http.parameters import validated
+from service.http.dependencies import EngineDep, IfMatch, MapId, PatienceDep, single_values
+from service.http.headers import expected_revision
+from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
 from service.jobs.context import born
 from service.jobs.routes import JobsDep, accepted

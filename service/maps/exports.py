@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 from core.storage import Map
 from core.storage.archives.virtual_archive import CHUNK_BYTES, VirtualArchive
 from service.errors.faults import NotReady, TooManyExports
-from service.http.ranges import Slice
+from service.http.headers import Slice
 
 if TYPE_CHECKING:
     from service.settings import Settings

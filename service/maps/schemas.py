@@ -12,8 +12,7 @@ from core.judgement.verdict import Calibration
 from core.places import Timestamp
 from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM
-from service.http.fields import IDENTITY_EXAMPLE, Cursor
-from service.http.parameters import CameraName
+from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",

@@ -23,11 +23,12 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute, intake_of
-from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, entity_tag, single_values
+from service.http.bodies import intake_of
+from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, single_values
+from service.http.headers import check_match, entity_tag, is_known, named_tags, wanted_slice
 from service.http.openapi import BINARY
-from service.http.parameters import Parameters
-from service.http.ranges import check_match, is_known, named_tags, wanted_slice
+from service.http.route_classes import StrictRoute
+from service.http.schemas import Parameters
 from service.http.uploads import media_type
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView

@@ -22,7 +22,6 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute
 from service.http.dependencies import (
     EngineDep,
     FromState,
@@ -30,7 +29,6 @@ from service.http.dependencies import (
     Page,
     PatienceDep,
     PlaceId,
-    PlacePageQuery,
     SequenceName,
     frame_for_map,
     json_body,
@@ -40,7 +38,7 @@ from service.http.dependencies import (
     started,
 )
 from service.http.openapi import form_body, frame_body, json_patch
-from service.http.parameters import BatchParameters, EnrolParameters, check_metadata
+from service.http.route_classes import StrictRoute
 from service.http.uploads import json_part, read_many
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, accepted
@@ -49,6 +47,7 @@ from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, Sequel
 from service.places.batches import candidate_of, check_batch, given_id, item_problem
 from service.places.enrolment import Candidate, enrol
+from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
 from service.places.schemas import (
     BatchResult,
     BatchResults,

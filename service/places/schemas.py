@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 from core.places import Place, Pose, Sequence, Timestamp
 from core.storage import Change, Keep, SequenceSummary
 from service.errors.problems import Problem
-from service.http.fields import IDENTITY_EXAMPLE, Cursor, Milliseconds
+from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 
 PLACE_EXAMPLE: dict[str, Any] = {
     "id": "p7",

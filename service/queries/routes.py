@@ -30,7 +30,7 @@ from service.http.dependencies import (
     started,
 )
 from service.http.openapi import BINARY, form_body, frame_body
-from service.http.quick_route import QuickRoute
+from service.http.route_classes import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import item_problem
 from service.queries.answers import StatisticsDep, told_answer

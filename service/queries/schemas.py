@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler
 
 from core.judgement.verdict import Verdict
 from service.errors.problems import Problem
-from service.http.fields import IDENTITY_EXAMPLE, Milliseconds
+from service.http.schemas import IDENTITY_EXAMPLE, Milliseconds
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
 
 

@@ -18,7 +18,6 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute
 from service.http.dependencies import (
     EngineDep,
     FromState,
@@ -33,6 +32,7 @@ from service.http.dependencies import (
     started,
 )
 from service.http.openapi import frame_body
+from service.http.route_classes import StrictRoute
 from service.queries.answers import StatisticsDep
 from service.sessions.frames import session_report, session_view, take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView

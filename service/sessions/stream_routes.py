@@ -38,7 +38,7 @@ from service.errors.faults import (
 )
 from service.errors.problems import Problem, problem_of, problem_response
 from service.http.bodies import parse_json
-from service.http.parameters import validated
+from service.http.schemas import validated
 from service.http.uploads import check_frame
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters

@@ -23,9 +23,9 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute
 from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
-from service.http.parameters import Parameters
+from service.http.route_classes import StrictRoute
+from service.http.schemas import Parameters
 from service.jobs.context import born
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of

@@ -29,7 +29,8 @@ from core.storage.files.arrays import StaleArrays, read_arrays, write_arrays
 from core.storage.pagination import decode_name, decode_number, encode_cursor
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
-from service.http.parameters import EnrolParameters, validated
+from service.http.schemas import validated
+from service.places.parameters import EnrolParameters
 from service.queries.filters import FilterParameters, parse_box, parsed_json
 from service.telemetry.traces import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder

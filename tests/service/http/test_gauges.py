@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from tests.service.app.test_root import samples
-from tests.service.http.conftest import STRICT
-from tests.service.http.wire import get, opened, post, rest
+from tests.service.conftest import STRICT
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+from tests.service.wire import get, opened, post, rest
 
 
 def test_what_is_held_is_told(strict: Server) -> None:

@@ -6,9 +6,9 @@ import json
 import subprocess
 import sys
 
-from tests.service.http.wire import eventually
 from tests.service.scenes import encoded, scene
 from tests.service.server import ROOT, Server
+from tests.service.wire import eventually
 
 PROGRAM = """
 import os, sys

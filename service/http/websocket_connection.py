@@ -1,6 +1,6 @@
-"""One WebSocket: uvicorn's protocol, with limits on what is held of a robot's messages, and a stop between two of them.
+"""One WebSocket: uvicorn's protocol, with limits on the messages that wait, and a shutdown between two messages.
 
-uvicorn sends a ping every 20 seconds and gives a robot up that does not answer one for as long.
+uvicorn sends a ping every 20 seconds and closes the connection of a client that does not answer it for as long.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.exceptions import SecurityError
@@ -17,18 +17,15 @@ from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
 from service.errors.faults import Fault, HeadTooLarge, MalformedHead, MemoryFull
-from service.http.connections import Connections
-
-if TYPE_CHECKING:
-    from service.http.protocol import HttpConnection
+from service.http.connections import Connection, Connections
 
 POLICY_VIOLATION, TRY_AGAIN_LATER, RESTARTING = 1008, 1013, 1012
 
 
 def handshake_fault(head: bytes) -> Fault | None:
-    """Why the library would not take a request for the handshake of a WebSocket; None if it will.
+    """Why the websockets library would refuse a request as a handshake; None if it would accept it.
 
-    Asked in earnest it would say so in words of its own, or say nothing and leave the connection open.
+    It is asked beforehand because its own refusal is no problem object, or no answer at all and an open connection.
     """
     judge = ServerProtocol()
     judge.receive_data(head)
@@ -38,37 +35,37 @@ def handshake_fault(head: bytes) -> Fault | None:
     if judge.handshake_exc is None:
         return None
     if isinstance(judge.handshake_exc, SecurityError):
-        return HeadTooLarge("The request for a WebSocket has too many headers, or a line of more than 8 KiB.")
+        return HeadTooLarge("The WebSocket handshake has too many headers, or a line of more than 8 KiB.")
     return MalformedHead(
-        "This is no request for a WebSocket: that is a GET of HTTP/1.1 without a body, with Sec-WebSocket-Version: 13 "
+        "This is not a valid WebSocket handshake. Send an HTTP/1.1 GET without a body, with Sec-WebSocket-Version: 13 "
         "and 16 bytes in base64 as Sec-WebSocket-Key.",
         {"Sec-WebSocket-Version": "13"},
     )
 
 
-class StreamConnection(WebSocketsSansIOProtocol):
+class WebSocketConnection(WebSocketsSansIOProtocol):
     """A WebSocket that holds a bounded number of messages, of fragments and of bytes.
 
     Args:
-        connections: the register of all, with the limits.
-        more: what uvicorn gives to a protocol.
+        connections: the register of all connections, with the limits.
+        more: uvicorn's own arguments of a protocol.
     """
 
     def __init__(self, *, connections: Connections, **more: Any) -> None:
         super().__init__(**more)
-        self.logger = logging.getLogger("uvicorn.streams")  # whose lines would hold whole query strings
+        self.logger = logging.getLogger("uvicorn.streams")  # uvicorn's own logger would log whole query strings
         self._connections, self._settings = connections, connections.settings
-        self._origin: HttpConnection | None = None
+        self._origin: Connection | None = None
         self._at_work = self._stopping = False
-        self._arriving = 0  # bytes of an unfinished message
-        self._held = deque[int]()  # those of the message at work, and of each that waits
+        self._arriving = 0  # bytes of the unfinished message
+        self._held = deque[int]()  # bytes of the message at work and of each one that waits
         self._write_timer: asyncio.TimerHandle | None = None
 
-    def came_from(self, origin: HttpConnection) -> None:
-        """Take the place of the connection that asked for the upgrade in the register."""
+    def came_from(self, origin: Connection) -> None:
+        """Take over the entry of the connection that asked for the upgrade in the register."""
         self._origin = origin
         self._connections.stream(self)
-        # What comes before the handshake is answered is no message yet; the first ``receive`` reads on.
+        # Nothing is read until the handshake is answered; the first ``receive`` resumes reading.
         self.read_paused = True
         self.transport.pause_reading()
 
@@ -87,9 +84,9 @@ class StreamConnection(WebSocketsSansIOProtocol):
     def data_received(self, data: bytes) -> None:
         if self.close_sent and self.close_timer is None:
             return  # refused
-        if not self.handshake_initiated:  # the head, which is held by nobody
+        if not self.handshake_initiated:  # the head, which is not counted as held
             super().data_received(data)
-            if not self.handshake_initiated:  # refused in spite of ``handshake_fault``
+            if not self.handshake_initiated:  # refused although ``handshake_fault`` found nothing
                 self.transport.abort()
             return
         try:
@@ -99,7 +96,7 @@ class StreamConnection(WebSocketsSansIOProtocol):
             return
         self._arriving += len(data)
         super().data_received(data)
-        # What was neither of a message nor is the beginning of one, such as a ping, is held no longer.
+        # Bytes of no message, such as those of a ping, are held no longer.
         left = len(self.conn.reader.buffer) + sum(map(len, self.frames))
         self._connections.memory.release(self._arriving - left)
         self._arriving = left
@@ -111,7 +108,7 @@ class StreamConnection(WebSocketsSansIOProtocol):
         super().handle_cont(event)
 
     def send_receive_event_to_app(self) -> None:
-        if self.close_sent:  # the service has closed, and reads on for the robot's part of that alone
+        if self.close_sent:  # the service has sent its close frame and waits only for the client's
             super().send_receive_event_to_app()
             return
         if self.queue.qsize() >= self._settings.max_stream_messages:
@@ -142,14 +139,14 @@ class StreamConnection(WebSocketsSansIOProtocol):
         return message
 
     def shutdown(self) -> None:
-        """Answer the frame, or the handshake, that is at work, and say that the service restarts."""
+        """Answer the message or the handshake that is at work, then close with the code for a restart."""
         if (self._at_work or not self.handshake_complete) and not self.close_sent:
             self._stopping = True
         else:
             self._say_restarting()
 
     def _say_restarting(self) -> None:
-        if not self.transport.is_closing():  # else the robot was faster, and there is nothing to say
+        if not self.transport.is_closing():  # else the client has closed first
             super().shutdown()
 
     # What is written
@@ -157,11 +154,11 @@ class StreamConnection(WebSocketsSansIOProtocol):
     async def send(self, message: Any) -> None:
         await super().send(message)
         if message["type"] == "websocket.http.response.body" and not message.get("more_body", False):
-            self.handshake_complete = True  # a refusal ends it, too; uvicorn would log an error of ours
+            self.handshake_complete = True  # a refusal completes it too; otherwise uvicorn logs an error
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self.transport.pause_reading()  # or answers to pings would pile up
+        self.transport.pause_reading()  # otherwise answers to pings would pile up
         self._write_timer = self.loop.call_later(self._settings.write_timeout, self._give_up)
 
     def resume_writing(self) -> None:

@@ -1,4 +1,4 @@
-"""One HTTP connection: uvicorn's protocol, with a limit on each size that a caller decides and a time for each step."""
+"""One HTTP connection: uvicorn's protocol, with limits on all that a client chooses and on the time of each step."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from service.errors.faults import Fault, HeadTooLarge, HeadTooSlow, MalformedHead, TooManyConnections, UrlTooLong
 from service.errors.problems import MEDIA_TYPE, RETRY_LATER, declared, problem_of, retry_after
 from service.http.connections import LEAST_PROGRESS, Connections, untaken
-from service.http.websocket_protocol import StreamConnection, handshake_fault
+from service.http.websocket_connection import WebSocketConnection, handshake_fault
 
 LINGER_SECONDS = 2.0
-"""So long what a refused caller still sends is read and thrown away: a connection that is closed before might take the
-answer with it."""
+"""How long what a refused client still sends is read and discarded: if the connection were closed at once, the client
+might lose the answer."""
 
 LAST_SECONDS = 0.25
-"""When the service stops, a request that is on its way over a connection without any has so long to arrive."""
+"""How long an idle connection stays open when the service stops, for a request that is already on its way."""
 
 FIELD_EXTRA = 4
-"""Bytes of a header besides its name and value: colon, space, end of line."""
+"""Bytes of a header line besides its name and value: the colon, the space, the end of the line."""
 
 log = logging.getLogger("placerec.connections")
 
 
 class _Refused(Exception):
-    """Ends the parser: what follows is not read."""
+    """Raised in the parser's callbacks to stop it: nothing that follows is read."""
 
 
 class HttpConnection(HttpToolsProtocol):
-    """A connection that is closed when its caller is too slow, too long, or one too many.
+    """A connection that is closed when its client is too slow, sends too much, or is one too many.
 
     Args:
-        connections: the register of all, with the limits.
-        more: what uvicorn gives to a protocol.
+        connections: the register of all connections, with the limits.
+        more: uvicorn's own arguments of a protocol.
     """
 
     def __init__(self, *, connections: Connections, **more: Any) -> None:
         super().__init__(**more)
         self._connections, self._settings = connections, connections.settings
-        self.logger = logging.getLogger("uvicorn.http")  # a refusal has a line of our own
+        self.logger = logging.getLogger("uvicorn.http")  # refusals are logged below
         self._refusal: Fault | None = None
-        self._deaf = False  # nothing more is read
-        self._last = False  # the next answer is the last one
+        self._stopped_reading = False
+        self._last = False  # the connection is closed after the next answer
         self._surplus = False
         self._in_head = self._in_message = False
-        self._began = False  # a head did, in the bytes that came last
+        self._began = False  # a head began in the bytes that came last
         self._url_size = self._fields_size = self._fields = self._partial = 0
         self._head_timer: asyncio.TimerHandle | None = None
         self._write_timer: asyncio.TimerHandle | None = None
@@ -80,11 +80,11 @@ class HttpConnection(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def give_way(self) -> None:
-        """Close, for others want the place."""
+        """Close to make room for another connection."""
         self._end("made-room")
 
     def shutdown(self) -> None:
-        """Answer what is under way, and a request that is just arriving, and close."""
+        """Answer the request that is under way or just arriving, then close."""
         self._last = True
         if self._is_working():
             super().shutdown()
@@ -92,14 +92,14 @@ class HttpConnection(HttpToolsProtocol):
             self._end_timer = self.loop.call_later(LAST_SECONDS, self._end, "stopping")
 
     def timeout_keep_alive_handler(self) -> None:
-        """The caller had no request for too long; what the system has yet to send it is being read."""
+        """Close a connection that was idle for too long, unless the client is still reading the last answer."""
         if untaken(self.transport):
             self._await_request()
         else:
             self._end("idle")
 
     def _is_working(self) -> bool:
-        """Whether a request is under way that waits for its answer."""
+        """Whether a request waits for its answer."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def _end(self, reason: str) -> None:
@@ -109,24 +109,24 @@ class HttpConnection(HttpToolsProtocol):
         self._close()
 
     def _close(self) -> None:
-        """Close; what was written may still be taken, as slowly as any answer."""
+        """Close once the client has read what was written, which is timed as any answer is."""
         self.transport.close()
         self._watch_rest()
 
     # What arrives
 
     def data_received(self, data: bytes) -> None:
-        if self._deaf:
+        if self._stopped_reading:
             return
         self._began = False
         super().data_received(data)
-        if self._deaf or self.transport.is_closing() or self.transport.get_protocol() is not self:
+        if self._stopped_reading or self.transport.is_closing() or self.transport.get_protocol() is not self:
             return
         if self._in_head and not self._began:
-            # Only whole chunks of a head that goes on are counted, so that what came before it is not.
+            # Only chunks that lie wholly within the head are counted: others may begin with the end of a body.
             self._partial += len(data)
             if self._partial > self._settings.max_url_bytes + self._settings.max_header_bytes:
-                self._refusal = HeadTooLarge("The head of the request has no end.")
+                self._refusal = HeadTooLarge("The head of the request does not end within the limit.")
                 self.send_400_response("")
                 return
         timed = self._in_message or self._is_working() or self.flow.write_paused or self.timeout_keep_alive_task
@@ -143,7 +143,7 @@ class HttpConnection(HttpToolsProtocol):
         self._url_size += len(url)
         if self._url_size > self._settings.max_url_bytes:
             most = self._settings.max_url_bytes
-            self._refuse(UrlTooLong(f"Path and query string have more than {most} bytes."))
+            self._refuse(UrlTooLong(f"The path and the query string have more than {most} bytes."))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
@@ -154,7 +154,7 @@ class HttpConnection(HttpToolsProtocol):
             self._refuse(HeadTooLarge(f"The request has more than {settings.max_headers} headers."))
         if self._fields_size > settings.max_header_bytes:
             self._refuse(HeadTooLarge(f"The headers have more than {settings.max_header_bytes} bytes."))
-        if self._in_head:  # what follows a body is read by nobody
+        if self._in_head:  # the trailers of a body are ignored
             super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
@@ -166,7 +166,7 @@ class HttpConnection(HttpToolsProtocol):
             self._end_timer.cancel()
             self._end_timer = None
         if self._surplus:
-            self._refuse(TooManyConnections("Too many connections are open; come again in a moment."))
+            self._refuse(TooManyConnections("Too many connections are open. Try again in a moment."))
         ahead = len(self.pipeline) + 1 if self._is_working() else 0
         if ahead >= self._settings.max_pipelined or (ahead and self.parser.should_upgrade()):
             self._connections.ended("pipelining")
@@ -183,7 +183,7 @@ class HttpConnection(HttpToolsProtocol):
     def on_message_complete(self) -> None:
         self._in_message = False
         super().on_message_complete()
-        if self._head_timer is not None:  # that of the rest of a refused body, which has come
+        if self._head_timer is not None:  # it timed the rest of a refused body, which is here now
             self._head_timer.cancel()
             self._head_timer = None
             self._await_request()
@@ -199,13 +199,13 @@ class HttpConnection(HttpToolsProtocol):
                 self._await_request()
 
     def _await_request(self) -> None:
-        """All is answered, and the answers are taken: it is the caller's turn."""
+        """Wait for the client: every request is answered, and the client has read the answers."""
         self._connections.wait(self)
         if not self._in_message:
             seconds, idle = self.timeout_keep_alive, self.timeout_keep_alive_handler
             self.timeout_keep_alive_task = self.loop.call_later(seconds, idle)
         elif self._head_timer is None:
-            # The rest of a refused body: it is thrown away, but not for ever.
+            # The rest of a refused body is discarded, but not for ever.
             self._head_timer = self.loop.call_later(self._settings.read_timeout, self._head_too_slow)
 
     def _check_handshake(self) -> None:
@@ -221,9 +221,9 @@ class HttpConnection(HttpToolsProtocol):
         if self._write_timer is not None:
             self._write_timer.cancel()
         protocol: object = self.transport.get_protocol()
-        if isinstance(protocol, StreamConnection):
+        if isinstance(protocol, WebSocketConnection):
             protocol.came_from(self)
-            if self.flow.write_paused:  # by the answer before
+            if self.flow.write_paused:  # because of the answer before
                 self.transport.set_write_buffer_limits()
                 protocol.pause_writing()
 
@@ -242,16 +242,16 @@ class HttpConnection(HttpToolsProtocol):
         elif not self._in_head and not self._is_working():
             self._end("silent")
         else:
-            self._refusal = HeadTooSlow("The head of the request did not come in time.")
+            self._refusal = HeadTooSlow("The head of the request did not arrive in time.")
             self.send_400_response("")
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what cannot be passed on, and close; behind the answers that are still to come."""
-        if self._deaf:
+        """Refuse a request that the application does not see, after the answers that are still due, and close."""
+        if self._stopped_reading:
             return
-        # The parser wraps whatever is raised within its callbacks.
+        # The parser wraps exceptions that its callbacks raise.
         within = getattr(sys.exception(), "__context__", None)
-        fault: Exception = self._refusal or MalformedHead("The bytes that were sent are no request of HTTP/1.1.")
+        fault: Exception = self._refusal or MalformedHead("The bytes that were sent are not an HTTP/1.1 request.")
         if isinstance(within, MemoryError | OSError):
             fault = declared(within)
         problem = problem_of(fault, request_id=secrets.token_hex(16))
@@ -262,13 +262,13 @@ class HttpConnection(HttpToolsProtocol):
         working = self._is_working()
         self._stop_listening()
         if working and self._in_message and not self._in_head and not self.pipeline:
-            # The rest of this very request is broken: whoever waits for it is told that nothing more comes.
+            # The rest of this request is broken: its handler is told that the client is gone.
             self.cycle.disconnected = True
             self.cycle.message_event.set()
             if self.cycle.response_started:
                 self.transport.abort()
                 return
-        elif working:  # its answer comes first, and is the last one
+        elif working:  # that request is answered first; then the connection closes
             return
         body = problem.model_dump_json(exclude_none=True).encode()
         fields: dict[str, str] = dict(getattr(fault, "headers", {}))
@@ -288,8 +288,8 @@ class HttpConnection(HttpToolsProtocol):
         self._end_timer = self.loop.call_later(LINGER_SECONDS, self._close)
 
     def _stop_listening(self) -> None:
-        """Read nothing more; the last of the answers that are still to come ends the connection."""
-        self._deaf = True
+        """Read nothing more; the connection closes after the last answer that is still due."""
+        self._stopped_reading = True
         if self._head_timer is not None:
             self._head_timer.cancel()
             self._head_timer = None
@@ -299,7 +299,7 @@ class HttpConnection(HttpToolsProtocol):
     # What is written
 
     def _watch_rest(self) -> None:
-        """Have ``pause_writing`` called now if anything is still to be taken, and ``resume_writing`` when all is."""
+        """Have ``pause_writing`` called now if anything is unread, and ``resume_writing`` when all is read."""
         if self.transport.get_write_buffer_size():
             self.transport.set_write_buffer_limits(high=0)
 
@@ -314,7 +314,7 @@ class HttpConnection(HttpToolsProtocol):
             self._write_timer.cancel()
             self._write_timer = None
         self.transport.set_write_buffer_limits()
-        if not (self._deaf or self.transport.is_closing() or self._is_working() or self.pipeline):
+        if not (self._stopped_reading or self.transport.is_closing() or self._is_working() or self.pipeline):
             self._await_request()
 
     def _check_progress(self) -> None:
