@@ -1,6 +1,6 @@
 """How well systems recognize one traverse by another: the thesis's protocol, its data sets, its comparison."""
 
-from core.evaluation.protocol.comparison import Box, Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
 from core.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
@@ -18,7 +18,6 @@ from core.evaluation.protocol.results import results_csv
 __all__ = [
     "DEPTHS",
     "STAGES",
-    "Box",
     "Comparison",
     "Evaluation",
     "Outcome",

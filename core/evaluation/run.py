@@ -12,7 +12,6 @@ from core.evaluation.cache import EvaluationCache
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.measurement import best_first, run
 from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
-from core.evaluation.region_overlays import region_finder
 from core.evaluation.scalability import scalability, scale_steps
 from core.evaluation.severity import severity, severity_steps
 from core.evaluation.subjects import Load, Subject, Training
@@ -78,7 +77,7 @@ def compare_systems(
         kept=pair.kept,
         truth=pair.truth,
         runs=ranked,
-        regions=None if seeing is None else region_finder(seeing.encoder, load),
+        regions=None if seeing is None else lambda path: seeing.region_boxes(load(path)),
         regions_of=None if seeing is None else seeing.identity,
         scalability=points if extras.scalability else None,
         severity=curves if extras.severity else None,

@@ -146,7 +146,7 @@ class Subject:
         rows, times = [], []
         for batch in batches:
             began = time.perf_counter()
-            rows.append(index.compare(batch))
+            rows.append(index.score(batch))
             times += [1e3 * (time.perf_counter() - began) / len(batch)] * len(batch)
             for _ in batch:
                 self._advance()

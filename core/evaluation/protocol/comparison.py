@@ -15,10 +15,8 @@ from core.evaluation.protocol.outcomes import Outcome
 from core.frames.traverses import Truth
 
 if TYPE_CHECKING:
+    from core.baselines.encoders import Box
     from core.baselines.system import About
-
-Box = tuple[float, float, float, float]
-"""A region of a picture: left, top, right, bottom, as fractions of its width and height."""
 
 
 @dataclass(frozen=True)

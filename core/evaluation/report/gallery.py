@@ -13,8 +13,9 @@ from core.evaluation.report.pictures import Pictures, show
 from core.evaluation.report.text import escape, number
 
 if TYPE_CHECKING:
+    from core.baselines.encoders import Box
     from core.evaluation import Outcome
-    from core.evaluation.protocol.comparison import Box, Comparison, Run
+    from core.evaluation.protocol.comparison import Comparison, Run
 
 Regions = Callable[[Path], "Sequence[Box] | None"]
 

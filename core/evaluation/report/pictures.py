@@ -14,7 +14,7 @@ from core.frames.containers import read_header
 from core.frames.images import decode, encode_thumbnail
 
 if TYPE_CHECKING:
-    from core.evaluation.protocol.comparison import Box
+    from core.baselines.encoders import Box
 
 LONGEST = 256
 """Pixels of a small copy's longer side."""

@@ -44,7 +44,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
         MissingWeights, UnknownEncoder, InvalidModel: one cannot be made.
         typer.BadParameter: a file is given for a system that was not asked for.
     """
-    from core.baselines.catalogue import build, systems
+    from core.baselines.registry import build, systems
 
     asked = list(names)
     if every:
@@ -67,7 +67,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
 
 def show_list(models: EncoderCatalogue) -> None:
     """Write name, paper, configuration and weights of all systems, then the data sets."""
-    from core.baselines.catalogue import systems
+    from core.baselines.registry import systems
     from core.evaluation.data.datasets import DATASETS
 
     shown = table("name", "system and paper", "configuration", "weights", title="Systems, for --encoder")

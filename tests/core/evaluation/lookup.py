@@ -92,6 +92,6 @@ class _Together:
         self.known = known
         self.calls: list[int] = []
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+    def score(self, queries: Sequence[Description]) -> NDArray[np.float32]:
         products = np.stack([query.arrays["descriptor"] for query in queries]) @ self.known.T
         return np.asarray(products - products.mean(axis=0), np.float32)

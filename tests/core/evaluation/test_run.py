@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.baselines.catalogue import build
+from core.baselines.registry import build
 from core.evaluation.cache import EvaluationCache
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.run import Extras, compare_systems

@@ -65,9 +65,9 @@ class Counted:
     inner: Index
     sizes: list[int]
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+    def score(self, queries: Sequence[Description]) -> NDArray[np.float32]:
         self.sizes.append(len(queries))
-        return self.inner.compare(queries)
+        return self.inner.score(queries)
 
 
 def test_one_query_is_asked_at_a_time(pair: TraversePair) -> None:

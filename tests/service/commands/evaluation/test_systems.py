@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from core.baselines.catalogue import systems
+from core.baselines.registry import systems
 from core.evaluation.data.datasets import DATASETS
 from core.method.catalogue import EncoderCatalogue
 from service.commands.evaluation.systems import build_systems, parse_weights
