@@ -17,9 +17,9 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from core.evaluation import auc_pr
 from core.frames.images import decode
 from core.frames.traverses import find_images, read_ground_truth
+from core.judgement.curves import auc_pr
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local

@@ -5,11 +5,9 @@ from core.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
     Evaluation,
-    auc_pr,
-    auc_roc,
     extended_precision,
-    recall_at,
     recall_at_full_precision,
+    recall_at_k,
     summarize,
 )
 from core.evaluation.protocol.outcomes import Outcome, judge, judge_ranking
@@ -24,13 +22,11 @@ __all__ = [
     "Run",
     "ScalePoint",
     "SeverityCurve",
-    "auc_pr",
-    "auc_roc",
     "extended_precision",
     "judge",
     "judge_ranking",
-    "recall_at",
     "recall_at_full_precision",
+    "recall_at_k",
     "results_csv",
     "summarize",
 ]

@@ -27,7 +27,7 @@ from core.networks.identity import canonical_json, json_digest
 
 FORMAT = "placerec-evaluation/1"
 VALUES = "values"
-LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "torch")
+LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scipy", "torch")
 
 # What shows, keeps or transports figures but cannot change one.
 NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/data/datasets.py", "models", "storage")

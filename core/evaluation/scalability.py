@@ -9,9 +9,10 @@ import numpy as np
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.protocol.comparison import ScalePoint
-from core.evaluation.protocol.figures import auc_pr, recall_at
-from core.evaluation.protocol.outcomes import judge
+from core.evaluation.protocol.figures import recall_at_k
+from core.evaluation.protocol.outcomes import best_matched, best_scores, judge
 from core.evaluation.subjects import Subject
+from core.judgement.curves import auc_pr
 
 POINTS = 6
 FEWEST = 8
@@ -64,7 +65,7 @@ def _point(subject: Subject, size: int) -> ScalePoint:
         system=subject.about.name,
         references=size,
         queries=len(asked),
-        auc_pr=auc_pr([outcome.score for outcome in outcomes], [outcome.matched for outcome in outcomes]),
-        recall_at_1=recall_at(outcomes, 1),
+        auc_pr=auc_pr(best_scores(outcomes), best_matched(outcomes)),
+        recall_at_1=recall_at_k(outcomes, 1),
         milliseconds=float(np.median(compared.milliseconds)),
     )

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
+from core.judgement.curves import auc_pr, auc_roc, falling
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import Flags, Trials, Values, area_under_roc
+from core.judgement.trials import Flags, Trials, Values
 from core.judgement.verdict import Calibration
 
 FEWEST_OUTCOMES = 10
@@ -118,9 +119,9 @@ def recalibrate(trials: Trials, base: Calibration, target: Target, source: str) 
         known=int(known.sum()),
         unknown=int((~known).sum()),
         right=int(right.sum()),
-        auc_pr=area_under_pr(trials.decision, right),
-        auc_roc=area_under_roc(trials.decision, known),
-        auc_roc_right=area_under_roc(trials.decision, right) or 0.0,
+        auc_pr=auc_pr(trials.decision, right),
+        auc_roc=auc_roc(trials.decision, known),
+        auc_roc_right=auc_roc(trials.decision, right) or 0.0,
         cross_validated=cross_validated(trials, base, target),
         points=_thinned(points),
     )
@@ -161,8 +162,7 @@ def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> He
 
 def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
     """What every threshold that makes a difference does, by rising threshold; all [n]."""
-    order = np.argsort(decision, kind="stable")[::-1]
-    ends = np.flatnonzero(np.append(np.diff(decision[order]) != 0, True))  # what is equal passes together
+    order, ends = falling(decision)
     passed, rights = ends + 1, np.cumsum(right[order])[ends]
     strangers, unknown = np.cumsum(~known[order])[ends], int((~known).sum())
     return [
@@ -174,19 +174,6 @@ def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
         )
         for i, end in enumerate(ends)
     ][::-1]
-
-
-def area_under_pr(decision: Values, right: Flags) -> float:
-    """Under the precision-recall curve by the trapezoid rule, recall over right matches only; 0 without one.
-
-    From recall 0, where precision counts as 1, as everywhere in the evaluation.
-    """
-    if not right.any():
-        return 0.0
-    points = curve_points(decision, right, right)[::-1]
-    recalls = np.array([0.0] + [point.recall for point in points])
-    precisions = np.array([1.0] + [point.precision for point in points])
-    return float(np.trapezoid(precisions, recalls))
 
 
 def _check(trials: Trials, target: Target) -> None:
@@ -201,7 +188,7 @@ def _check(trials: Trials, target: Target) -> None:
         raise CalibrationImpossible(
             f"This rule rests on at least {FEWEST_OUTCOMES} frames of places that the map lacks; here are {strangers}."
         )
-    area = area_under_roc(trials.decision, trials.right) or 0.0
+    area = auc_roc(trials.decision, trials.right) or 0.0
     if area < LEAST_AREA:
         raise CalibrationImpossible(
             f"On this map right answers can hardly be told from wrong ones: the area under the ROC is {area:.2f}, "

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidResults
-from core.evaluation.protocol.figures import ALL_RIGHT, DEPTHS, NONE_RIGHT, STAGES, Evaluation, auc_pr, one_class
+from core.evaluation.protocol.figures import ALL_RIGHT, DEPTHS, NONE_RIGHT, STAGES, Evaluation, one_class
 from core.evaluation.protocol.outcomes import Outcome
+from core.judgement.curves import auc_pr
 
 COLUMNS = ("query", "retrieved", "score", "matched")
 MATCHED = {"0": False, "0.0": False, "1": True, "1.0": True}

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from core.baselines.hog import ABOUT, BINS, BLOCK, STRIDE, WINDOW, Hog
-from core.evaluation import auc_pr, judge_ranking
+from core.evaluation.protocol.outcomes import best_matched, best_scores, judge
 from core.frames.images import decode
 from core.frames.traverses import find_images, read_ground_truth
+from core.judgement.curves import auc_pr
 
 CORRIDOR = Path(__file__).parents[4] / "shared/datasets/eval/corridor"
 PUBLISHED_AUC_PR = 0.697  # VPR-Bench's stored similarities, judged as here
@@ -51,6 +52,6 @@ def test_corridor_comes_out_as_published() -> None:
     )
     truth = read_ground_truth(CORRIDOR / "ground_truth.csv", len(queries), len(references))
     scores = system.index(references).score(queries)
-    outcomes = [judge_ranking(row, np.arange(len(references)), true) for row, true in zip(scores, truth, strict=True)]
-    figure = auc_pr([outcome.score for outcome in outcomes], [outcome.matched for outcome in outcomes])
+    outcomes = judge(scores, np.arange(len(references)), truth)
+    figure = auc_pr(best_scores(outcomes), best_matched(outcomes))
     assert abs(figure - PUBLISHED_AUC_PR) < 0.05

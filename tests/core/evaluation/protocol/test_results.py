@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from sklearn.metrics import auc, precision_recall_curve
 
 from core.errors import InvalidResults
-from core.evaluation.protocol.figures import auc_pr
 from core.evaluation.protocol.outcomes import Outcome
 from core.evaluation.protocol.results import NOT_IN_FILE, read_results, results_csv, summarize_results
+from core.judgement.curves import auc_pr
 
 SCORES = st.one_of(
     st.integers(-3, 3).map(lambda n: n / 4),  # few different values, so that ties are common
