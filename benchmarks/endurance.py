@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from benchmarks.fleet import Fleet, Picture, Plan, Seen
 from benchmarks.process import service
 from benchmarks.report import report, verdict
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 
 MAP = "endurance"
 SAMPLE_SECONDS = 5.0
@@ -91,7 +91,7 @@ def size_of(path: Path) -> int:
 
 def draw(number: int) -> Picture:
     """A picture, and the same a little darker and as another file."""
-    drawn = sample_picture(number)
+    drawn = sample_frame(number)
     darker: NDArray[np.uint8] = cv2.convertScaleAbs(drawn, alpha=0.85)  # type: ignore[assignment]
     return Picture(jpeg(drawn, 85), jpeg(darker, 75))
 

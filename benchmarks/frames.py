@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.frames.traverses import find_images
 
@@ -24,7 +24,7 @@ def camera_frames(count: int, traverse: str = "query") -> tuple[list[bytes], str
     folder = REAL / traverse
     if not folder.is_dir():
         first = 0 if traverse == "query" else 10_000
-        return [jpeg(sample_picture(first + index, WIDTH, HEIGHT)) for index in range(count)], "drawn pictures"
+        return [jpeg(sample_frame(first + index, WIDTH, HEIGHT)) for index in range(count)], "drawn pictures"
     paths = find_images(folder)
     made = []
     for index in range(count):

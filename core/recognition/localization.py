@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.examination import examine as examined
+from core.judgement.examination import examine
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import Values, log_odds_per_score, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration, Judgement, Neighborhood, Whereabouts, completed, judge
-from core.method.agreement import Cells, reranked
+from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import Place
 from core.recognition.selection import EVERYTHING, Choice, Selection
@@ -191,7 +191,7 @@ def second_stage(
 
     for length in (len(rows) if by_all else HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])
-        found = examined(ordered[:length], places, neighborhood, encoder.candidates, gains)
+        found = examine(ordered[:length], places, neighborhood, encoder.candidates, gains)
         order = found.order
         scored = Scored(
             rows[order],
@@ -212,22 +212,6 @@ def _is_enough(scored: Scored, neighborhood: Neighborhood, has_second_stage: boo
     """Whether as many other places than the best are among them as a verdict looks at."""
     others = ~scored.whereabouts.near(0, neighborhood)
     return int((others & scored.examined if has_second_stage else others).sum()) >= TOP_PLACES
-
-
-def examine(encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking) -> Ranking:
-    """The second stage alone: the first ``encoder.candidates`` of a ranking gain by how far they agree with the query.
-
-    Args:
-        local: of the query, int8 [C, L].
-        ranking: of the snapshot's search, rows int64 [n] and inner products float32 [n].
-
-    Returns:
-        The rows, best first, and their scores, float32 [n].
-    """
-    rows, inner_products = ranking
-    scores = encoder.scores_from_inner_products(inner_products)
-    order, raised = reranked(scores, encoder.agreement(local, snapshot.locals_in_place(rows[: encoder.candidates])))
-    return rows[order], raised
 
 
 def _judged(map_: Map, encoder: Encoder, encoding: Encoding, scored: Scored, k: int, settle: bool) -> Located | None:

@@ -58,24 +58,18 @@ def _measure_here(
     # Imported here because they take a second.
     import torch
 
-    from core.evaluation.timing import (
-        better_forward,
-        encode_batch,
-        encoding_runs,
-        jpeg,
-        medians,
-        sample_picture,
-        search_run,
-    )
+    from core.evaluation.samples import jpeg, sample_frame
+    from core.evaluation.timing import better_forward, encode_batch, encoding_runs, medians, search_run
     from core.threads import share_cores
 
     share_cores(threads or torch.get_num_threads())
     chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
-    data = jpeg(sample_picture()) if image is None else read_bytes(image)
+    data = jpeg(sample_frame()) if image is None else read_bytes(image)
     with progress() as bar:
         bar.add_task("Measuring", total=None)
         batch = {"batch": lambda: encode_batch(chosen, [data] * PICTURES)}
-        times = medians({**encoding_runs(chosen, data), **batch, "search": search_run(chosen, places)}, rounds)
+        with search_run(chosen, places) as search:
+            times = medians({**encoding_runs(chosen, data), **batch, "search": search}, rounds)
         times["batch"] /= PICTURES
     forward = better_forward(times)
     shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {torch.get_num_threads()} threads")
@@ -98,12 +92,12 @@ def _measure_service(
 ) -> dict[str, Any]:
     import subprocess
 
-    from core.evaluation.timing import jpeg, sample_picture
+    from core.evaluation.samples import jpeg, sample_frame
     from service.commands.load import measure
 
     path = "/v1/encode" if map_id is None else path_of("maps", map_id, "query")
     version = ask(Target(url, None), "GET", "/version").json()
-    frames = [read_bytes(image)] if image else [jpeg(sample_picture(index)) for index in range(PICTURES)]
+    frames = [read_bytes(image)] if image else [jpeg(sample_frame(index)) for index in range(PICTURES)]
     seen: dict[str, Any] = {}
     shown = table("robots", "#answers/s", "#p50 ms", "#p95 ms", "#p99 ms", "#refused", title=f"{url}{path}")
     with tempfile.TemporaryDirectory() as text, progress() as bar:

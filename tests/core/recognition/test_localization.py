@@ -10,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.judgement.verdict import NO_POSE, TOP_PLACES
+from core.judgement.verdict import TOP_PLACES
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.localization import ATTEMPTS, examine, locate
+from core.recognition.localization import ATTEMPTS, locate
 from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
-from core.storage.search.snapshot import Spot
 from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import scene, seen_again
 
@@ -127,27 +126,6 @@ def test_what_agrees_cell_by_cell_comes_first_if_it_is_examined(
     (itself,) = encoder.agreement(query.local, query.local[np.newaxis])
     assert matches[0][0] == pytest.approx(order[EXAMINED - 1][1] + itself, abs=1e-5)
     assert itself > 0.5 * SECOND_STAGE.share
-
-
-def test_the_ranking_stays_in_order(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
-    snapshot = lab.snapshot()
-    for encoding in seen:
-        ranking = snapshot.search(encoding.descriptor)
-        rows, scores = examine(encoder, snapshot, encoding.local, ranking)
-        assert np.all(np.diff(scores) <= 0)
-        assert rows[CANDIDATES:].tolist() == ranking[0][CANDIDATES:].tolist()
-        assert sorted(rows.tolist()) == list(range(PLACES))
-
-
-def test_without_a_second_stage_a_ranking_is_what_the_search_gave() -> None:
-    encoder = EncoderCatalogue().get("region-vlad")
-    encodings = [encoder.encode(scene(seed)) for seed in range(5)]
-    spots = [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, ordinal) for ordinal in range(5)]
-    snapshot = Snapshot(encoder.dimension, 3).appended([encoding.descriptor for encoding in encodings], spots)
-    rows, products = snapshot.search(encodings[2].descriptor)
-    found, scores = examine(encoder, snapshot, encodings[2].local, (rows, products))
-    assert found.tolist() == rows.tolist()
-    np.testing.assert_array_equal(scores, encoder.scores_from_inner_products(products))
 
 
 class Late:
