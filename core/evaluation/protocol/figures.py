@@ -57,7 +57,7 @@ class Evaluation(BaseModel):
     bytes_per_place: int | None = None
     milliseconds: dict[str, float | None] = Field(description="Medians per query.")
     describe_milliseconds: float | None = Field(
-        default=None, description="Median per query, all stages before matching, without decoding the picture."
+        default=None, description="Median per query, all stages before matching, without decoding the image."
     )
     trained_on: str | None = None
     ece: float | None = Field(default=None, description="Expected calibration error of the probabilities in `trust`.")
