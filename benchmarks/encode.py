@@ -57,7 +57,7 @@ def stage_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], object]]
 
 def main(
     encoder: str = DEFAULT_ENCODER,
-    image: Annotated[Path | None, typer.Option(help="Default: a picture made here.")] = None,
+    image: Annotated[Path | None, typer.Option(help="Default: a sample frame.")] = None,
     rounds: Annotated[int, typer.Option(min=3)] = 60,
     threads: Annotated[int, typer.Option(min=0, help="0: every core.")] = 0,
 ) -> None:

@@ -31,18 +31,35 @@ class Process:
     pid: int
     ready: float
 
+    def memory(self) -> float:
+        """Resident memory, in MB (10^6 bytes)."""
+        return memory(self.pid)
+
     def peak_memory(self) -> float:
         """The most memory that it has had resident, in MB (10^6 bytes)."""
         return peak_memory(self.pid)
 
+    def open_files(self) -> int:
+        """How many file descriptors it has open."""
+        return len(list(Path(f"/proc/{self.pid}/fd").iterdir()))
+
+
+def memory(pid: int) -> float:
+    """Resident memory of a process, in MB (10^6 bytes); 0 if it has ended."""
+    return _status(pid, "VmRSS")
+
 
 def peak_memory(pid: int) -> float:
     """The most memory that a process has had resident, in MB (10^6 bytes); 0 if it has ended."""
+    return _status(pid, "VmHWM")
+
+
+def _status(pid: int, name: str) -> float:
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:
         return 0.0
-    kilobytes = next((line.split()[1] for line in lines if line.startswith("VmHWM:")), "0")
+    kilobytes = next((line.split()[1] for line in lines if line.startswith(f"{name}:")), "0")
     return int(kilobytes) * 1024 / 1e6
 
 

@@ -25,14 +25,14 @@ SENDERS = 4
 
 
 def frame(index: int) -> bytes:
-    """A picture for each place: one of 50 scenes, mirrored, cropped and lit in its own way."""
-    picture = sample_frame(index % 50)
+    """The JPEG file of a place: one of 50 sample frames, mirrored, cropped and lit in its own way."""
+    drawn = sample_frame(index % 50)
     random = np.random.default_rng(index)
     top, left = random.integers(0, 100, 2)
-    picture = picture[top : top + 360, left : left + 480]
+    drawn = drawn[top : top + 360, left : left + 480]
     if random.random() < 0.5:
-        picture = picture[:, ::-1]
-    return jpeg(np.asarray(cv2.convertScaleAbs(picture, alpha=float(random.uniform(0.7, 1.2))), np.uint8))
+        drawn = drawn[:, ::-1]
+    return jpeg(np.asarray(cv2.convertScaleAbs(drawn, alpha=float(random.uniform(0.7, 1.2))), np.uint8))
 
 
 def enrol(process: Process, places: int) -> float:

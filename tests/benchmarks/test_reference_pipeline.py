@@ -30,7 +30,7 @@ def test_both_pipelines_give_one_vector(step: float) -> None:
 
 def test_at_the_packaged_step_it_is_the_encoders_own_vector() -> None:
     encoder = EncoderCatalogue().get(THESIS)
-    picture = sample_frame(4)
-    data = jpeg(picture)
+    frame = sample_frame(4)
+    data = jpeg(frame)
     vector = ours(encoder, data, encoder.definition.steps[0], Words(encoder.centers))
     np.testing.assert_allclose(vector, encoder.encode(decode(data)).descriptor, atol=1e-5)
