@@ -23,8 +23,9 @@ import torch
 import typer
 
 from benchmarks.frames import camera_frames
-from benchmarks.process import fill_map, median, service
+from benchmarks.process import median, service
 from benchmarks.report import report, verdict
+from core.evaluation.samples import fill_map
 from core.evaluation.timing import encode_batch
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue

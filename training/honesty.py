@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible
 from core.judgement.calibration import Held, Target, fit_map_calibration, held_figures
-from core.judgement.trials import Trial, Trials, area_under_roc, gathered
+from core.judgement.curves import auc_roc
+from core.judgement.trials import Trial, Trials, gathered
 from core.judgement.verdict import judge
 from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -96,8 +97,8 @@ def main(
         shown = describe(loaded, task.queries), describe(loaded, task.references)
         for name, trials in zip(truths, half_trials(loaded, *shown, list(truths.values())), strict=True):
             made: dict[str, Any] = {
-                "auc_roc": area_under_roc(trials.decision, trials.known),
-                "auc_roc_right": area_under_roc(trials.decision, trials.right),
+                "auc_roc": auc_roc(trials.decision, trials.known),
+                "auc_roc_right": auc_roc(trials.decision, trials.right),
             }
             calibration = loaded.calibration
             made["default"] = figures(

@@ -18,8 +18,8 @@ from rich.progress import track
 from safetensors.torch import load_file
 from torch import Tensor
 
-from core.evaluation import auc_roc
 from core.frames.preprocessing import Pixels
+from core.judgement.curves import auc_roc
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
 from core.method.catalogue import NETWORK_SUFFIX, PACKAGED, save_encoder

@@ -22,9 +22,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
 from core.frames.preprocessing import Pixels
+from core.judgement.curves import auc_pr, auc_roc, falling
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import Flags, Trial, Trials, Values, area_under_roc, gathered, joined
+from core.judgement.trials import Flags, Trial, Trials, Values, gathered, joined
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.places import Neighborhood, Whereabouts
 
@@ -226,9 +227,9 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
         known=int(known.sum()),
         unknown=int((~known).sum()),
         right=int(right.sum()),
-        auc_pr=area_under_pr(trials.decision, right),
-        auc_roc=area_under_roc(trials.decision, known),
-        auc_roc_right=area_under_roc(trials.decision, right) or 0.0,
+        auc_pr=auc_pr(trials.decision, right),
+        auc_roc=auc_roc(trials.decision, known),
+        auc_roc_right=auc_roc(trials.decision, right) or 0.0,
         cross_validated=cross_validated(trials, base, target),
         points=_thinned(points),
     )
@@ -274,8 +275,7 @@ def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
         decision: float64 [n].
         known, right: bool [n].
     """
-    order = np.argsort(decision, kind="stable")[::-1]
-    ends = np.flatnonzero(np.append(np.diff(decision[order]) != 0, True))  # equal values pass together
+    order, ends = falling(decision)
     passed, rights = ends + 1, np.cumsum(right[order])[ends]
     strangers, unknown = np.cumsum(~known[order])[ends], int((~known).sum())
     return [
@@ -287,23 +287,6 @@ def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
         )
         for i, end in enumerate(ends)
     ][::-1]
-
-
-def area_under_pr(decision: Values, right: Flags) -> float:
-    """Area under the precision-recall curve by the trapezoid rule, recall over right matches only; 0 without any.
-
-    The curve begins at recall 0 with precision 1, as in the evaluation.
-
-    Args:
-        decision: float64 [n].
-        right: bool [n].
-    """
-    if not right.any():
-        return 0.0
-    points = curve_points(decision, right, right)[::-1]
-    recalls = np.array([0.0] + [point.recall for point in points])
-    precisions = np.array([1.0] + [point.precision for point in points])
-    return float(np.trapezoid(precisions, recalls))
 
 
 def _check(trials: Trials, target: Target) -> None:
@@ -318,7 +301,7 @@ def _check(trials: Trials, target: Target) -> None:
         raise CalibrationImpossible(
             f"This rule rests on at least {FEWEST_OUTCOMES} frames of places that the map lacks; here are {strangers}."
         )
-    area = area_under_roc(trials.decision, trials.right) or 0.0
+    area = auc_roc(trials.decision, trials.right) or 0.0
     if area < LEAST_AREA:
         raise CalibrationImpossible(
             f"On this map right answers can hardly be told from wrong ones: the area under the ROC is {area:.2f}, "

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.evaluation import auc_pr
 from core.frames.images import decode
 from core.frames.traverses import find_images
+from core.judgement.curves import auc_pr
 from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding

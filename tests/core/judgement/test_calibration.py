@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sklearn.metrics import auc, precision_recall_curve, roc_auc_score
 
 from core.errors import CalibrationImpossible
 from core.judgement.calibration import (
     BLOCKS,
     MOST_POINTS,
     Target,
-    area_under_pr,
     blocks_of,
     cross_validated,
     curve_points,
@@ -21,7 +19,7 @@ from core.judgement.calibration import (
     second_look,
 )
 from core.judgement.probability import Curve
-from core.judgement.trials import Trials, area_under_roc, joined
+from core.judgement.trials import Trials, joined
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.places import Neighborhood, Whereabouts
 
@@ -142,15 +140,6 @@ def tied(n: int = 400, seed: int = 5) -> tuple[NDArray[np.float64], NDArray[np.b
     generator = np.random.default_rng(seed)
     decision = np.round(generator.random(n), 2)
     return decision, generator.random(n) < decision
-
-
-def test_areas_are_those_of_scikit_learn_ties_and_all() -> None:
-    decision, right = tied()
-    assert area_under_roc(decision, right) == pytest.approx(roc_auc_score(right, decision))
-    precision, recall, _ = precision_recall_curve(right, decision)
-    assert area_under_pr(decision, right) == pytest.approx(auc(recall, precision))
-    assert area_under_roc(decision, np.ones(400, np.bool_)) is None
-    assert area_under_pr(decision, np.zeros(400, np.bool_)) == 0
 
 
 def test_the_points_say_what_each_threshold_does() -> None:

@@ -1,4 +1,4 @@
-"""The catalogue: what is listed can be built, and what is missing is said."""
+"""The registry: what is listed can be built, and missing weights are named."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.baselines.catalogue import ENTRIES, build, systems
-from core.baselines.encoders import PAPERS, TITLES, EncoderSystem, constants
+from core.baselines.encoders import EncoderSystem
+from core.baselines.registry import BASELINES, build, systems
 from core.baselines.system import Trainable
 from core.errors import InvalidModel, MissingWeights, UnknownEncoder
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.method.presets import NETWORK, PRESETS
+from core.method.presets import NETWORK
 
 THESIS = {
     "region-vlad",
@@ -43,10 +43,10 @@ THESIS = {
     "attentive-attention",
     "context-flexible-attention",
 }
-"""Every system that the thesis compares with (issue: runnable by name)."""
+"""Every system that the thesis compares with."""
 
-FREE = [entry.about.name for entry in ENTRIES if entry.about.weights is None]
-WEIGHTED = [entry.about.name for entry in ENTRIES if entry.about.weights is not None]
+FREE = [baseline.about.name for baseline in BASELINES if baseline.about.weights is None]
+WEIGHTED = [baseline.about.name for baseline in BASELINES if baseline.about.weights is not None]
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +85,13 @@ def test_a_map_of_one_place_and_a_blank_query_have_scores(name: str, models: Enc
     blank = np.full((48, 64, 3), 5, np.uint8)
     queries = [system.describe(frames[0]), system.describe(blank)]
     for place in (frames[0], blank):
-        scores = system.index([system.describe(place)]).compare(queries)
+        scores = system.index([system.describe(place)]).score(queries)
         assert scores.shape == (2, 1) and scores.dtype == np.float32 and np.isfinite(scores).all()
     assert all(array.nbytes for query in queries for array in query.arrays.values())
+
+
+def test_each_weights_sentence_ends_as_one() -> None:
+    assert all(about.weights.endswith(".") for about in (one.about for one in BASELINES) if about.weights is not None)
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
@@ -128,30 +132,9 @@ def test_what_uses_no_network_takes_no_weights(name: str, models: EncoderCatalog
 
 def test_listing_leaves_the_slow_libraries_alone() -> None:
     script = (
-        "import sys; from core.method.catalogue import EncoderCatalogue; from core.baselines.catalogue import systems; "
+        "import sys; from core.method.catalogue import EncoderCatalogue; from core.baselines.registry import systems; "
         "systems(EncoderCatalogue()); "
         "print(*{'sklearn', 'matplotlib', 'scipy.sparse', 'scipy.ndimage', 'scipy.io'} & set(sys.modules))"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
     assert shown.stdout.split() == []
-
-
-def test_an_encoder_system_gives_the_encoders_own_scores(models: EncoderCatalogue) -> None:
-    system, encoder = build(DEFAULT_ENCODER, models=models), models.get(DEFAULT_ENCODER)
-    generator = np.random.default_rng(4)
-    frames = [np.kron(generator.integers(0, 255, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8) for _ in range(3)]
-    described = [system.describe(frame) for frame in frames]
-    assert described[0].arrays["descriptor"].shape == (encoder.dimension,)
-    assert set(described[0].milliseconds) == {"forward", "regions", "vlad"}
-    encodings = [encoder.encode(frame) for frame in frames]
-    expected = [[encoder.score(a, b) for b in encodings] for a in encodings]
-    np.testing.assert_allclose(system.index(described).compare(described), expected, atol=1e-6)
-
-
-def test_each_packaged_encoder_has_a_title_and_a_paper() -> None:
-    assert set(PAPERS) == set(TITLES) == set(PRESETS)
-
-
-def test_constants_of_parts_are_named_after_their_part() -> None:
-    fields = {"words": 128, "projection": None, "stage": {"layers": ("conv2",), "inner": {"q": 0.5}}}
-    assert constants(fields) == {"words": 128, "stage.layers": ("conv2",), "stage.inner.q": 0.5}

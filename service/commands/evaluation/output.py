@@ -1,4 +1,4 @@
-"""``placerec evaluate``: its tables, its JSON, its remarks."""
+"""``placerec evaluate``: its tables, JSON and CSV files, and remarks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rich.markup import escape
 from core.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
 from core.evaluation.protocol.results import results_csv
 from service.commands.console import number, remark, show, table, write_file
-from service.commands.models import name_of
+from service.commands.model import name_of
 
 RULES = {"mean_of_negatives": "mean of true negatives", "full_precision": "best wrong match"}
 
 
 def show_figures(figures: Sequence[Evaluation], title: str) -> None:
-    """A row of accuracy for each encoder; what has one class of matches only gets a word for its AUC-PR."""
+    """A row of accuracy for each encoder; matches of one class only get a word in place of AUC-PR."""
     columns = ("#AUC-PR", "#AUC-ROC", *(f"#recall@{depth}" for depth in DEPTHS), "#recall at full precision")
     shown = table("encoder", *columns, "#extended precision", "#right", title=title)
     for row in figures:
@@ -52,7 +52,7 @@ def show_costs(figures: Sequence[Evaluation]) -> None:
 
 
 def show_thresholds(figures: Sequence[Evaluation]) -> None:
-    """What thresholds do to right and wrong answers, before and after; nothing without a true negative."""
+    """A table of what thresholds do to right and wrong answers; nothing without a true negative."""
     counts = ("true_positives", "false_positives", "false_negatives", "true_negatives")
     heads = ("TP", "FP", "FN", "TN")
     shown = table("encoder", "threshold", "#at", *(f"#{head}" for head in heads), title="Thresholds, before → after")
@@ -66,7 +66,7 @@ def show_thresholds(figures: Sequence[Evaluation]) -> None:
 
 
 def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Sequence[str]) -> None:
-    """Why some figures are missing, what is special of the data, and whose figures are of an earlier run."""
+    """Remarks: why figures are missing, what is special about the data, and which figures are cached."""
     for note in notes:
         remark(note)
     reasons = dict.fromkeys((name, reason) for row in figures for name, reason in row.notes.items())
@@ -102,7 +102,7 @@ def show_trends(comparison: Comparison) -> None:
 
 
 def run_json(run: Run) -> dict[str, Any]:
-    """The figures of a run, and what it was."""
+    """The figures of a run and its system."""
     about = {"title": run.about.title, "paper": run.about.paper, "configuration": dict(run.about.configuration)}
     return {**run.evaluation.model_dump(), **about, "cached": run.cached}
 
@@ -111,7 +111,7 @@ def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, An
     """The first run's figures on the top level, those of all in ``encoders``, and what else was measured.
 
     Args:
-        runs: in the order that they were asked for.
+        runs: in the order of the command line.
     """
     every = [run_json(run) for run in runs]
     trends: dict[str, Any] = {}

@@ -20,17 +20,17 @@ from core.threads import keep_numpy_single_threaded
 
 Load = Callable[[Path], Pixels]
 Change = Callable[[Pixels, int], Pixels]
-"""What is done to a picture before it is described, given its place in the traverse."""
+"""Changes a frame before it is described, given its number in the traverse."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """What systems that learn are trained on.
+    """The images that systems learn from.
 
-    source: in words.
+    source: where they come from, in words.
     """
 
-    pictures: list[Path]
+    images: list[Path]
     source: str
     seed: int = 0
 
@@ -44,7 +44,7 @@ class Described:
 
 
 @dataclass(frozen=True)
-class Compared:
+class Scored:
     """Scores of queries against references, float32 [Q, R'], and what each query took, milliseconds [Q]."""
 
     scores: NDArray[np.float32]
@@ -54,11 +54,11 @@ class Compared:
 class Subject:
     """One system on one pair of traverses.
 
-    Nothing is computed before it is asked for; training comes first where a system learns.
+    Nothing is computed before it is needed; training comes first where a system learns.
 
     Args:
-        load: decodes a picture; what it raises ends the run.
-        advance: called after each picture that is learned from, described, or compared.
+        load: decodes an image; what it raises ends the run.
+        advance: called after each image that is learned from or described, and after each query that is scored.
     """
 
     def __init__(
@@ -91,18 +91,18 @@ class Subject:
 
     @property
     def steps(self) -> int:
-        """How often ``advance`` is called in a measurement: pictures learned, described, compared."""
-        learned = len(self.training.pictures) if self._learns else 0
+        """How often ``advance`` is called in a measurement: images learned from or described, and queries scored."""
+        learned = len(self.training.images) if self._learns else 0
         return learned + len(self.pair.kept) + 2 * len(self.pair.queries)
 
     def key(self, kind: str, **parts: object) -> str:
-        """What a measurement of this subject is kept under.
+        """The cache key of a measurement of this subject.
 
         Args:
             kind: of measurement.
             parts: JSON, what else it depends on.
         """
-        training = [files_digest(self.training.pictures), self.training.seed] if self._learns else None
+        training = [files_digest(self.training.images), self.training.seed] if self._learns else None
         return cache_key(
             kind=kind,
             system=self._untrained_identity,
@@ -123,7 +123,7 @@ class Subject:
         return self.describe(self.pair.queries)
 
     def describe(self, paths: Sequence[Path], change: Change | None = None) -> Described:
-        """Describe pictures one after another; decoding them is not timed."""
+        """Describe images one after another; decoding them is not timed."""
         self._train()
         descriptions, times = [], []
         for number, path in enumerate(paths):
@@ -136,33 +136,33 @@ class Subject:
             self._advance()
         return Described(descriptions, times)
 
-    def compare(self, index: Index, queries: Sequence[Description]) -> Compared:
+    def score(self, index: Index, queries: Sequence[Description]) -> Scored:
         """Scores of the queries, each asked by itself and timed unless the system needs them all together.
 
         Raises:
-            InvalidModel: the system gives something else than finite scores.
+            InvalidModel: the system gives scores that are not finite, or of another shape.
         """
         batches = [queries] if self.system.sequential else [[query] for query in queries]
         rows, times = [], []
         for batch in batches:
             began = time.perf_counter()
-            rows.append(index.compare(batch))
+            rows.append(index.score(batch))
             times += [1e3 * (time.perf_counter() - began) / len(batch)] * len(batch)
             for _ in batch:
                 self._advance()
         scores = np.concatenate(rows).astype(np.float32, copy=False)
         if scores.ndim != 2 or len(scores) != len(queries) or not np.isfinite(scores).all():
             raise InvalidModel(f"{self.system.about.name} gave scores of the shape {scores.shape}, or not finite ones.")
-        return Compared(scores, times)
+        return Scored(scores, times)
 
     def _train(self) -> None:
         if self._trained:
             return
         assert isinstance(self.system, Trainable)
-        self.system.train(self._training_pictures(), self.training.seed)
+        self.system.train(self._training_frames(), self.training.seed)
         self._trained = True
 
-    def _training_pictures(self) -> Iterator[Pixels]:
-        for path in self.training.pictures:
+    def _training_frames(self) -> Iterator[Pixels]:
+        for path in self.training.images:
             yield self._load(path)
             self._advance()

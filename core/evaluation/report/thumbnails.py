@@ -1,4 +1,4 @@
-"""Small copies of the data set's pictures, each stored once in the page however often it is shown."""
+"""Small copies of the data set's images, each stored once in the page however often it is shown."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from core.frames.containers import read_header
 from core.frames.images import decode, encode_thumbnail
 
 if TYPE_CHECKING:
-    from core.evaluation.protocol.comparison import Box
+    from core.baselines.encoders import Box
 
 LONGEST = 256
 """Pixels of a small copy's longer side."""
@@ -32,8 +32,8 @@ class Thumbnail:
     height: int
 
 
-class Pictures:
-    """What the page keeps of the pictures that it shows."""
+class Thumbnails:
+    """Small copies of the images that the page shows."""
 
     def __init__(self, budget: int = BUDGET) -> None:
         self.left = budget
@@ -46,7 +46,7 @@ class Pictures:
         return self.left <= 0
 
     def add(self, path: Path) -> Thumbnail | None:
-        """Keep a small copy; None where the file is gone, or holds no picture any more."""
+        """Keep a small copy; None where the file is gone, or no longer holds an image."""
         if path not in self._known:
             self._known[path] = self._shrink(path)
         return self._known[path]
@@ -75,7 +75,7 @@ def data_uri(data: bytes, media_type: str) -> str:
 
 
 def show(thumbnail: Thumbnail, alt: str, boxes: Sequence[Box] = ()) -> str:
-    """A picture, with its regions of interest drawn.
+    """The HTML of a thumbnail, with its regions of interest drawn.
 
     Args:
         boxes: left, top, right, bottom, as fractions of width and height.

@@ -1,4 +1,4 @@
-"""``placerec evaluate``: figures of results and similarities that others have saved."""
+"""``placerec evaluate``: figures of results and similarities that other tools have saved."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from core.evaluation import Evaluation, Outcome, judge, summarize
 from core.evaluation.protocol.results import read_results, summarize_results
 from core.frames.traverses import Truth, read_kept_references
 from service.commands.console import Failure
-from service.commands.evaluation.tables import remark_notes, show_figures, show_thresholds, write_json, write_results
+from service.commands.evaluation.output import remark_notes, show_figures, show_thresholds, write_json, write_results
 from service.commands.evaluation.traverses import TruthOptions
 
 
@@ -28,14 +28,14 @@ class SavedOptions:
     limit_references: Path | None
 
     def check(self, others: Mapping[str, object], output: Path | None) -> None:
-        """See that nothing is asked that takes pictures or systems.
+        """Check that no option is given that needs images or systems.
 
         Args:
-            others: options that do, by name, with their values.
+            others: the options that need them, by name, with their values.
             output: where rows would be written.
 
         Raises:
-            typer.BadParameter: something is.
+            typer.BadParameter: one is.
         """
         if self.results and self.similarities:
             raise typer.BadParameter("give --from-results or --from-similarity, not both")
@@ -55,10 +55,10 @@ class SavedOptions:
                 raise typer.BadParameter("--from-similarity goes with --ground-truth or --tolerance, one of them")
             self.truth.check()
             if output is not None and len(set(self._names())) < len(self.similarities):
-                raise typer.BadParameter("--results takes files of different names: theirs become names of its files")
+                raise typer.BadParameter("--results needs files of different names: it names its own after them")
 
     def show(self, json_file: Path | None, results: Path | None) -> None:
-        """Write the table, and the files that were asked for."""
+        """Write the table and the files that the options name."""
         if self.results:
             figures = [summarize_results(path.name, read_results(path)) for path in self.results]
             _show(figures, "Saved results", json_file)
@@ -69,13 +69,13 @@ class SavedOptions:
             write_results(results, list(zip(self._names(), [outcomes for _, outcomes in judged], strict=True)))
 
     def _names(self) -> list[str]:
-        """What the rows of each matrix are named after."""
+        """The names under which the rows of each matrix are written."""
         return [path.stem for path in self.similarities]
 
     def _judge(self, path: Path) -> tuple[Evaluation, list[Outcome]]:
         import numpy as np
 
-        from core.evaluation.protocol.similarity import read_similarity
+        from core.evaluation.protocol.results import read_similarity
 
         scores = read_similarity(path, self.transposed)
         queries, references = scores.shape

@@ -1,4 +1,4 @@
-"""Large visual vocabularies, learned in a run from the pictures at hand.
+"""Large vocabularies of visual words, learned in a run from the training frames (FAB-MAP, Cross-Region-BoW).
 
 ``core.method.vocabulary`` makes the few words of an encoder as well as it can; with thousands of words from a
 few ten thousand features that would take many minutes and gain nothing.
@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from core.baselines.system import Array
 from core.errors import InvalidModel
-
-Array = NDArray[np.float32]
 
 ITERATIONS = 10
 POINTS_PER_WORD = 32
@@ -40,7 +39,7 @@ def train_words(frames: Sequence[NDArray[np.generic]], count: int, seed: int) ->
 
     found = [frame for frame in frames if len(frame)]
     if not found:
-        raise InvalidModel("no training picture has a feature to make words of; give other pictures.")
+        raise InvalidModel("no training image has a feature to make words of; give other images.")
     features = np.concatenate(found).astype(np.float32, copy=False)
     if len(features) <= count:
         return features

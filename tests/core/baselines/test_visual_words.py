@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.baselines.words import BLOCK, nearest_words, train_words
+from core.baselines.visual_words import BLOCK, nearest_words, train_words
 from core.errors import InvalidModel
 
 
@@ -24,7 +24,7 @@ def test_fewer_features_than_words_are_all_words() -> None:
 
 
 def test_no_features_is_said() -> None:
-    with pytest.raises(InvalidModel, match="no training picture"):
+    with pytest.raises(InvalidModel, match="no training image"):
         train_words([np.empty((0, 4), np.float32)], 10, seed=0)
 
 
