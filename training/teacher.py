@@ -49,7 +49,7 @@ class Teacher(nn.Module):
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """B x 3 x 227 x 227 BGR in 0–255 to two maps, each B x 512 x 13 x 13.
 
-        On a 227-pixel input the teacher's cell m is centred at pixel 16m and CaffeNet's cell at
+        Any side 16m + 3 is taken and gives (m - 1) x (m - 1) cells.  On a 227-pixel input the teacher's cell m is centred at pixel 16m and CaffeNet's cell at
         17 + 16m, so dropping the teacher's first and last row and column aligns the two grids to
         one pixel.
         """
@@ -59,7 +59,7 @@ class Teacher(nn.Module):
             x = module(x)
             if block == "5_1":
                 early = x
-        return early[:, :, 1:14, 1:14], x[:, :, 1:14, 1:14]
+        return early[:, :, 1:-1, 1:-1], x[:, :, 1:-1, 1:-1]
 
 
 def _convolution(weight: np.ndarray, bias: np.ndarray, stride: int, pad: int, groups: int) -> nn.Conv2d:

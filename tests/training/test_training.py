@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +20,12 @@ from training.disturbance import STEPS, disturb
 from training.photographs import DisturbedCrops, day_and_night, random_crop, split_photographs
 from training.student import SCALE, Student
 from training.teacher import BLOCKS, Teacher
+
+
+SIDE = 67
+"""Of the crops, in pixels: both networks make 3 x 3 cells of them."""
+
+small_run = partial(distill, batch=8, workers=0, side=SIDE, held_out_batches=1)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +65,9 @@ def teacher_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_in_two_sittings_equals_one(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
-    whole = distill(photographs, teacher_weights, tmp_path / "one", crops=48, batch=8, workers=0)
-    distill(photographs, teacher_weights, tmp_path / "two", crops=48, batch=8, workers=0, stop_after=3)
-    resumed = distill(photographs, teacher_weights, tmp_path / "two", crops=48, batch=8, workers=0)
+    whole = small_run(photographs, teacher_weights, tmp_path / "one", crops=48)
+    small_run(photographs, teacher_weights, tmp_path / "two", crops=48, stop_after=3)
+    resumed = small_run(photographs, teacher_weights, tmp_path / "two", crops=48)
     first, second = load_file(whole), load_file(resumed)
     assert set(first) == {f"conv{n}.{kind}" for n in (1, 2, 3, 4) for kind in ("weight", "bias")}
     for name, tensor in first.items():
@@ -71,19 +78,17 @@ def test_a_run_in_two_sittings_equals_one(photographs: Path, teacher_weights: Pa
 
 
 def test_the_loss_falls(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
-    distill(photographs, teacher_weights, tmp_path, crops=160, batch=8, workers=0, checkpoint_every=10)
+    small_run(photographs, teacher_weights, tmp_path, crops=160, checkpoint_every=10)
     losses = [float(row["loss"]) for row in csv.DictReader((tmp_path / "log.csv").open())]
     assert losses[-1] < losses[0] - 0.1
 
 
 def test_a_run_goes_on_from_earlier_weights(photographs: Path, teacher_weights: Path, tmp_path: Path) -> None:
-    first = distill(photographs, teacher_weights, tmp_path / "one", crops=64, batch=8, workers=0)
-    second = distill(
-        photographs, teacher_weights, tmp_path / "two", crops=4000, batch=8, workers=0, start=first, stop_after=5
-    )
+    first = small_run(photographs, teacher_weights, tmp_path / "one", crops=64)
+    second = small_run(photographs, teacher_weights, tmp_path / "two", crops=4000, start=first, stop_after=5)
     before, after = load_file(first), load_file(second)
     # The heads learn alone at first, so the backbone's features are still those that it started with.
-    pixels = torch.rand(1, 3, 227, 227) * 255
+    pixels = torch.rand(1, 3, SIDE, SIDE) * 255
     maps = []
     for weights in (before, after):
         network = ShallowNetwork(Student().definition, ("conv4",))
@@ -97,7 +102,7 @@ def test_taking_up_weights_keeps_the_features() -> None:
     torch.manual_seed(1)
     student, other = Student(), Student()
     student.train()
-    pixels = torch.rand(2, 3, 227, 227) * 255
+    pixels = torch.rand(8, 3, SIDE, SIDE) * 255
     with torch.no_grad():
         student.features(pixels)
     student.eval()
@@ -114,11 +119,11 @@ def test_folding_keeps_the_features() -> None:
     student.train()
     with torch.no_grad():
         for _ in range(3):  # moves the running statistics away from their start
-            student.features(torch.rand(2, 3, 227, 227) * 255)
+            student.features(torch.rand(8, 3, SIDE, SIDE) * 255)
     student.eval()
     network = ShallowNetwork(student.definition, ("conv3", "conv4"))
     network.load_weights(student.folded_weights())
-    pixels = torch.rand(1, 3, 227, 227) * 255
+    pixels = torch.rand(1, 3, SIDE, SIDE) * 255
     with torch.no_grad():
         for folded, original in zip(network((pixels - student.mean) * SCALE), student.features(pixels), strict=True):
             torch.testing.assert_close(folded, original, rtol=1e-3, atol=1e-4)
