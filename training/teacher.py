@@ -49,9 +49,9 @@ class Teacher(nn.Module):
     def forward(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """B x 3 x 227 x 227 BGR in 0–255 to two maps, each B x 512 x 13 x 13.
 
-        Any side 16m + 3 is taken and gives (m - 1) x (m - 1) cells.  On a 227-pixel input the teacher's cell m is centred at pixel 16m and CaffeNet's cell at
+        On a 227-pixel input the teacher's cell m is centred at pixel 16m and CaffeNet's cell at
         17 + 16m, so dropping the teacher's first and last row and column aligns the two grids to
-        one pixel.
+        one pixel.  The same holds of every input of 16m + 3 pixels, which gives (m - 1) x (m - 1) cells.
         """
         x = torch.relu(self.stem((pixels - self.mean) * SCALE))
         early = x

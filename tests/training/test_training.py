@@ -21,7 +21,6 @@ from training.photographs import DisturbedCrops, day_and_night, random_crop, spl
 from training.student import SCALE, Student
 from training.teacher import BLOCKS, Teacher
 
-
 SIDE = 67
 """Of the crops, in pixels: both networks make 3 x 3 cells of them."""
 
