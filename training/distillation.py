@@ -1,4 +1,4 @@
-"""Distillation: the student, shown a disturbed crop, learns what the teacher sees in the clean one.
+"""Distillation: from an augmented crop, the student learns to predict the teacher's features of the clean one.
 
 Loss: the mean over cells of 1 - cosine(head(student map), standardized teacher map), for
 conv3 against the teacher's conv5_1 and conv4 against its conv5_5.
@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from training.photographs import DisturbedCrops, split_photographs
+from training.photographs import AugmentedCrops, split_photographs
 from training.student import Student
 from training.teacher import Teacher
 
@@ -36,7 +36,7 @@ AVERAGING = 0.999  # decay of the running average of the weights, which is what 
 
 
 class Standardization:
-    """Per-channel mean and spread of a teacher map, from the first batches, then fixed."""
+    """Subtracts the mean and divides by the spread of each channel of a teacher's map."""
 
     def __init__(self, mean: Tensor, spread: Tensor) -> None:
         self.mean, self.spread = mean, spread
@@ -66,10 +66,10 @@ def learning_rate(step: int, steps: int, peak: float) -> float:
 
 
 def _batches(loader: DataLoader[Any], device: torch.device) -> Iterator[tuple[Tensor, Tensor]]:
-    for clean, disturbed in loader:
+    for clean, augmented in loader:
         yield tuple(
             pixels.to(device).permute(0, 3, 1, 2).float().contiguous(memory_format=torch.channels_last)
-            for pixels in (clean, disturbed)
+            for pixels in (clean, augmented)
         )
 
 
@@ -144,7 +144,7 @@ def distill(
         return maps if standards is None else tuple(s(m) for s, m in zip(standards, maps, strict=True))
 
     def crops_of(paths: tuple[Path, ...], start: int, stop: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
-        dataset = DisturbedCrops(paths, photographs, side, seed, start, stop)
+        dataset = AugmentedCrops(paths, photographs, side, seed, start, stop)
         return _batches(DataLoader(dataset, batch, num_workers=workers, drop_last=True), device)
 
     # The standardization is drawn from the seed alone, so a resumed run computes the same one.
@@ -158,10 +158,10 @@ def distill(
     backbone = list(student.stages.parameters())
     heads_alone = 0 if start is None else int(HEADS_ALONE * steps)
 
-    def loss_of(network: Student, clean: Tensor, disturbed: Tensor) -> Tensor:
+    def loss_of(network: Student, clean: Tensor, augmented: Tensor) -> Tensor:
         goal = targets(clean, standards)
         with autocast():
-            made = network(disturbed)
+            made = network(augmented)
         return sum((cosine_loss(p, t) for p, t in zip(made, goal, strict=True)), torch.zeros((), device=device))
 
     @torch.no_grad()

@@ -1,8 +1,8 @@
-"""What a map's own calibration is worth on real walks, as ``training.honesty`` measures it; lip6 in part.
+"""How good a map's own calibration is on real traverses, as ``training.calibration_quality`` measures it; lip6 in part.
 
-The truth of lip6_outdoor is that put right by local features (``training.alignment``): which references each query
-shows, first to last, stands in lip6_truth.csv.  It is good to a few frames where it asks for two, so precision is asked
-for within five frames, too.
+The truth of lip6_outdoor is the one corrected by local features (``training.ground_truth``); lip6_truth.csv holds the
+first and the last reference that each query shows.  It is good to a few frames only, and within two are asked for, so
+precision is measured within five frames, too.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from core.judgement.map_calibration import Measurement, Target, held_figures, re
 from core.judgement.trials import Trials
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from training.honesty import half_trials, widened
-from training.validation import Shown, describe
+from training.calibration_quality import half_trials, widened
+from training.validation import Encodings, describe
 
 EVAL = Path(__file__).parents[3] / "shared/datasets/eval"
 TRUTH = Path(__file__).with_name("lip6_truth.csv")
@@ -35,7 +35,7 @@ def encoder() -> Encoder:
     return EncoderCatalogue().get(DEFAULT_ENCODER)
 
 
-def shown(encoder: Encoder, folder: Path, step: int = 1) -> Shown:
+def shown(encoder: Encoder, folder: Path, step: int = 1) -> Encodings:
     return describe(encoder, [decode(path.read_bytes()) for path in find_images(folder)[::step]])
 
 
@@ -52,7 +52,7 @@ def corridor(encoder: Encoder) -> list[Trials]:
 
 @pytest.fixture(scope="module")
 def lip6(encoder: Encoder) -> list[Trials]:
-    """Within two frames of the truth put right, and within five."""
+    """Within two frames of the corrected truth, and within five."""
     truth = np.zeros((455, 608), np.bool_)
     for query, first, last in np.loadtxt(TRUTH, np.int64, delimiter=",", skiprows=1):
         truth[query, first : last + 1] = True

@@ -1,4 +1,4 @@
-"""Draws a run's log: the loss on fresh crops and on photographs kept out of training, over the crops seen."""
+"""Draws the losses of a distillation, on fresh crops and on photographs kept out of training, over the crops seen."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 
-def draw(log: Path, output: Path) -> None:
-    """From ``log.csv`` as the distillation writes it to a PNG.
+def draw_loss_curve(log: Path, output: Path) -> None:
+    """Draw ``log.csv``, which the distillation writes, as a PNG.
 
     Raises:
         ValueError: the log has no row.
@@ -40,8 +40,8 @@ def main(
     log: Annotated[Path, typer.Option(help="log.csv of a run.")] = Path("runs/distillation/log.csv"),
     output: Annotated[Path, typer.Option(help="The PNG to write.")] = Path("runs/distillation/curve.png"),
 ) -> None:
-    """Draw the validation curve."""
-    draw(log, output)
+    """Draw the loss curve."""
+    draw_loss_curve(log, output)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The encoder's constants, compared on the validation tasks over several vocabularies each.
+"""The encoder's constants, varied one at a time and compared on the validation tasks over several vocabularies each.
 
 Prints a Markdown table: one row a configuration, the mean over the seeds of k-means and half the
 largest difference between two of them.  The corridor traverse stands last, for the reader; nothing is
@@ -27,10 +27,19 @@ from core.method.presets import PRESETS
 from core.method.projection import Projection
 from core.method.vocabulary import pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork
-from training.contrast import refine
-from training.packaging import UNCALIBRATED, Tasks, load_tasks, network_of, vocabulary_pictures
-from training.projection import fit_projections, paired_cells
-from training.validation import DISTRACTORS, Shown, camera_recall, camera_scores, scores, walk
+from training.default_calibration import UNCALIBRATED
+from training.packaging import network_of, vocabulary_pictures
+from training.projections import fit_projections, paired_cells, refine
+from training.validation import (
+    DISTRACTORS,
+    Encodings,
+    ValidationTasks,
+    camera_recall,
+    camera_scores,
+    load_tasks,
+    load_traverses,
+    scores,
+)
 
 Array = NDArray[np.float32]
 
@@ -78,15 +87,15 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: share 0.5": _stage(share=0.5),
     "second stage: share 0.85": _stage(share=0.85),
 }
-CONTRAST = "projections refined by contrast"
-CONTRAST_CROPS, CONTRAST_STEPS = 800, 400
+REFINED = "projections refined by contrastive learning"
+REFINEMENT_CROPS, REFINEMENT_STEPS = 800, 400
 COLUMNS = (
     "lip6 recall@1", "lip6 AUC-PR", "lip6 as stated, recall@1", "webcams recall@1", "night recall@1",
     "corridor recall@1", "corridor AUC-PR",
 )  # fmt: skip
 
 
-class Study:
+class Ablation:
     """Activations of all pictures, computed once, and the figures of any configuration on them."""
 
     def __init__(self, weights: Path, datasets: Path, images: int, side: int | None = None) -> None:
@@ -94,8 +103,8 @@ class Study:
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
         self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
-        self.tasks: Tasks = load_tasks(datasets)
-        self.corridor = walk(datasets / "eval/corridor", "query", "ref")
+        self.tasks: ValidationTasks = load_tasks(datasets)
+        self.corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
         shown: dict[str, list[Pixels]] = {
             "vocabulary": vocabulary_pictures(datasets, images, seed=0),
             "lip6 queries": self.tasks.lip6.queries,
@@ -115,20 +124,20 @@ class Study:
         return made
 
     def maps(self, name: str, definition: EncoderDefinition) -> list[list[Array]]:
-        """What the definition's outputs give for every picture of a set."""
+        """The activations that a definition reads, for every picture of a set."""
         return [[frame[layer].astype(np.float32) for layer in definition.outputs] for frame in self.activations[name]]
 
-    def describe(self, encoder: Encoder, name: str) -> Shown:
-        """What the encoder makes of every picture of a set."""
+    def describe(self, encoder: Encoder, name: str) -> Encodings:
+        """Encode every picture of a set."""
         made = [encoder.describe(maps) for maps in self.maps(name, encoder.definition)]
-        return Shown(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
+        return Encodings(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
 
     def refine(self, datasets: Path) -> None:
-        """From now on with the projections as ``training.contrast`` leaves them, in both stages."""
+        """Refine the projections by contrastive learning; both stages use these from now on."""
         network = network_of(self.weights, STAGE.layers)
-        pairs = paired_cells(network, datasets / "train", CONTRAST_CROPS)
-        refined, losses = refine(self.projections, STAGE, pairs, CONTRAST_STEPS)
-        typer.echo(f"contrast: loss {np.mean(losses[:20]):.3f} at first, {np.mean(losses[-20:]):.3f} at last")
+        pairs = paired_cells(network, datasets / "train", REFINEMENT_CROPS)
+        refined, losses = refine(self.projections, STAGE, pairs, REFINEMENT_STEPS)
+        typer.echo(f"refinement: loss {np.mean(losses[:20]):.3f} at first, {np.mean(losses[-20:]):.3f} at last")
         for layer, projection in refined.items():
             further = self.projections[layer].matrix[:, STAGE.values :]
             self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
@@ -138,7 +147,7 @@ class Study:
         extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-        encoder = Encoder("study", extractor, definition, vocabulary, UNCALIBRATED)
+        encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
         references = self.describe(encoder, "lip6 references")
         far = references.part(slice(0, DISTRACTORS))
         lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)
@@ -146,13 +155,13 @@ class Study:
             encoder, self.describe(encoder, "corridor queries"), self.describe(encoder, "corridor references")
         )
         return [
-            *_walked(self.tasks.lip6.truth, lip6),
-            _walked(self.tasks.lip6_as_stated.truth, lip6)[0],
+            *_traverse_figures(self.tasks.lip6.truth, lip6),
+            _traverse_figures(self.tasks.lip6_as_stated.truth, lip6)[0],
             *(
                 camera_recall(task, *camera_scores(encoder, self.describe(encoder, name), far))
                 for name, task in (("webcams", self.tasks.webcams), ("night", self.tasks.night))
             ),
-            *_walked(self.corridor.truth, corridor),
+            *_traverse_figures(self.corridor.truth, corridor),
         ]
 
     def _network(self, definition: EncoderDefinition) -> ShallowNetwork:
@@ -162,7 +171,7 @@ class Study:
         return {layer: self.projections[layer] for layer in definition.projected()}
 
 
-def _walked(truth: NDArray[np.bool_], answers: Array) -> tuple[float, float]:
+def _traverse_figures(truth: NDArray[np.bool_], answers: Array) -> tuple[float, float]:
     """recall@1 and AUC-PR of a traverse pair."""
     best = answers.argmax(axis=1)
     matched = truth[np.arange(len(best)), best]
@@ -185,7 +194,7 @@ def main(
         "runs/distillation/weights.safetensors"
     ),
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
-    output: Annotated[Path, typer.Option(help="JSON with every run.")] = Path("runs/selection.json"),
+    output: Annotated[Path, typer.Option(help="JSON with every run.")] = Path("runs/ablation.json"),
     images: Annotated[int, typer.Option(min=1, help="Photographs for each vocabulary.")] = 600,
     side: Annotated[int | None, typer.Option(min=67, help="Another input size than the network's own.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Vocabularies a configuration.")] = 3,
@@ -193,19 +202,19 @@ def main(
 ) -> None:
     """Compare the configurations of CHANGES."""
     torch.manual_seed(0)
-    study = Study(weights, datasets, images, side)
+    ablation = Ablation(weights, datasets, images, side)
     rows: dict[str, Sequence[Sequence[float]]] = {}
     for name, change in CHANGES.items():
         if only and name not in only:
             continue
         definition = EncoderDefinition.model_validate({**DEFAULT.model_dump(), **change})
-        rows[name] = [study.figures(definition, seed) for seed in range(seeds)]
+        rows[name] = [ablation.figures(definition, seed) for seed in range(seeds)]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
         typer.echo(table({name: rows[name]}).splitlines()[-1])
-    if not only or CONTRAST in only:
-        study.refine(datasets)
-        rows[CONTRAST] = [study.figures(DEFAULT, seed) for seed in range(seeds)]
+    if not only or REFINED in only:
+        ablation.refine(datasets)
+        rows[REFINED] = [ablation.figures(DEFAULT, seed) for seed in range(seeds)]
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
     typer.echo(table(rows))
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from training.alignment import REACH, aligned_truth, match_count, passes, smooth_path
+from training.ground_truth import REACH, corrected_truth, match_count, passes, smooth_path
 
 
 def test_the_path_follows_support_and_not_single_outliers() -> None:
@@ -44,12 +44,12 @@ def test_a_drifting_truth_is_put_right() -> None:
         left = int(at * 12)
         return np.ascontiguousarray(street[:, left : left + 160])
 
-    references = [frame(n) for n in range(50)]
-    queries = [frame(REACH // 2 + n * 0.8) for n in range(25)]  # slower than the stated truth believes
-    stated = np.zeros((25, 50), np.bool_)
-    for n in range(25):
+    references = [frame(n) for n in range(42)]
+    queries = [frame(REACH // 2 + n * 0.8) for n in range(18)]  # slower than the stated truth believes
+    stated = np.zeros((18, 42), np.bool_)
+    for n in range(18):
         stated[n, REACH // 2 + n - 2 : REACH // 2 + n + 3] = True
-    truth = aligned_truth(queries, references, stated)
-    for n in range(4, 25):
+    truth = corrected_truth(queries, references, stated)
+    for n in range(4, 18):
         centre = float(np.flatnonzero(truth[n]).mean())
         assert abs(centre - (REACH // 2 + n * 0.8)) <= 1.5, n

@@ -1,4 +1,4 @@
-"""Photometric disturbances that imitate what a robot's camera meets between two traverses.
+"""Photometric augmentations that imitate what changes for a robot's camera between two traverses.
 
 Each takes and returns an H x W x 3 float32 BGR image in 0–1 (values may leave that range between
 steps) and draws its strength from the generator.  Geometry is never changed: the teacher sees the
@@ -175,7 +175,7 @@ STEPS: tuple[tuple[float, Callable[[Image, Generator], Image]], ...] = (
 )
 
 
-def disturb(pixels: NDArray[np.uint8], generator: Generator) -> NDArray[np.uint8]:
+def augment(pixels: NDArray[np.uint8], generator: Generator) -> NDArray[np.uint8]:
     """An H x W x 3 uint8 BGR picture as another camera, hour, weather or season might show it."""
     image: Image = pixels.astype(np.float32) / np.float32(255)
     for probability, step in STEPS:

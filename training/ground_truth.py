@@ -1,10 +1,10 @@
-"""Which reference each query of a street walk really shows, from local features alone.
+"""Corrects the ground truth of a pair of traverses: which reference each query really shows, by local features alone.
 
-The truth that comes with eval/lip6_outdoor runs through the two loops at one and the same pace; the walker did
-not, so it drifts by up to nine frames from what the pictures show.  Here each query is held against the references
-around its stated one by the number of SIFT matches (Lowe, 2004) that pass the ratio test, and the path of most
-matches is taken along which the shift against the stated truth changes by no more than one frame a step.  No
-network of this project has a part in it, so encoders can be compared by it.
+The truth that comes with eval/lip6_outdoor assumes that both loops were walked at one pace; they were not, so it
+drifts by up to nine frames from what the pictures show.  Here each query is compared with the references around its
+stated one by the number of SIFT matches (Lowe, 2004) that pass the ratio test, and the path with the most matches is
+taken along which the shift against the stated truth changes by at most one frame a step.  No network of this project
+takes part, so encoders can be compared by it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.frames.preprocessing import Pixels
 
 REACH = 20
-"""Frames around the stated reference within which the true one is looked for."""
+"""Frames around the stated reference within which the true one is searched."""
 RATIO = 0.8
 """Lowe's ratio of the distances to the nearest and to the second nearest feature."""
 TOLERANCE = 2
@@ -35,7 +35,7 @@ def local_features(pixels: Pixels) -> NDArray[np.float32]:
 
 
 def match_count(a: NDArray[np.float32], b: NDArray[np.float32]) -> int:
-    """How many features of ``a`` have one match in ``b`` that is clearly the nearest."""
+    """How many features of ``a`` pass the ratio test against ``b``."""
     if len(a) == 0 or len(b) < 2:
         return 0
     products = a @ b.T
@@ -45,7 +45,7 @@ def match_count(a: NDArray[np.float32], b: NDArray[np.float32]) -> int:
 
 
 def smooth_path(support: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The column for each row that gathers most support, moving by at most one column a row (Viterbi); int64 [n]."""
+    """The path with the most support that moves by at most one column a row (Viterbi), as columns, int64 [n]."""
     rows, columns = support.shape
     total, came = support[0].astype(np.float64), np.zeros((rows, columns), np.int64)
     moves = np.array([-1, 0, 1])
@@ -62,10 +62,10 @@ def smooth_path(support: NDArray[np.float32]) -> NDArray[np.int64]:
     return path
 
 
-def aligned_truth(
+def corrected_truth(
     queries: Sequence[Pixels], references: Sequence[Pixels], stated: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """The truth put right: bool [Q, R], references within TOLERANCE of the path of most matches.
+    """The corrected truth: bool [Q, R], references within TOLERANCE of the path with the most matches.
 
     Args:
         stated: bool [Q, R]; each query's true references form one run of indices or several, of which each is

@@ -1,9 +1,9 @@
-"""What probabilities and verdicts are worth on real walks: half of the references left out, then the other half.
+"""How good probabilities and verdicts are on real traverses with half of the references left out.
 
-Every block of consecutive queries is judged by the calibration that the other blocks give, so nothing is judged by
-itself; beside it stands the default calibration of the encoder.  corridor is judged by its stated truth (within two
-frames) and within three, what a map takes for the same place; lip6 by its stated truth, by the truth put right
-(``alignment.py``), and within five frames of that, since it is good to a few frames only.
+A map is calibrated on the trials themselves by cross-validation: every block of consecutive queries is judged by the
+calibration that the other blocks give.  The default calibration of the encoder stands beside it.  corridor is judged by
+its stated truth (within two frames) and within three, which a map takes for the same place; lip6 by its stated truth,
+by the corrected truth (``ground_truth.py``), and within five frames of that, since it is good to a few frames only.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from core.judgement.verdict import Whereabouts, judge
 from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from training.calibration import NEIGHBORHOOD
-from training.validation import Shown, describe, realigned, walk
+from training.default_calibration import NEIGHBORHOOD
+from training.validation import Encodings, describe, load_traverses, with_corrected_truth
 
 Truth = NDArray[np.bool_]
 
@@ -35,7 +35,7 @@ PRECISIONS = (0.9, 0.95, 0.98)
 
 
 def widened(truth: Truth, frames: int) -> Truth:
-    """The same with so many more frames on either side; bool [Q, R]."""
+    """The truth with ``frames`` more references on either side; bool [Q, R]."""
     wide = truth.copy()
     for shift in range(1, frames + 1):
         wide[:, shift:] |= truth[:, :-shift]
@@ -43,8 +43,8 @@ def widened(truth: Truth, frames: int) -> Truth:
     return wide
 
 
-def half_trials(encoder: Encoder, queries: Shown, references: Shown, truths: Sequence[Truth]) -> list[Trials]:
-    """Each query asked of the first half of the references and of the second; trials for each truth, bool [Q, R]."""
+def half_trials(encoder: Encoder, queries: Encodings, references: Encodings, truths: Sequence[Truth]) -> list[Trials]:
+    """Trials of each query against the first half of the references and the second, for each truth, bool [Q, R]."""
     found: list[list[Trial]] = [[] for _ in truths]
     scores = encoder.scores_from_inner_products(queries.descriptors @ references.descriptors.T)
     middle, end = len(references.local) // 2, len(references.local)
@@ -67,7 +67,7 @@ def _gains(encoder: Encoder, query: Cells, references: Cells, asked: NDArray[np.
 
 
 def figures(held: Held) -> dict[str, Any]:
-    """The worth of verdicts and probabilities in a few numbers."""
+    """Verdicts and probabilities in a few numbers."""
     worth = held.reliability
     return {
         "precision": held.precision.value,
@@ -83,14 +83,14 @@ def main(
     datasets: Annotated[Path, typer.Option(help="Folder with eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
 ) -> None:
-    """Print the figures on both walks, by every truth and for several precisions wanted."""
+    """Print the figures on both pairs of traverses, by every truth and for several target precisions."""
     loaded = EncoderCatalogue().get(encoder)
-    corridor = walk(datasets / "eval/corridor", "query", "ref")
-    lip6 = walk(datasets / "eval/lip6_outdoor", "query", "reference")
-    right = realigned(lip6).truth
+    corridor = load_traverses(datasets / "eval/corridor", "query", "ref")
+    lip6 = load_traverses(datasets / "eval/lip6_outdoor", "query", "reference")
+    corrected = with_corrected_truth(lip6).truth
     for task, truths in (
         (corridor, {"corridor as stated": corridor.truth, "corridor within 3": widened(corridor.truth, 1)}),
-        (lip6, {"lip6 as stated": lip6.truth, "lip6 put right": right, "lip6 within 5": widened(right, 3)}),
+        (lip6, {"lip6 as stated": lip6.truth, "lip6 corrected": corrected, "lip6 within 5": widened(corrected, 3)}),
     ):
         shown = describe(loaded, task.queries), describe(loaded, task.references)
         for name, trials in zip(truths, half_trials(loaded, *shown, list(truths.values())), strict=True):
