@@ -73,7 +73,7 @@ KNOWN_CIRCLES: list[set[str]] = [
 ]  # fmt: skip
 KNOWN_CROWDS = {
     "benchmarks", "core/baselines", "service/commands", "tests/core/evaluation/report", "tests/core/storage",
-    "tests/durability", "tests/fuzz", "tests/service/http",
+    "tests/service/http",
 }  # fmt: skip
 
 

@@ -12,16 +12,16 @@ from typing import Any
 
 import httpx
 
-from tests.durability import server_operations
-from tests.durability.lives import Dead, Lives
 from tests.durability.model import Lost, World, changed, differences, settled
-from tests.durability.server_operations import JOBS, apply, chosen, pruned
-from tests.durability.servers import ForkedServer, Servers
-from tests.durability.storage_operations import Operation
+from tests.durability.server import operations as requests
+from tests.durability.server.operations import JOBS, apply, chosen, pruned
+from tests.durability.server.processes import ServerProcess, ServerProcesses
+from tests.durability.storage.operations import Operation
+from tests.durability.storage.processes import ProcessEnded, StorageProcesses
 from tests.service.encoders import COARSE, install_coarse_encoder
 
 CLIENTS = 3
-LONGEST_LIFE = 36
+MOST_OPERATIONS = 36
 """Requests of all clients together before a kill, at most."""
 
 SETTINGS: dict[str, object] = {"encoder": COARSE, "log_level": "warning", "job_workers": 2}
@@ -30,12 +30,12 @@ PATIENCE = 60.0
 
 @dataclass
 class Client:
-    """One who has maps of its own; what it asks for follows from the seed and what it was told.
+    """Sends requests about maps of its own; they follow from the seed and the answers.
 
     candidates: the worlds that may be found.
     session: the run that is open, with its map, id and last frame; ``begun``: a frame that may have been taken in.
     job: the operation whose job is not known to have ended.
-    single: only what is done by one request, and when that is answered.
+    single: only requests whose effect is complete when they are answered.
     """
 
     seed: object
@@ -49,11 +49,11 @@ class Client:
 
     @property
     def prefix(self) -> str:
-        """Of the ids of its maps."""
+        """How the ids of its maps begin."""
         return f"c{self.number}-"
 
     def next(self) -> Operation:
-        """Choose a request; from now on it may have happened or not."""
+        """Choose a request, which from now on may have happened."""
         (world,) = self.candidates
         random = Random(f"{self.seed}/{self.number}/{self.done}")
         operation = chosen(random, world, self.prefix, self.session, self.single)
@@ -68,10 +68,10 @@ class Client:
         return operation
 
     def acknowledge(self, operation: Operation, answer: dict[str, Any]) -> None:
-        """The request was answered.
+        """Compare the answer to a request, which has now happened.
 
         Raises:
-            Lost: not with the answer that it had to have.
+            Lost: the answer is wrong.
         """
         found, wanted = answer["answer"], self._wanted
         if isinstance(wanted, dict) and "among" in wanted:
@@ -99,10 +99,10 @@ class Client:
     # After a start
 
     def end_job(self, client: httpx.Client, job: dict[str, Any] | None) -> None:
-        """Know what became of the job that was asked for; wait for its end.
+        """Wait for the end of the job that was asked for, and note what it has done.
 
         Args:
-            job: as it is listed; None: it was never taken.
+            job: as it is listed; None if the service never took it.
 
         Raises:
             Lost: it failed.
@@ -129,10 +129,10 @@ class Client:
             self.candidates = self.candidates[-1:]
 
     def check_session(self, client: httpx.Client) -> None:
-        """Is the run where it was?
+        """Compare the frame at which the open session stands.
 
         Raises:
-            Lost: it is not.
+            Lost: it is not the one sent last.
         """
         if self.session is None:
             return
@@ -170,15 +170,15 @@ class ServerKills:
         self._known_jobs: set[str] = set()
         install_coarse_encoder(folder / "models")
 
-    def run(self, lives: Lives, servers: Servers, kills: int) -> Tally:
-        """So many lives.
+    def run(self, processes: StorageProcesses, servers: ServerProcesses, kills: int) -> Tally:
+        """Kill ``kills`` servers one after the other.
 
         Raises:
             Lost: with what was found instead, the seed, and the last operations of each client.
         """
         try:
             while self.tally.kills < kills:
-                self._live(lives, servers, Random(f"{self.seed}/life/{self.tally.kills}"))
+                self._run_until_killed(processes, servers, Random(f"{self.seed}/life/{self.tally.kills}"))
         except (Lost, AssertionError, httpx.HTTPError) as lost:
             last = "\n".join(
                 f"client {one.number}, operation {one.done}: {str(one.last)[-1500:]}" for one in self.clients
@@ -187,7 +187,7 @@ class ServerKills:
             raise Lost(f"{why}\n{last}") from lost
         return self.tally
 
-    def _live(self, lives: Lives, servers: Servers, random: Random) -> None:
+    def _run_until_killed(self, processes: StorageProcesses, servers: ServerProcesses, random: Random) -> None:
         server = servers.begin(self.settings)
         try:
             server.wait()
@@ -196,10 +196,10 @@ class ServerKills:
         finally:
             server.close()
         self.tally.kills += 1
-        self.compare(lives)
+        self.compare(processes)
 
-    def _settle(self, server: ForkedServer) -> None:
-        """End the jobs that were cut, and look at the sessions."""
+    def _settle(self, server: ServerProcess) -> None:
+        """Wait for the jobs that were cut, compare the sessions, and verify every map."""
         for client in self.clients:
             if client.job is not None:
                 listed = server.client.get(f"/v1/jobs?map={client.job['map']}&limit=50").raise_for_status().json()
@@ -215,8 +215,8 @@ class ServerKills:
             if not verified["ok"]:
                 raise Lost(f"map {name}: {verified}")
 
-    def _work(self, server: ForkedServer, random: Random) -> None:
-        last, delay = random.randrange(5, LONGEST_LIFE), random.random() ** 2 * 0.2
+    def _work(self, server: ServerProcess, random: Random) -> None:
+        last, delay = random.randrange(5, MOST_OPERATIONS), random.random() ** 2 * 0.2
         killed, counting, failures = threading.Event(), threading.Lock(), list[Exception]()
         done = 0
 
@@ -238,7 +238,7 @@ class ServerKills:
                             if done == last:
                                 killer.start()
                         self._do(own, client, operation)
-            except (httpx.TransportError, Dead) as error:
+            except (httpx.TransportError, ProcessEnded) as error:
                 if not killed.is_set():
                     failures.append(Lost(f"the service does not answer: {error!r}"))
             except Exception as error:
@@ -258,36 +258,36 @@ class ServerKills:
             raise failures[0]
 
     def _do(self, own: httpx.Client, client: Client, operation: Operation) -> None:
-        answer = server_operations.send(own, operation)
+        answer = requests.send(own, operation)
         if "job" not in answer:
             if client.job is not None:
                 raise Lost(f"{operation} was refused: {answer}")
             client.acknowledge(operation, answer)
             return
         # From here on the job must come to its end, however often the service is killed.
-        job = own.get(f"/v1/jobs/{answer['job']}?wait={server_operations.JOB_SECONDS}").raise_for_status().json()
+        job = own.get(f"/v1/jobs/{answer['job']}?wait={requests.JOB_SECONDS}").raise_for_status().json()
         if job["state"] not in ("queued", "running"):
             client.end_job(own, job)
             self._known_jobs.add(answer["job"])
             self.tally.jobs += 1
 
-    def compare(self, lives: Lives) -> None:
-        """Is in a copy of what the dead process left all that must be?  Maps of a job that was cut come later.
+    def compare(self, processes: StorageProcesses) -> None:
+        """Compare a copy of what the dead server left; maps of a job that was cut are compared later.
 
         Raises:
-            Lost: it is not.
+            Lost: something is missing.
         """
         copied = self.folder / "copy"
         shutil.rmtree(copied, ignore_errors=True)
         shutil.copytree(self.folder / "data", copied)
-        life = lives.begin(copied)
+        process = processes.begin(copied)
         try:
-            found = life.voices[0].ask({"do": "contents"})["answer"]
-        except Dead as dead:
-            raise Lost(f"the copy does not open: {self.folder / 'log'}") from dead
+            found = process.connections[0].ask({"do": "contents"})["answer"]
+        except ProcessEnded as ended:
+            raise Lost(f"the copy does not open: {self.folder / 'log'}") from ended
         finally:
-            life.kill()
-            life.close()
+            process.kill()
+            process.close()
         for client in self.clients:
             own = {name: one for name, one in found.items() if name.startswith(client.prefix)}
             if client.job is None:

@@ -1,8 +1,8 @@
-"""A process that does operations on the storage layer until it is killed: ``python -m`` it and it forks one a line.
+"""Forks processes that do operations on the storage layer until they are killed; run it by ``python -m``.
 
-The first process imports everything and starts no thread; each line on its standard input, ``directory socket
-workers``, is answered with the number of a process that has forked off.  That one opens the data directory, connects
-to the socket once for each worker, and does what it is sent there, a line of JSON at a time.
+The first process imports everything and starts no thread.  Each line on its standard input, ``directory socket
+workers``, is answered with the number of a new process, which opens the data directory, connects to the socket once
+for each worker, and does the operations that it receives there, a line of JSON each.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from core.storage.files.row_formats import inner_products, pack_descriptors
 from core.storage.search import index_files, recall
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 from tests.durability.contents import contents, map_contents
-from tests.durability.storage_operations import Operation, enrolment
+from tests.durability.storage.operations import Operation, enrolment
 
 ROWS_PER_SEGMENT = 4
 GROUP_ROWS = 8
-"""So few that a handful of places makes files of codes."""
+"""Small, so that a handful of places makes files of codes."""
 
 QUERIES = 8
-"""Asked to measure the recall of an index, which is done again and again here."""
+"""By which the recall of an index is measured; few, since that is done again and again here."""
 
 Answer = dict[str, Any]
 
 
 class Gate:
-    """Many may be within, or one alone."""
+    """A lock that many may share, or one may have alone."""
 
     def __init__(self) -> None:
         self._condition, self._within = threading.Condition(), 0
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Beside others."""
+        """Hold the lock together with others."""
         with self._condition:
             self._within += 1
         try:
@@ -64,7 +64,7 @@ class Gate:
 
     @contextmanager
     def alone(self) -> Iterator[None]:
-        """With nobody else."""
+        """Hold the lock alone."""
         with self._condition:
             self._condition.wait_for(lambda: self._within == 0)
             yield
@@ -183,8 +183,8 @@ def _serve(storage: Callable[[], Storage], connection: socket.socket) -> None:
             connection.sendall(b"ack " + json.dumps(answer).encode() + b"\n")
 
 
-def _live(directory: Path, address: str, workers: int) -> None:
-    """One process: the lines are read while the directory is being opened, and done after it."""
+def _run_until_killed(directory: Path, address: str, workers: int) -> None:
+    """Run one process: it reads lines while the directory is being opened, and does them afterwards."""
     connections = []
     for number in range(workers):
         connection = socket.socket(socket.AF_UNIX)
@@ -248,7 +248,7 @@ def main(unsynced: str | None = None) -> None:
         process = os.fork()
         if process == 0:
             try:
-                _live(Path(directory), address, int(workers))
+                _run_until_killed(Path(directory), address, int(workers))
             except BaseException:
                 traceback.print_exc()
             os._exit(0)

@@ -13,10 +13,10 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.durability.lives import Dead, Lives
 from tests.durability.model import Lost
-from tests.durability.storage_kills import Worker
-from tests.durability.storage_power import attach
+from tests.durability.storage.kills import Worker
+from tests.durability.storage.power_cuts import attach
+from tests.durability.storage.processes import ProcessEnded, StorageProcesses
 from tests.syscalls import strace
 
 CALLS = ("pwrite64", "write", "fsync", "fdatasync", "ftruncate", "rename", "unlink", "unlinkat", "mkdir", "rmdir")
@@ -35,7 +35,7 @@ class PointTally:
     operations: int = 0
 
 
-def points(lives: Lives, folder: Path, seed: object) -> list[Point]:
+def points(processes: StorageProcesses, folder: Path, seed: object) -> list[Point]:
     """Every point of the run: the most calls of each kind that any of its threads made.
 
     Raises:
@@ -43,7 +43,7 @@ def points(lives: Lives, folder: Path, seed: object) -> list[Point]:
     """
     trace = folder / "trace"
     tracer = [strace() or "strace", "-f", "-e", f"trace={','.join(CALLS)}", "-o", str(trace)]
-    _run(lives, folder / "whole", tracer, seed, may_die=False)
+    _run(processes, folder / "whole", tracer, seed, may_be_killed=False)
     counted = Counter(
         (found[1], found[2]) for line in trace.open() if (found := re.match(r"(\d+) +(\w+)\(", line)) is not None
     )
@@ -51,7 +51,7 @@ def points(lives: Lives, folder: Path, seed: object) -> list[Point]:
     return [(call, number) for call in CALLS for number in range(1, most[call] + 1)]
 
 
-def kill_at(lives: Lives, folder: Path, seed: object, point: Point) -> tuple[bool, int]:
+def kill_at(processes: StorageProcesses, folder: Path, seed: object, point: Point) -> tuple[bool, int]:
     """Run until the point, and compare; whether it was met, and operations begun.
 
     Raises:
@@ -61,32 +61,34 @@ def kill_at(lives: Lives, folder: Path, seed: object, point: Point) -> tuple[boo
     tracer = [strace() or "strace", "-f", "-o", "/dev/null", "-e", f"trace={call}"]
     tracer += ["-e", f"inject={call}:signal=KILL:when={number}"]
     directory = folder / f"{call}-{number}"
-    worker, met = _run(lives, directory, tracer, seed, may_die=True)
-    life = lives.begin(directory)
+    worker, met = _run(processes, directory, tracer, seed, may_be_killed=True)
+    process = processes.begin(directory)
     try:
-        worker.settle(life.voices[0].ask({"do": "contents"})["answer"])
-    except (Dead, Lost) as lost:
+        worker.settle(process.connections[0].ask({"do": "contents"})["answer"])
+    except (ProcessEnded, Lost) as lost:
         raise Lost(f"seed {seed}, killed at {call} {number}: {str(lost) or 'the directory does not open'}") from lost
     finally:
-        life.kill()
-        life.close()
+        process.kill()
+        process.close()
     subprocess.run(["rm", "-r", str(directory)], check=True)
     return met, worker.done
 
 
-def _run(lives: Lives, directory: Path, tracer: list[str], seed: object, may_die: bool) -> tuple[Worker, bool]:
+def _run(
+    processes: StorageProcesses, directory: Path, tracer: list[str], seed: object, may_be_killed: bool
+) -> tuple[Worker, bool]:
     worker, died = Worker(seed, 0), False
-    life = lives.begin(directory, waiting=True)
-    process = attach(life, tracer, directory.parent / "strace.log")
+    process = processes.begin(directory, waiting=True)
+    tracing = attach(process, tracer, directory.parent / "strace.log")
     try:
         for _ in range(OPERATIONS):
-            worker.acknowledge(life.voices[0].ask(worker.next()))
-    except Dead as dead:
-        if not may_die:
-            raise Lost(f"the process ended by itself: {directory.parent / 'log'}") from dead
+            worker.acknowledge(process.connections[0].ask(worker.next()))
+    except ProcessEnded as ended:
+        if not may_be_killed:
+            raise Lost(f"the process ended by itself: {directory.parent / 'log'}") from ended
         died = True
     finally:
-        life.kill()
-        life.close()
-        process.wait(60)
+        process.kill()
+        process.close()
+        tracing.wait(60)
     return worker, died

@@ -1,4 +1,4 @@
-"""Servers that are begun to be killed."""
+"""Starts servers that are going to be killed."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from typing import Self
 
 import httpx
 
-from tests.durability.lives import REPOSITORY
+from tests.durability.storage.processes import REPOSITORY
 from tests.service.server import free_port
 
 START_SECONDS = 300.0
 """The machine may be busy with other things."""
 
 
-class ForkedServer:
-    """``placerec serve`` in a process that was forked off (:mod:`tests.durability.server_process`)."""
+class ServerProcess:
+    """``placerec serve`` in a process that was forked off (:mod:`tests.durability.server.forks`)."""
 
     def __init__(self, number: int, port: int, log: Path) -> None:
         self.number, self.log = number, log
@@ -66,21 +66,27 @@ class ForkedServer:
             self._handle = None
 
 
-class Servers:
-    """Begins servers, in little more time than they take to be ready."""
+class ServerProcesses:
+    """Starts servers, each in little more time than it takes to be ready."""
 
     def __init__(self, folder: Path) -> None:
-        """Args: folder: for what they write to standard error."""
+        """Import all that a server needs, once.
+
+        Args:
+            folder: for what the servers write to standard error.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         self._log = folder / "log.jsonl"
         with self._log.open("ab") as log:
             self._parent = subprocess.Popen(
-                [sys.executable, "-m", "tests.durability.server_process"],
+                [sys.executable, "-m", "tests.durability.server.forks"],
                 cwd=REPOSITORY,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
             )
+        assert self._parent.stdout is not None
+        assert self._parent.stdout.readline() == b"ready\n", self._log.read_text()
 
     def __enter__(self) -> Self:
         return self
@@ -93,11 +99,11 @@ class Servers:
         self._parent.wait(60)
         self._parent.stdout.close()
 
-    def begin(self, settings: Mapping[str, object], traced: bool = False) -> ForkedServer:
-        """One more, with these settings and a port of its own.
+    def begin(self, settings: Mapping[str, object], traced: bool = False) -> ServerProcess:
+        """Start a server with these settings and a port of its own.
 
         Args:
-            traced: it waits for a tracer.
+            traced: the server waits until it is traced.
         """
         assert self._parent.stdin is not None and self._parent.stdout is not None
         port = free_port()
@@ -106,4 +112,4 @@ class Servers:
         wanted = {"environment": environment, "log": str(self._log), "traced": traced}
         self._parent.stdin.write(json.dumps(wanted).encode() + b"\n")
         self._parent.stdin.flush()
-        return ForkedServer(int(self._parent.stdout.readline()), port, self._log)
+        return ServerProcess(int(self._parent.stdout.readline()), port, self._log)

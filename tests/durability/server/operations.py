@@ -13,7 +13,7 @@ import httpx
 
 from tests.durability.contents import sha
 from tests.durability.model import ANY, MapModel, Refused, Shown, World
-from tests.durability.storage_operations import DEFAULTS, MASKS, Operation
+from tests.durability.storage.operations import DEFAULTS, MASKS, Operation
 from tests.service.scenes import jpeg
 from tests.service.server import text
 
@@ -33,7 +33,7 @@ def picture(number: int) -> bytes:
 
 @lru_cache(maxsize=PICTURES)
 def shown(number: int) -> Shown:
-    """What must be found of a place that shows it; its thumbnail and descriptor are what is found first."""
+    """What must be found of a place with this frame; thumbnail and descriptor are learnt when they are found."""
     return Shown(sha(picture(number)), ANY, ANY, sha(picture(number)), {}, {})
 
 
@@ -272,11 +272,11 @@ _SENT: dict[str, Callable[[httpx.Client, Operation], dict[str, Any]]] = {
 def chosen(
     random: Random, world: World, prefix: str, session: dict[str, Any] | None, single: bool = False
 ) -> Operation:
-    """The next request of the one who has the maps whose ids begin so.
+    """The next request of the client whose maps' ids begin with ``prefix``.
 
     Args:
         session: the one that is open, with its map, id and last frame.
-        single: only what is done by one request, and when that is answered.
+        single: only requests without jobs and uploads, whose effect is complete when they are answered.
     """
     names = [f"{prefix}{number}" for number in range(MAPS)]
     there, free = [name for name in names if name in world], [name for name in names if name not in world]

@@ -1,4 +1,4 @@
-"""Processes that are begun to be killed, and the talk with them."""
+"""Starts processes that drive the storage layer and are going to be killed, and talks to them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from typing import Any, Self
 
 from tests.durability.model import Lost
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 PATIENCE = 120.0
 """Seconds after which an answer that does not come is a failure."""
 
 
-class Dead(Exception):
-    """The process was killed before it answered."""
+class ProcessEnded(Exception):
+    """The process ended before it answered."""
 
 
-class Voice:
+class Connection:
     """One worker's connection to a process."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -33,33 +33,33 @@ class Voice:
         self._connection, self._rest = connection, b""
 
     def begin(self) -> None:
-        """Let the process go on that waits for its tracer."""
+        """Let a process go on that waits for its tracer."""
         self._connection.sendall(b"\n")
 
     def send(self, operation: dict[str, Any]) -> None:
-        """Let an operation begin.
+        """Send an operation.
 
         Raises:
-            Dead.
+            ProcessEnded.
         """
         try:
             self._connection.sendall(json.dumps(operation).encode() + b"\n")
         except (BrokenPipeError, ConnectionResetError) as error:
-            raise Dead from error
+            raise ProcessEnded from error
 
     def answer(self) -> dict[str, Any]:
-        """What became of it; an answer that was sent before the process died counts.
+        """Receive the answer; one that was sent before the process ended counts.
 
         Raises:
-            Dead.
+            ProcessEnded.
         """
         while b"\n" not in self._rest:
             try:
                 more = self._connection.recv(1 << 20)
             except ConnectionResetError as error:
-                raise Dead from error
+                raise ProcessEnded from error
             if not more:
-                raise Dead
+                raise ProcessEnded
             self._rest += more
         line, _, self._rest = self._rest.partition(b"\n")
         found: dict[str, Any] = json.loads(line.removeprefix(b"ack "))
@@ -73,29 +73,29 @@ class Voice:
         return self.answer()
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the connection."""
         self._connection.close()
 
 
-class Life:
-    """One process."""
+class StorageProcess:
+    """One process and its connections, one for each worker."""
 
-    def __init__(self, number: int, voices: list[Voice]) -> None:
-        self.number, self.voices = number, voices
+    def __init__(self, number: int, connections: list[Connection]) -> None:
+        self.number, self.connections = number, connections
 
     def kill(self) -> None:
-        """SIGKILL, as often as one likes."""
+        """Send SIGKILL; more than once does no harm."""
         with suppress(ProcessLookupError):
             os.kill(self.number, signal.SIGKILL)
 
     def close(self) -> None:
-        """Hang up, which ends the process, and wait until it is gone."""
-        for voice in self.voices:
-            voice.close()
+        """Close the connections, which ends the process, and wait for its end."""
+        for connection in self.connections:
+            connection.close()
         self.wait()
 
     def wait(self) -> None:
-        """Until it is gone: it holds the data directory before."""
+        """Wait for the end of the process, which holds the data directory until then."""
         handle = None
         try:
             handle = os.pidfd_open(self.number)
@@ -107,15 +107,16 @@ class Life:
                 os.close(handle)
 
 
-class Lives:
-    """Begins processes that drive the storage layer, in a few milliseconds each."""
+class StorageProcesses:
+    """Starts processes that drive the storage layer, in a few milliseconds each."""
 
     def __init__(self, folder: Path, workers: int = 1, unsynced: str | None = None) -> None:
-        """Of processes with so many workers each.
+        """Import all that such a process needs, once.
 
         Args:
             folder: for the socket; its path must be short.
-            unsynced: what they leave unsynced (``storage_process.UNSYNCED``), to be found out.
+            workers: of each process.
+            unsynced: what the processes leave unsynced (``driver.UNSYNCED``), for a test of the harness.
         """
         folder.mkdir(parents=True, exist_ok=True)
         self._workers, self._address = workers, folder / "socket"
@@ -124,7 +125,7 @@ class Lives:
         self._listener.bind(str(self._address))
         self._listener.listen(16)
         self._listener.settimeout(PATIENCE)
-        command = [sys.executable, "-m", "tests.durability.storage_process", *([unsynced] if unsynced else [])]
+        command = [sys.executable, "-m", "tests.durability.storage.driver", *([unsynced] if unsynced else [])]
         self._log = (folder / "log").open("ab")
         self._parent = subprocess.Popen(
             command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log
@@ -143,21 +144,21 @@ class Lives:
         self._parent.stdout.close()
         self._log.close()
 
-    def begin(self, directory: Path, waiting: bool = False) -> Life:
-        """One more process, with a data directory.
+    def begin(self, directory: Path, waiting: bool = False) -> StorageProcess:
+        """Start a process with a data directory.
 
         Args:
-            waiting: it opens the directory when its first voice says so.
+            waiting: the process opens the directory only after ``connections[0].begin()``.
         """
         assert self._parent.stdin is not None and self._parent.stdout is not None
         self._parent.stdin.write(f"{directory} {self._address} {self._workers}\n".encode())
         self._parent.stdin.flush()
         number = int(self._parent.stdout.readline())
-        voices: dict[int, Voice] = {}
-        while len(voices) < self._workers:
+        connections: dict[int, Connection] = {}
+        while len(connections) < self._workers:
             connection, _ = self._listener.accept()
-            voices[int(connection.recv(2))] = Voice(connection)
-        life = Life(number, [voices[worker] for worker in range(self._workers)])
+            connections[int(connection.recv(2))] = Connection(connection)
+        process = StorageProcess(number, [connections[worker] for worker in range(self._workers)])
         if not waiting:
-            life.voices[0].begin()
-        return life
+            process.connections[0].begin()
+        return process

@@ -1,8 +1,8 @@
-"""Real servers, each forked off a process that has imported everything and started no thread: ``python -m`` it.
+"""Forks real servers off a process that has imported everything and started no thread; run it by ``python -m``.
 
-Each line on standard input is a JSON object, ``environment``, ``log`` and ``traced``, and is answered with the number
-of a process that runs ``placerec serve`` so; with ``traced`` not before a tracer follows it.  A start then takes what
-opening the data directory and loading the encoder take.
+It prints ``ready``.  Then each line on standard input is a JSON object with ``environment``, ``log`` and ``traced``; it
+is answered with the number of a process that runs ``placerec serve`` in that environment, with ``traced`` as soon as a
+tracer follows it.  Such a start takes as long as opening the data directory and loading the encoder.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ def main() -> None:
     from service.commands import main as placerec
 
     gc.freeze()
+    print("ready", flush=True)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
     for line in sys.stdin:
         wanted = json.loads(line)

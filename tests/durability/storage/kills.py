@@ -9,12 +9,12 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from tests.durability.lives import Dead, Life, Lives, Voice
 from tests.durability.model import Lost, World, changed, differences, settled
-from tests.durability.storage_operations import Operation, apply, chosen
+from tests.durability.storage.operations import Operation, apply, chosen
+from tests.durability.storage.processes import Connection, ProcessEnded, StorageProcess, StorageProcesses
 
 WORKERS = 2
-LONGEST_LIFE = 24
+MOST_OPERATIONS = 24
 """Operations of the first worker before a kill, at most."""
 
 KILLED_WHILE_OPENING = 0.2
@@ -22,7 +22,7 @@ KILLED_WHILE_OPENING = 0.2
 
 @dataclass
 class Worker:
-    """One who writes to maps of its own; what it does follows from the seed and what it was told.
+    """Writes to maps of its own; its operations follow from the seed and the answers.
 
     candidates: the worlds that may be found: as acknowledged last, and with what was begun since.
     """
@@ -36,14 +36,14 @@ class Worker:
 
     @property
     def prefix(self) -> str:
-        """Of the ids of its maps."""
+        """How the ids of its maps begin."""
         return f"w{self.number}-"
 
     def settle(self, found: dict[str, Any]) -> bool:
-        """Find out which of the worlds there is after a start; whether what was not acknowledged has happened.
+        """Compare what was found after a start; whether the operation that was not acknowledged has happened.
 
         Raises:
-            Lost: none of them.
+            Lost: none of the worlds that may be found was.
         """
         own = {name: one for name, one in found.items() if name.startswith(self.prefix)}
         world, number = settled(self.candidates, own)
@@ -51,7 +51,7 @@ class Worker:
         return number > 0
 
     def next(self) -> Operation:
-        """Choose an operation; from now on it may have happened or not."""
+        """Choose an operation, which from now on may have happened."""
         (world,) = self.candidates
         operation = chosen(Random(f"{self.seed}/{self.number}/{self.done}"), world, self.prefix)
         self.done += 1
@@ -61,10 +61,10 @@ class Worker:
         return operation
 
     def acknowledge(self, answer: dict[str, Any]) -> None:
-        """The operation has happened.
+        """Compare the answer to the last operation, which has now happened.
 
         Raises:
-            Lost: not with the answer that it had to have.
+            Lost: the answer is wrong.
         """
         operation, world = self.last[-1], self.candidates[-1]
         if wrong := differences(self._wanted, answer["answer"]):
@@ -98,16 +98,16 @@ class StorageKills:
         self.directory = folder / "data"
         self.workers = [Worker(seed, number) for number in range(WORKERS)]
 
-    def run(self, lives: Lives, kills: int) -> Tally:
-        """So many lives, and a last start.
+    def run(self, processes: StorageProcesses, kills: int) -> Tally:
+        """Kill ``kills`` processes one after the other, and start a last one.
 
         Raises:
             Lost: with what was found instead, the seed, and the last operations of each worker.
         """
         try:
             while self.tally.kills < kills:
-                self._live(lives, Random(f"{self.seed}/life/{self.tally.kills}"))
-            self.check(lives)
+                self._run_until_killed(processes, Random(f"{self.seed}/life/{self.tally.kills}"))
+            self.check(processes)
         except Lost as lost:
             last = "\n".join(
                 f"worker {one.number}, operation {one.done}: {str(one.last)[-1500:]}" for one in self.workers
@@ -115,71 +115,73 @@ class StorageKills:
             raise Lost(f"seed {self.seed}, after kill {self.tally.kills}: {lost}\n{last}") from lost
         return self.tally
 
-    def check(self, lives: Lives) -> None:
-        """Start once more, compare, and end."""
-        life = lives.begin(self.directory)
+    def check(self, processes: StorageProcesses) -> None:
+        """Start a process, compare what it finds, and end it."""
+        process = processes.begin(self.directory)
         try:
-            self._settle(life)
-        except Dead as dead:
-            raise Lost(f"the process ended by itself: {self.folder / 'log'}") from dead
+            self._settle(process)
+        except ProcessEnded as ended:
+            raise Lost(f"the process ended by itself: {self.folder / 'log'}") from ended
         finally:
-            life.close()
+            process.close()
 
-    def _settle(self, life: Life) -> None:
-        found = life.voices[0].ask({"do": "contents"})["answer"]
+    def _settle(self, process: StorageProcess) -> None:
+        found = process.connections[0].ask({"do": "contents"})["answer"]
         for worker in self.workers:
             self.tally.between += len(worker.candidates) > 1
             self.tally.there += worker.settle(found)
 
-    def _live(self, lives: Lives, random: Random) -> None:
+    def _run_until_killed(self, processes: StorageProcesses, random: Random) -> None:
         opening = random.random() < KILLED_WHILE_OPENING
-        last, delay = random.randrange(1, LONGEST_LIFE), random.random() ** 2 * (0.06 if opening else 0.01)
-        life = lives.begin(self.directory)
+        last, delay = random.randrange(1, MOST_OPERATIONS), random.random() ** 2 * (0.06 if opening else 0.01)
+        process = processes.begin(self.directory)
         killed = threading.Event()
 
         def kill() -> None:
             time.sleep(delay)
             killed.set()
-            life.kill()
+            process.kill()
 
         killer = threading.Thread(target=kill)
         failures: list[Exception] = []
         try:
             if opening:
                 killer.start()
-            self._settle(life)
+            self._settle(process)
             self.tally.starts += 1
 
-            def work(worker: Worker, voice: Voice) -> None:
+            def work(worker: Worker, connection: Connection) -> None:
                 try:
                     while True:
-                        voice.send(worker.next())
+                        connection.send(worker.next())
                         if worker.number == 0 and worker.done == until and not opening:
                             killer.start()
-                        worker.acknowledge(voice.answer())
-                except Dead:
+                        worker.acknowledge(connection.answer())
+                except ProcessEnded:
                     if not killed.is_set():
                         failures.append(Lost(f"the process ended by itself: {self.folder / 'log'}"))
                 except Exception as error:
                     failures.append(error)
-                    life.kill()
+                    process.kill()
 
             until = self.workers[0].done + last
             before = sum(worker.done for worker in self.workers)
-            threads = [threading.Thread(target=work, args=pair) for pair in zip(self.workers, life.voices, strict=True)]
+            threads = [
+                threading.Thread(target=work, args=pair) for pair in zip(self.workers, process.connections, strict=True)
+            ]
             for thread in threads:
                 thread.start()
             for thread in threads:
                 thread.join()
             self.tally.operations += sum(worker.done for worker in self.workers) - before
-        except Dead as dead:
+        except ProcessEnded as ended:
             if not killed.is_set():
-                raise Lost(f"the process ended by itself: {self.folder / 'log'}") from dead
+                raise Lost(f"the process ended by itself: {self.folder / 'log'}") from ended
         finally:
-            life.kill()
+            process.kill()
             if killer.ident is not None:
                 killer.join()
-            life.close()
+            process.close()
         if failures:
             raise failures[0]
         self.tally.kills += 1

@@ -14,12 +14,12 @@ import httpx
 
 from service.jobs.records import JobRecords
 from service.sessions.store import SessionStore
-from tests.durability import server_operations
-from tests.durability.lives import Lives
 from tests.durability.model import Lost, World
-from tests.durability.server_kills import PATIENCE, SETTINGS, Client
-from tests.durability.servers import Servers
-from tests.durability.storage_power import PowerTally, check, cut
+from tests.durability.server import operations as requests
+from tests.durability.server.kills import PATIENCE, SETTINGS, Client
+from tests.durability.server.processes import ServerProcesses
+from tests.durability.storage.power_cuts import PowerTally, check, cut
+from tests.durability.storage.processes import StorageProcesses
 from tests.durability.traced_disk import Disk, arguments
 from tests.service.encoders import install_coarse_encoder
 
@@ -32,8 +32,8 @@ class Moment:
     session: dict[str, Any] | None
 
 
-def record(servers: Servers, folder: Path, seed: object, operations: int) -> tuple[Path, list[Moment]]:
-    """A traced service that answers random requests; its trace, and what must be after each answer.
+def record(servers: ServerProcesses, folder: Path, seed: object, operations: int) -> tuple[Path, list[Moment]]:
+    """Trace a service that answers random requests; its trace, and what must be found after each answer.
 
     Raises:
         Lost: an answer was wrong.
@@ -51,7 +51,7 @@ def record(servers: Servers, folder: Path, seed: object, operations: int) -> tup
             for number in range(operations):
                 operation = client.next()
                 own.headers["X-Request-Id"] = f"op-{number}"
-                client.acknowledge(operation, server_operations.send(own, operation))
+                client.acknowledge(operation, requests.send(own, operation))
                 moments.append(Moment(client.candidates[0], copy.deepcopy(client.session)))
     finally:
         server.close()
@@ -76,7 +76,9 @@ def answered(disk: Disk, trace: Path) -> Iterator[int]:
             yield count
 
 
-def power(servers: Servers, lives: Lives, folder: Path, seed: object, operations: int, disks: int) -> PowerTally:
+def power(
+    servers: ServerProcesses, processes: StorageProcesses, folder: Path, seed: object, operations: int, disks: int
+) -> PowerTally:
     """Trace, cut the power at so many moments, and compare what is found.
 
     Raises:
@@ -85,7 +87,7 @@ def power(servers: Servers, lives: Lives, folder: Path, seed: object, operations
     trace, moments = record(servers, folder, seed, operations)
 
     def look(image: Path, answers: int) -> None:
-        _check(lives, image, moments[answers : answers + 2])
+        _check(processes, image, moments[answers : answers + 2])
 
     tally = cut(folder, seed, PowerTally(operations), disks, lambda disk: answered(disk, trace), look)
     if max(answered(Disk(folder / "data"), trace), default=0) != operations:
@@ -93,8 +95,8 @@ def power(servers: Servers, lives: Lives, folder: Path, seed: object, operations
     return tally
 
 
-def _check(lives: Lives, image: Path, may: list[Moment]) -> None:
-    check(lives, image, [moment.world for moment in may])
+def _check(processes: StorageProcesses, image: Path, may: list[Moment]) -> None:
+    check(processes, image, [moment.world for moment in may])
     JobRecords(image).close()
     store = SessionStore(image)
     found = {one.id: one.number or 0 for one in store.all() if one.ended is None}

@@ -10,25 +10,25 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from random import Random
 
-from tests.durability.lives import Dead, Life, Lives
 from tests.durability.model import Lost, World, settled
-from tests.durability.storage_kills import Worker
+from tests.durability.storage.kills import Worker
+from tests.durability.storage.processes import ProcessEnded, StorageProcess, StorageProcesses
 from tests.durability.traced_disk import VARIANTS, Disk, arguments
 
 ATTACHING_SECONDS = 30.0
 
 
-def attach(life: Life, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
+def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
     """Let a tracer follow a process that waits, then let that go on."""
     with log.open("ab") as told:
-        process = subprocess.Popen([*tracer, "-p", str(life.number)], stderr=told)
+        tracing = subprocess.Popen([*tracer, "-p", str(process.number)], stderr=told)
     until = time.monotonic() + ATTACHING_SECONDS
-    while "TracerPid:\t0\n" in Path(f"/proc/{life.number}/status").read_text():
-        assert process.poll() is None and time.monotonic() < until, log.read_text()[-2000:]
+    while "TracerPid:\t0\n" in Path(f"/proc/{process.number}/status").read_text():
+        assert tracing.poll() is None and time.monotonic() < until, log.read_text()[-2000:]
         time.sleep(0.002)
     time.sleep(0.02)  # it has stopped by now, and goes on when the tracer lets it
-    life.voices[0].begin()
-    return process
+    process.connections[0].begin()
+    return tracing
 
 
 @dataclass
@@ -45,7 +45,7 @@ class PowerTally:
         return PowerTally(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
 
 
-def record(lives: Lives, folder: Path, seed: object, operations: int) -> tuple[Path, list[World]]:
+def record(processes: StorageProcesses, folder: Path, seed: object, operations: int) -> tuple[Path, list[World]]:
     """A traced process that does random operations; its trace, and the world after each acknowledgement.
 
     Raises:
@@ -53,17 +53,17 @@ def record(lives: Lives, folder: Path, seed: object, operations: int) -> tuple[P
     """
     worker, trace = Worker(seed, 0), folder / "trace"
     worlds = [worker.candidates[0]]
-    life = lives.begin(folder / "data", waiting=True)
-    tracer = attach(life, arguments(trace), folder / "strace.log")
+    process = processes.begin(folder / "data", waiting=True)
+    tracer = attach(process, arguments(trace), folder / "strace.log")
     try:
         for _ in range(operations):
-            worker.acknowledge(life.voices[0].ask(worker.next()))
+            worker.acknowledge(process.connections[0].ask(worker.next()))
             worlds.append(worker.candidates[0])
-    except Dead as dead:
-        raise Lost(f"the process ended by itself: {folder / 'log'}") from dead
+    except ProcessEnded as ended:
+        raise Lost(f"the process ended by itself: {folder / 'log'}") from ended
     finally:
-        life.kill()
-        life.close()
+        process.kill()
+        process.close()
         tracer.wait(60)
     return trace, worlds
 
@@ -82,16 +82,16 @@ def moments(disk: Disk, trace: Path) -> Iterator[int]:
             yield acknowledged
 
 
-def power(lives: Lives, folder: Path, seed: object, operations: int, disks: int) -> PowerTally:
+def power(processes: StorageProcesses, folder: Path, seed: object, operations: int, disks: int) -> PowerTally:
     """Trace, cut the power at so many moments, and compare what is found.
 
     Raises:
         Lost: something that was acknowledged is not there, or something is half there.
     """
-    trace, worlds = record(lives, folder, seed, operations)
+    trace, worlds = record(processes, folder, seed, operations)
 
     def look(image: Path, acknowledged: int) -> None:
-        check(lives, image, worlds[acknowledged : acknowledged + 2])
+        check(processes, image, worlds[acknowledged : acknowledged + 2])
 
     return cut(folder, seed, PowerTally(operations), disks, lambda disk: moments(disk, trace), look)
 
@@ -108,7 +108,7 @@ def cut(
 
     Args:
         moments: replays the trace on a disk; after each change, how many operations were acknowledged.
-        look: compares a disk with what so many acknowledged operations allow; raises Lost or Dead.
+        look: compares a disk with what so many acknowledged operations allow; raises Lost or ProcessEnded.
 
     Raises:
         Lost: something that was acknowledged is not there, or something is half there.
@@ -126,7 +126,7 @@ def cut(
         disk.image(image, variant, Random(f"{seed}/disk/{number}"))
         try:
             look(image, acknowledged)
-        except (Dead, Lost) as lost:
+        except (ProcessEnded, Lost) as lost:
             why = str(lost) or "the directory does not open"
             raise Lost(f"seed {seed}, power cut at change {number}, {variant}: {why}") from lost
         tally.disks += 1
@@ -134,16 +134,16 @@ def cut(
     return tally
 
 
-def check(lives: Lives, directory: Path, may: Sequence[World]) -> None:
+def check(processes: StorageProcesses, directory: Path, may: Sequence[World]) -> None:
     """Open a directory and compare all of it with the worlds that may be there.
 
     Raises:
         Lost: none of them is.
-        Dead: it does not open.
+        ProcessEnded: it does not open.
     """
-    life = lives.begin(directory)
+    process = processes.begin(directory)
     try:
-        settled(may, life.voices[0].ask({"do": "contents"})["answer"])
+        settled(may, process.connections[0].ask({"do": "contents"})["answer"])
     finally:
-        life.kill()
-        life.close()
+        process.kill()
+        process.close()
