@@ -1,4 +1,4 @@
-"""Tests of the harness: it sees a loss, and its disk holds after a power cut what was synced, and all else by chance."""
+"""The harness itself: it sees a loss, and after a power cut its disk holds what was synced, and all else by chance."""
 
 from __future__ import annotations
 

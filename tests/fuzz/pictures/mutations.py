@@ -6,8 +6,8 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from tests.fuzz import exifs, jpegs, pngs, webps
-from tests.fuzz.originals import Original
+from tests.fuzz.pictures import exifs, jpegs, pngs, webps
+from tests.fuzz.pictures.originals import Original
 
 Mutation = Callable[[bytes, random.Random], bytes]
 

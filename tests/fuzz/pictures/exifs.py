@@ -6,7 +6,7 @@ import random
 import struct
 from collections.abc import Callable
 
-from tests.fuzz import jpegs, pngs, webps
+from tests.fuzz.pictures import jpegs, pngs, webps
 
 PREFIX = b"Exif\0\0"
 ORIENTATION, EXIF_FOLDER, GPS_FOLDER = 0x0112, 0x8769, 0x8825
