@@ -1,4 +1,4 @@
-"""The table of faults in the documents: each row names a test, and no test of these is missing in it."""
+"""The table of faults in docs/faults.md names every test here, one a row."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAGE = FOLDER.parents[1] / "docs" / "faults.md"
 
 
 def injecting() -> set[str]:
-    """All tests that inject faults, as the table names them."""
+    """All tests of this folder, as the table names them."""
     return {
         f"{path.name}::{node.name}"
         for path in FOLDER.glob("test_*.py")

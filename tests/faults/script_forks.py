@@ -1,7 +1,7 @@
-"""A process that has everything imported and forks one child for each script, so that a fault costs no start.
+"""Forks a child for each run of the script off a process that has imported everything, so that a run starts at once.
 
-``python -m tests.faults.nursery`` reads lines of JSON, ``[directory, go, result, indexed]`` with what
-:func:`tests.faults.script.run` is to be given, and answers each with the child's process id.
+``python -m tests.faults.script_forks`` reads lines of JSON, ``[directory, go, result, indexed]`` the
+arguments of :func:`tests.faults.script.run`, and answers each with the child's process id.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SET_TRACER, _ANY = 0x59616D61, ctypes.c_ulong(-1)
 
 
 def main() -> None:
-    """Until standard input ends."""
+    """Fork one child a line, until the input ends."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     _warm_up()
     for line in sys.stdin:
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _warm_up() -> None:
-    """Do the script once, so that all is imported and compiled; no thread that a child would miss is left."""
+    """Run the script once, so that everything is imported and compiled; leave no thread, which a child would lack."""
     faiss.omp_set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         for name in ("go", "passed"):
