@@ -43,9 +43,7 @@ def read(trace: str, **options: object) -> Report:
             OPEN + WRITE + SYNC_FOLDER + '7 unlinkat(4</data>, "a", 0) = 0\n' + ACK, [], id="removed by folder"
         ),
         pytest.param(OPEN + WRITE + SYNC + RENAME + SYNC_FOLDER + ACK, [], id="synced, then renamed"),
-        pytest.param(
-            OPEN + WRITE + SYNC + SYNC_FOLDER + RENAME + ACK, ["/data (line 5)"], id="the folder, renamed"
-        ),
+        pytest.param(OPEN + WRITE + SYNC + SYNC_FOLDER + RENAME + ACK, ["/data (line 5)"], id="the folder, renamed"),
         pytest.param(OPEN + WRITE + RENAME + SYNC_FOLDER + ACK, ["/data/b (line 2)"], id="the contents, renamed"),
         pytest.param(TRUNCATE + ACK, ["/data/a (line 1)"], id="truncation is a write"),
         pytest.param(TRUNCATE + "7 sync() = 0\n" + ACK, [], id="a sync of everything"),
