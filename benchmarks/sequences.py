@@ -3,7 +3,7 @@
     python -m benchmarks.sequences --data ../shared/datasets/eval
 
 Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
-training/alignment.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
+training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
 bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
 Nothing is told of the motion, and no map has poses.  Beside it, over 5 000 places with poses, the time that one
 frame's belief takes, against encoding a frame in the same minute.
@@ -29,9 +29,9 @@ from core.method.encoder import Encoder
 from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.recognition.stages import examine
 from core.storage import MapSettings
-from training.alignment import aligned_truth
+from training.ground_truth import corrected_truth
 from training.photographs import find_photographs, read
-from training.validation import Shown, describe
+from training.validation import Encodings, describe
 
 Truth = NDArray[np.bool_]
 
@@ -57,7 +57,7 @@ def walked(count: int) -> Whereabouts:
 
 
 def evidences(
-    encoder: Encoder, queries: Shown, references: Shown, where: Whereabouts
+    encoder: Encoder, queries: Encodings, references: Encodings, where: Whereabouts
 ) -> Iterator[tuple[int, Evidence]]:
     """Of each query in turn: its best reference alone, and what it says of all, both stages as the service has them."""
     for descriptor, local in zip(queries.descriptors, queries.local, strict=True):
@@ -92,7 +92,7 @@ def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -
     stated[rows[:, 0], rows[:, 1]] = True
     if name != "lip6_outdoor":
         return {"stated": stated}
-    return {"put right": aligned_truth(queries, references, stated), "stated": stated}
+    return {"put right": corrected_truth(queries, references, stated), "stated": stated}
 
 
 def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) -> dict[str, dict[str, Any]]:

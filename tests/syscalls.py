@@ -1,4 +1,4 @@
-"""Was everything synced before it was acknowledged?  Read from a trace of system calls.
+"""Audits a trace of system calls: was everything synced before it was acknowledged?
 
 How to use it:
 

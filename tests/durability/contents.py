@@ -1,4 +1,4 @@
-"""Everything that a data directory holds, read by the real code, as plain values that can be compared."""
+"""Reads everything that a data directory holds, by the real code, as plain values that can be compared."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import httpx
 
 from tests.fuzz import api, http, images, streams
 from tests.fuzz.encoder import SMALL, install_small_encoder
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.originals import originals
 from tests.fuzz.sending import MAP
 from tests.service.server import ROOT, Server
 

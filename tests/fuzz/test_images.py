@@ -1,4 +1,4 @@
-"""Damaged pictures: a short run of what scripts/fuzz does for hours."""
+"""Damaged pictures: a short run of what ``scripts/fuzz images`` does for hours."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from core.errors import InvalidImage
 from core.frames.exif import read_whereabouts
 from core.frames.images import Limits, decode
 from tests.fuzz import images
-from tests.fuzz.mutations import KINDS, mutant
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.mutations import KINDS, mutant
+from tests.fuzz.pictures.originals import originals
 from tests.service.server import Server
 
 ORIGINALS = originals()
