@@ -13,7 +13,7 @@ import pytest
 
 from tests.service.server import ROOT, Server
 
-DOCUMENTS = sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS = sorted((ROOT / "docs").rglob("*.md"))
 BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 # A refusal by the service is an error of the document; curl alone would not see it as one.
