@@ -1,0 +1,68 @@
+"""The commands of the documents, as they are written, against a real service."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.service.server import ROOT, Server
+
+BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+WRITTEN_ADDRESS = "http://127.0.0.1:8000"
+"""The address in the documents; the service under test listens on another port."""
+
+# A refusal by the service is an error of the document; curl alone would not see it as one.
+PRELUDE = 'curl() { command curl --fail-with-body --show-error "$@"; }\n'
+
+
+def commands(document: Path) -> str:
+    """All commands of a document; of the README those of the section that is run beside a service."""
+    text = document.read_text()
+    if document == ROOT / "README.md":
+        text = text.partition("\n## Five minutes")[2].partition("\n## ")[0]
+    return "\n".join(BLOCK.findall(text))
+
+
+PAGES = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if commands(page)]
+
+
+@pytest.mark.parametrize("document", PAGES, ids=lambda path: path.relative_to(ROOT).with_suffix("").as_posix())
+def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    shutil.copytree(ROOT / "examples", here / "examples")
+    binaries = Path(sys.executable).parent
+    (here / ".venv").symlink_to(sys.prefix)
+    drawn = subprocess.run(
+        [sys.executable, "examples/make_pictures.py", "pictures"], cwd=here, capture_output=True, timeout=100
+    )
+    assert drawn.returncode == 0, drawn.stderr
+    service = Server(tmp_path / "service").wait()
+    try:
+        root = str(service.client.base_url).rstrip("/")
+        environment = {
+            **os.environ,
+            "url": root,
+            "api": f"{root}/v1",
+            "PATH": os.pathsep.join([str(binaries), os.environ["PATH"]]),
+            "XDG_CACHE_HOME": str(tmp_path / "cache"),
+            "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
+        }
+        done = subprocess.run(
+            ["bash", "-euxo", "pipefail", "-c", PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)],
+            cwd=here,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=110,
+        )
+        assert done.returncode == 0, f"{done.stderr[-3000:]}\n{done.stdout[-3000:]}"
+    finally:
+        status = service.stop()
+    assert status == 0
