@@ -7,13 +7,16 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
+import core.recognition
 from tests.service.server import ROOT, Server
 
 BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 WRITTEN_ADDRESS = "http://127.0.0.1:8000"
 """The address in the documents; the service under test listens on another port."""
 
@@ -32,6 +35,21 @@ def commands(document: Path) -> str:
 PAGES = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if commands(page)]
 
 
+@pytest.mark.skipif(not hasattr(core.recognition, "recognize"), reason="core.recognition has no recognize yet")
+def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
+    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
+    (program,) = PYTHON.findall((ROOT / "README.md").read_text())
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    assert run([sys.executable, "-c", program], tmp_path, environment).startswith("recognized corridor ")
+
+
+def run(command: Sequence[str | Path], folder: Path, environment: Mapping[str, str]) -> str:
+    """What a command that has to succeed writes to standard output."""
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, f"{done.stderr[-3000:]}\n{done.stdout[-3000:]}"
+    return done.stdout
+
+
 @pytest.mark.parametrize("document", PAGES, ids=lambda path: path.relative_to(ROOT).with_suffix("").as_posix())
 def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) -> None:
     here = tmp_path / "here"
@@ -39,10 +57,7 @@ def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) ->
     shutil.copytree(ROOT / "examples", here / "examples")
     binaries = Path(sys.executable).parent
     (here / ".venv").symlink_to(sys.prefix)
-    drawn = subprocess.run(
-        [sys.executable, "examples/make_pictures.py", "pictures"], cwd=here, capture_output=True, timeout=100
-    )
-    assert drawn.returncode == 0, drawn.stderr
+    run([sys.executable, "examples/make_pictures.py", "pictures"], here, dict(os.environ))
     service = Server(tmp_path / "service").wait()
     try:
         root = str(service.client.base_url).rstrip("/")
@@ -54,15 +69,8 @@ def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) ->
             "XDG_CACHE_HOME": str(tmp_path / "cache"),
             "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
         }
-        done = subprocess.run(
-            ["bash", "-euxo", "pipefail", "-c", PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)],
-            cwd=here,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=110,
-        )
-        assert done.returncode == 0, f"{done.stderr[-3000:]}\n{done.stdout[-3000:]}"
+        script = PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)
+        run(["bash", "-euxo", "pipefail", "-c", script], here, environment)
     finally:
         status = service.stop()
     assert status == 0
