@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -33,6 +33,12 @@ def commands(document: Path) -> str:
 
 
 PAGES = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if commands(page)]
+OF_KEYS = ROOT / "docs" / "how-to" / "keys-and-tls.md"
+"""After its commands every request needs a key."""
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).with_suffix("").as_posix()
 
 
 @pytest.mark.skipif(not hasattr(core.recognition, "recognize"), reason="core.recognition has no recognize yet")
@@ -50,27 +56,47 @@ def run(command: Sequence[str | Path], folder: Path, environment: Mapping[str, s
     return done.stdout
 
 
-@pytest.mark.parametrize("document", PAGES, ids=lambda path: path.relative_to(ROOT).with_suffix("").as_posix())
-def test_the_commands_run_as_they_are_written(document: Path, tmp_path: Path) -> None:
-    here = tmp_path / "here"
-    here.mkdir()
-    shutil.copytree(ROOT / "examples", here / "examples")
-    binaries = Path(sys.executable).parent
-    (here / ".venv").symlink_to(sys.prefix)
-    run([sys.executable, "examples/make_pictures.py", "pictures"], here, dict(os.environ))
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The service of all pages but that which creates keys."""
+    service = Server(tmp_path_factory.mktemp("shared")).wait()
+    yield service
+    assert service.stop() == 0
+
+
+@pytest.mark.parametrize("document", [page for page in PAGES if page != OF_KEYS], ids=name_of)
+def test_the_commands_run_as_they_are_written(document: Path, shared: Server, tmp_path: Path) -> None:
+    try:
+        run_page(document, shared, tmp_path)
+    finally:
+        for item in shared.client.get("/v1/maps").json()["items"]:
+            shared.client.delete(f"/v1/maps/{item['id']}")
+
+
+def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path) -> None:
     service = Server(tmp_path / "service").wait()
     try:
-        root = str(service.client.base_url).rstrip("/")
-        environment = {
-            **os.environ,
-            "url": root,
-            "api": f"{root}/v1",
-            "PATH": os.pathsep.join([str(binaries), os.environ["PATH"]]),
-            "XDG_CACHE_HOME": str(tmp_path / "cache"),
-            "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
-        }
-        script = PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)
-        run(["bash", "-euxo", "pipefail", "-c", script], here, environment)
+        run_page(OF_KEYS, service, tmp_path)
     finally:
         status = service.stop()
     assert status == 0
+
+
+def run_page(document: Path, service: Server, folder: Path) -> None:
+    """Run all commands of a document in a folder with the examples and their pictures."""
+    here = folder / "here"
+    here.mkdir()
+    shutil.copytree(ROOT / "examples", here / "examples")
+    (here / ".venv").symlink_to(sys.prefix)
+    run([sys.executable, "examples/make_pictures.py", "pictures"], here, dict(os.environ))
+    root = str(service.client.base_url).rstrip("/")
+    environment = {
+        **os.environ,
+        "url": root,
+        "api": f"{root}/v1",
+        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
+    }
+    script = PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)
+    run(["bash", "-euxo", "pipefail", "-c", script], here, environment)
