@@ -84,10 +84,10 @@ class ImportParameters(Parameters):
 async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports: ExportsDep) -> Response:
     """Download a map as one file: a tar of its settings, places, descriptors, pictures and cameras.
 
-    The file is that of one moment, whatever is enrolled or deleted while it is on its way; `docs/backup.md` tells
-    what it holds. A download that broke off goes on with `Range` and `If-Range` (or `If-Match`), as long as that
-    moment is kept. `If-None-Match` answers 304 for a map that holds what it held. The SHA-256 of every part stands
-    in the manifest, that of the manifest in the ETag.
+    The file is that of one moment, whatever is enrolled or deleted while it is on its way;
+    `docs/reference/exports.md` tells what it holds. A download that broke off goes on with `Range` and `If-Range`
+    (or `If-Match`), as long as that moment is kept. `If-None-Match` answers 304 for a map that holds what it held.
+    The SHA-256 of every part stands in the manifest, that of the manifest in the ETag.
     """
     export = exports.find(map_id, named_tags(request.headers))
     if export is None:
