@@ -31,7 +31,7 @@ from service.http.dependencies import (
 from service.http.openapi import json_patch
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
+from service.maps import storage_jobs
 from service.maps.limits import check_room
 from service.maps.schemas import (
     CalibrationChanges,
@@ -216,5 +216,5 @@ def verify_map(
     """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
     if not background:
         return engine.atlas.verify(map_id)
-    job = jobs.submit(rebuilding.VERIFY, map_id, arguments={}, maps=rebuilding.incarnation(engine, map_id))
+    job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))
     return accepted(job, engine.settings)

@@ -26,11 +26,11 @@ from service.errors.problems import problem_documentation
 from service.http.bodies import StrictRoute
 from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
 from service.http.parameters import Parameters
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
+from service.maps import storage_jobs
 from service.maps.limits import check_free
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import key_of
@@ -68,7 +68,7 @@ def submit(
     Raises:
         JobQueueFull, StorageFull, StorageFailure.
     """
-    maps = {one.record.id: born(one) for one in (map_, *others)}
+    maps = {one.record.id: creation_time(one) for one in (map_, *others)}
     job = jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
     response.headers["Location"] = location_of(job, engine.settings)
     return JobView.of(job)
@@ -107,7 +107,7 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     map whose places are not what they were when its codes were learnt, or whose caches somebody put back from a
     backup. A map that is searched exactly has nothing to be made.
     """
-    return submit(engine, jobs, response, rebuilding.REBUILD, {}, engine.atlas.get(map_id))
+    return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))
