@@ -32,7 +32,7 @@ from service.http.openapi import json_patch
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
-from service.maps.limits import check_room
+from service.maps.limits import check_map_count
 from service.maps.schemas import (
     CalibrationChanges,
     MapChanges,
@@ -92,7 +92,7 @@ def create_map(
     encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
-        check_room(engine)
+        check_map_count(engine)
         map_ = engine.atlas.create(
             new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
         )

@@ -31,7 +31,7 @@ from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
-from service.maps.limits import check_free
+from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import key_of
 from service.upkeep import merging, pruning, reencoding
@@ -95,7 +95,7 @@ def reencode_map(
     map_ = engine.atlas.get(map_id)
     identity = engine.resolve(wanted.encoder)
     reencoding.check_images(map_)
-    check_free(engine, jobs, wanted.to)
+    check_new_map(engine, jobs, wanted.to)
     return submit(engine, jobs, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
 
 
