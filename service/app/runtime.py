@@ -14,7 +14,7 @@ from core.errors import PlacerecError
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
-from service.maps import calibration, rebuilding
+from service.maps import calibration, storage_jobs
 from service.maps.exports import Exports
 from service.maps.imports import Imports
 from service.places import bulk_enrolment
@@ -73,8 +73,8 @@ class Runtime:
         register(reencoding.KIND, partial(reencoding.reencode, engine))
         register(pruning.KIND, partial(pruning.prune, engine))
         register(merging.KIND, partial(merging.merge, engine))
-        register(rebuilding.REBUILD, partial(rebuilding.rebuild, engine))
-        register(rebuilding.VERIFY, partial(rebuilding.verify, engine))
+        register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
+        register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
         register(calibration.KIND, partial(calibration.calibrate, engine))
         register(
             bulk_enrolment.KIND,

@@ -73,7 +73,7 @@ class JobContext:
         """
         name = str(self.map_id) if map_id is None else map_id
         found = atlas.get(name)
-        if name in self.maps and self.maps[name] != born(found):
+        if name in self.maps and self.maps[name] != creation_time(found):
             raise UnknownMap(
                 f"The map {name!r} was deleted since the job was asked for; the one of that id now is another."
             )
@@ -137,8 +137,8 @@ class JobContext:
         self.check_cancelled()
 
 
-def born(map_: Map) -> str:
-    """What tells a map from later ones of the same id: when it was created."""
+def creation_time(map_: Map) -> str:
+    """When a map was created, as ISO 8601: this tells it from a later map of the same id."""
     return map_.record.created_at.isoformat()
 
 

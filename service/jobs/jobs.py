@@ -138,8 +138,8 @@ class Jobs:
         Args:
             work: what it does; without it the kind is a registered one, which survives a restart.
             arguments: for the work, as JSON.
-            maps: those that it is asked for, by id, and when each was created (``job_context.born``): the job fails
-                rather than to work on a later one of the same id.
+            maps: creation times (``service.jobs.context.creation_time``) of the maps that it works on, by id: the job
+                fails rather than work on a later map of the same id.
 
         Raises:
             JobQueueFull: too many wait.

@@ -1,4 +1,4 @@
-"""How many maps there may be, and whether a map of a given id can be made."""
+"""Checks before a map is made: how many maps there may be, and whether the id is free."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from service.errors.faults import TooManyMaps
 from service.jobs.jobs import Jobs
 
 
-def check_room(engine: Engine) -> None:
-    """See that there is room for one more map; damaged maps and maps that are being made count as well.
+def check_map_count(engine: Engine) -> None:
+    """Check that one more map may be made; damaged maps and maps that are being made count, too.
 
     Raises:
-        TooManyMaps: there is none.
+        TooManyMaps: there are as many maps as the settings allow.
     """
     most = engine.settings.max_maps
     count = len(engine.all_records()) + len(engine.atlas.quarantined()) + len(engine.atlas.unlisted())
     if count >= most:
-        raise TooManyMaps(f"There are {count} maps of at most {most}; delete one that is not needed.")
+        raise TooManyMaps(f"There are {count} maps, and at most {most} are allowed; delete one that is not needed.")
 
 
-def check_free(engine: Engine, jobs: Jobs, map_id: str) -> None:
-    """See that a map of this id can be made.
+def check_new_map(engine: Engine, jobs: Jobs, map_id: str) -> None:
+    """Check that a map of this id may be made.
 
     Raises:
-        MapExists: there is one, or a job is to make one.
-        TooManyMaps: there are as many maps as there may be.
+        MapExists: there is one, or one is being made, or a job is going to make one.
+        TooManyMaps: there are as many maps as the settings allow.
     """
-    check_room(engine)
+    check_map_count(engine)
     pending = {job.arguments.get("to") for job in jobs.all() if not job.ended}
     if map_id in pending or map_id in engine.atlas.unlisted():
         raise MapExists(f"A map {map_id!r} is being made.")

@@ -22,8 +22,8 @@ from service.http.route_classes import StrictRoute
 from service.http.schemas import PageParameters
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
-from service.maps.limits import check_room
+from service.maps import storage_jobs
+from service.maps.limits import check_map_count
 from service.maps.schemas import (
     CalibrationChanges,
     MapChanges,
@@ -83,7 +83,7 @@ def create_map(
     encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
-        check_room(engine)
+        check_map_count(engine)
         map_ = engine.atlas.create(
             new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
         )
@@ -207,5 +207,5 @@ def verify_map(
     """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
     if not background:
         return engine.atlas.verify(map_id)
-    job = jobs.submit(rebuilding.VERIFY, map_id, arguments={}, maps=rebuilding.incarnation(engine, map_id))
+    job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))
     return accepted(job, engine.settings)

@@ -20,7 +20,7 @@ from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.context import JobContext, born, run_behind
+from service.jobs.context import JobContext, creation_time, run_behind
 from service.jobs.jobs import Jobs
 from service.jobs.records import Job
 from service.places.batches import candidate_of, check_batch, check_own, given_id
@@ -69,7 +69,7 @@ def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str) 
     """Let a job wait for a form, which is removed if there comes none."""
     try:
         count = len(_entries(engine, staging.open(name))[0])
-        maps = {map_.record.id: born(map_)}
+        maps = {map_.record.id: creation_time(map_)}
         return jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
     except BaseException:
         staging.remove(name)

@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
 import shutil
 import threading
-from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
-from core.disk.files import disk_errors, sync_folder, write_at, write_file
+from core.disk.files import disk_errors, write_at, write_file
 from core.errors import StorageFailure, StorageFull
 from service.errors.faults import StagingFull
+from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
 from service.http.multipart import FormReader, Part
 from service.worker_threads import to_its_end
@@ -191,19 +190,18 @@ class Staging:
             StorageFull, StorageFailure: nothing of it is left.
             Others: what ``chunks`` raises; nothing of it is left either.
         """
-        name = secrets.token_hex(8)
+        arrival = Arrival(self._folder, "store the frames", inside="form")
+        name = arrival.name
         self._claim(name, announced)
-        form = _Arriving(self._folder / f".{name}", self._folder / name)
         try:
-            await to_its_end(lambda: form.open(self._expect_room))
-            writer = _Writer(content_type, max_parts, max_part_bytes, form.file)
-            async for piece in in_pieces(chunks):
-                await to_its_end(partial(_feed, writer, piece))
-                self._coming[name] = max(0, self._coming[name] - len(piece))
-            writer.close()
-            size = await to_its_end(lambda: form.finish(writer.staged))
+            async with arriving(arrival, self._expect_room):
+                writer = _Writer(content_type, max_parts, max_part_bytes, arrival.file)
+                async for piece in in_pieces(chunks):
+                    await to_its_end(partial(_feed, writer, piece))
+                    self._coming[name] = max(0, self._coming[name] - len(piece))
+                writer.close()
+                size = await to_its_end(lambda: _complete(arrival, writer.staged))
         except BaseException:
-            await to_its_end(form.discard)
             with self._lock:
                 del self._sizes[name], self._coming[name]
             raise
@@ -213,43 +211,13 @@ class Staging:
         return name
 
 
-class _Arriving:
-    """The folder of a form that is being written; from one thread at a time."""
-
-    def __init__(self, folder: Path, there: Path) -> None:
-        self._folder, self._there = folder, there
-        self.file = -1
-
-    def open(self, expect_room: Callable[[], None]) -> None:
-        with disk_errors(f"write {self._folder}"):
-            self._folder.mkdir(parents=True)
-            expect_room()
-            self.file = os.open(self._folder / "form", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-
-    def finish(self, staged: Sequence[StagedPart]) -> int:
-        """Sync it and give it its name; its size."""
-        with disk_errors(f"write {self._there}"):
-            os.fsync(self.file)
-            size = os.fstat(self.file).st_size
-            write_file(self._folder / "parts", json.dumps([asdict(part) for part in staged]).encode())
-            os.rename(self._folder, self._there)
-            sync_folder(self._there.parent)
-            sync_folder(self._there.parent.parent)
-        self._close()
-        return size
-
-    def discard(self) -> None:
-        """Remove what there is of it, under either name."""
-        self._close()
-        for folder in (self._folder, self._there):
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def _close(self) -> None:
-        file, self.file = self.file, -1
-        if file >= 0:
-            os.close(file)
+def _complete(arrival: Arrival, staged: Sequence[StagedPart]) -> int:
+    """Write the list of the parts beside their bytes, and complete the form; returns the bytes of the parts."""
+    with disk_errors("store the frames"):
+        write_file(arrival.temporary / "parts", json.dumps([asdict(part) for part in staged]).encode())
+    return arrival.complete()
 
 
 def _feed(writer: _Writer, data: bytes) -> None:
-    with disk_errors("write down what arrives"):
+    with disk_errors("store the frames"):
         writer.feed(data)

@@ -20,7 +20,7 @@ from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.context import JobContext, JobInterrupted, born, encode_behind
+from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_behind
 
 KIND = "re-encode"
 
@@ -73,7 +73,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 def _is_published(engine: Engine, target: str, made: str) -> bool:
     try:
-        return born(engine.atlas.find(target)) == made
+        return creation_time(engine.atlas.find(target)) == made
     except UnknownMap:
         return False
 
@@ -206,7 +206,7 @@ class _Reencoding:
             "places": self.made.count_places(),
             "left_out": {"count": len(self.left_out), "places": named},
         }
-        self.context.remember(result=result, made=born(self.made))
+        self.context.remember(result=result, made=creation_time(self.made))
         self.engine.atlas.publish(self.target)
         return result
 

@@ -26,12 +26,12 @@ from service.errors.problems import problem_documentation
 from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
 from service.http.route_classes import StrictRoute
 from service.http.schemas import Parameters
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
-from service.maps.limits import check_free
+from service.maps import storage_jobs
+from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import key_of
 from service.upkeep import merging, pruning, reencoding
@@ -69,7 +69,7 @@ def submit(
     Raises:
         JobQueueFull, StorageFull, StorageFailure.
     """
-    maps = {one.record.id: born(one) for one in (map_, *others)}
+    maps = {one.record.id: creation_time(one) for one in (map_, *others)}
     job = jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
     response.headers["Location"] = location_of(job, engine.settings)
     return JobView.of(job)
@@ -96,7 +96,7 @@ def reencode_map(
     map_ = engine.atlas.get(map_id)
     identity = engine.resolve(wanted.encoder)
     reencoding.check_images(map_)
-    check_free(engine, jobs, wanted.to)
+    check_new_map(engine, jobs, wanted.to)
     return submit(engine, jobs, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
 
 
@@ -108,7 +108,7 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     map whose places are not what they were when its codes were learnt, or whose caches somebody put back from a
     backup. A map that is searched exactly has nothing to be made.
     """
-    return submit(engine, jobs, response, rebuilding.REBUILD, {}, engine.atlas.get(map_id))
+    return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))

@@ -243,7 +243,7 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
             )
 
         monkeypatch.setattr(calibrating, "measured", measured)
-        monkeypatch.setattr(calibrating, "load_encoder", lambda *_: None)
+        monkeypatch.setattr(runtime.engine, "load_encoder", lambda _: None)
         wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
         happens: Calibration | None = manual
         job = end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted))

@@ -17,7 +17,7 @@ from core.storage.files import segment_files as descriptors
 from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
 from service.maps import imports
-from service.maps.imports import Arrived
+from service.maps.imports import ReceivedFile
 from tests.core.storage.archives.files import exported
 from tests.service.engines import ENCODER, enrolments, runtime_at
 
@@ -34,7 +34,7 @@ async def chunks(data: bytes) -> AsyncIterator[bytes]:
     yield data
 
 
-async def received(runtime: Runtime, data: bytes) -> Arrived:
+async def received(runtime: Runtime, data: bytes) -> ReceivedFile:
     return await runtime.imports.receive(chunks(data), 0, [], lambda _: "lab")
 
 

@@ -76,7 +76,7 @@ async def test_what_does_not_come_whole_leaves_nothing(tmp_path: Path, monkeypat
         with pytest.raises(StorageFull):
             await received(staging, body(one=b"1"))
     with monkeypatch.context() as disk:
-        disk.setattr("service.places.staging.os.fsync", full)
+        disk.setattr("os.fsync", full)
         with pytest.raises(StorageFull):
             await received(staging, body(one=b"1"))
     assert left(tmp_path) == []

@@ -9,9 +9,11 @@ import pytest
 
 from core.storage import MapSettings
 from core.storage.transfer import Transfer
+from service.engine.engine import Engine
 from service.jobs.context import JobInterrupted
 from service.upkeep import pruning
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
+from tests.service.upkeep.upkeeping import wait_until
 
 GOING = ("l1", "l3", "l5")
 
@@ -23,11 +25,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
     planned = 0
 
-    def plan(engine: Any, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
+    def plan(engine: Engine, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
         nonlocal planned
         planned += 1
         assert planned == 1, "a second plan would thin what was thinned"
-        there = runtime.engine.atlas.get("lab").transfer.outline()
+        there = engine.atlas.get("lab").transfer.outline()
         return {"removed": 3}, {place.id: place.digest.hex() for place in there if place.id in GOING}
 
     monkeypatch.setattr(pruning, "_plan", plan)
@@ -47,8 +49,7 @@ def test_a_kill_around_the_commit(folder: Path, monkeypatch: pytest.MonkeyPatch,
     with runtime_at(folder) as runtime, monkeypatch.context() as broken:
         broken.setattr(Transfer, "forget", broken_off)
         job = runtime.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False})
-        while not runtime.jobs.stopping:
-            pass
+        wait_until(lambda: runtime.jobs.stopping)
     with runtime_at(folder) as runtime:
         done = end_of(runtime, job)
         assert (done.state, done.attempt, done.result) == ("succeeded", 2, {"removed": 3, "places_after": 5})
