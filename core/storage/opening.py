@@ -22,12 +22,18 @@ from core.disk.sqlite_file import transaction
 from core.index import Codes, CodeTable
 from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.places import Pose, microseconds
-from core.storage.database import ledger
-from core.storage.database import row_checksums as seals
+from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
 from core.storage.database.ledger import NamedSegment, named_segments
-from core.storage.database.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
+from core.storage.database.schema import (
+    NO_SEQUENCE,
+    check_schema,
+    migrate,
+    rebuild_metadata_index,
+    stale_metadata_index,
+    wrong_sequence_ends,
+)
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.arrays import StaleArrays
@@ -92,7 +98,7 @@ def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     """The map's record and the layout of its segment files.
 
     Raises:
-        Damage: the record makes no sense.
+        Damage: the record is invalid.
     """
     try:
         record, rows_per_segment = ledger.read_record(connection)
@@ -184,13 +190,13 @@ def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
         ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
         if line != "ok":
             raise Damage(f"{FILE}: {line}")
-    if broken := seals.broken(connection, "places"):
+    if broken := row_checksums.mismatched(connection, "places"):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := cut_sequences(connection):
+    if found := wrong_sequence_ends(connection):
         raise Damage(f"{FILE}: {found[0]}")
-    if found := misfiled(connection):  # it can be made again from the places, which are sound
+    if found := stale_metadata_index(connection):  # it can be made again from the places, which are sound
         log.warning("The index of the metadata of map %s is rebuilt: %s.", folder.name, found[0])
-        refile(connection)
+        rebuild_metadata_index(connection)
 
 
 def read_snapshot(
@@ -292,7 +298,7 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
         raise Damage(f"map.sqlite: {validation_message(error)}") from error
     except TypeError as error:  # NULL where the tables allow none
         database.close()
-        raise Damage(f"{FILE}: a value makes no sense: {error}") from error
+        raise Damage(f"{FILE}: a value is invalid: {error}") from error
     except BaseException:
         database.close()
         raise

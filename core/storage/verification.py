@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage
-from core.storage.database import row_checksums as seals
+from core.storage.database import row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
 from core.storage.database.ledger import NamedSegment, named_segments
@@ -107,7 +107,7 @@ def inspect(
     with findings.noting():
         _check_tables(connection, findings)
     with findings.noting():
-        _check_seals(connection, findings)
+        _check_row_checksums(connection, findings)
     with findings.noting():
         findings.problems += [f"{FILE}: {found}" for found in contradictions(connection)]
     with findings.noting():
@@ -141,9 +141,9 @@ def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
         findings.problems.append(f"{FILE}: row {row} of {table} belongs to nothing in {parent}")
 
 
-def _check_seals(connection: sqlite3.Connection, findings: _Findings) -> None:
+def _check_row_checksums(connection: sqlite3.Connection, findings: _Findings) -> None:
     for table, kind in (("map", "map"), ("places", "place"), ("cameras", "camera")):
-        names = seals.broken(connection, table)
+        names = row_checksums.mismatched(connection, table)
         for name in names[:_MOST_LISTED]:
             findings.problems.append(f"{FILE}: {kind} {name!r} does not match its checksum")
         if len(names) > _MOST_LISTED:

@@ -259,7 +259,7 @@ class FailedWrites:
             Damage: rows of successful writes are missing or damaged.
         """
         if self._log:
-            opened.database.settle()
+            opened.database.empty_log()
             self._log = False
         if self._rows:
             descriptors.rewind(self._folder, opened.layout, rows)

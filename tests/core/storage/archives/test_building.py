@@ -113,17 +113,17 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a picture of no kind": (line(PLACES, 5, picture={**KEPT, "kind": "none"}), "picture"),
     "pictures left over": (raw(PICTURES, lambda d: d + b"more"), "longer"),
     "pictures too few": (raw(PICTURES, lambda d: d[:-1]), "shorter"),
-    "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), "is to have"),
-    "descriptors too few": (raw(FRAMES, lambda d: d[:-47]), "is to have"),
-    "a descriptor of zeros": (descriptor(), "none that can be compared"),
-    "a descriptor that is no number": (descriptor(1, np.nan), "none that can be compared"),
-    "an infinite descriptor": (descriptor(1, np.inf), "none that can be compared"),
+    "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), ", not 9 times"),
+    "descriptors too few": (raw(FRAMES, lambda d: d[:-47]), ", not 9 times"),
+    "a descriptor of zeros": (descriptor(), "cannot be compared"),
+    "a descriptor that is no number": (descriptor(1, np.nan), "cannot be compared"),
+    "an infinite descriptor": (descriptor(1, np.inf), "cannot be compared"),
     "a line too few": (raw(PLACES, lambda d: d[: d.rindex(b"\n", 0, -1) + 1]), "lines, not 9|longer"),
     "a line too many": (
         raw(PLACES, lambda d: d + d.splitlines(keepends=True)[0].replace(b"p0", b"p99")),
         "more lines, not 9",
     ),
-    "no end of line": (raw(PLACES, lambda d: d[:-1]), "end of a line"),
+    "no end of line": (raw(PLACES, lambda d: d[:-1]), "end with a line end"),
     "an empty line": (raw(PLACES, lambda d: d.replace(b"\n", b"\n\n", 1)), "is not JSON"),
     "no UTF-8": (raw(PLACES, lambda d: d.replace(b"p0", b"\xff\xfe", 1)), "UTF-8"),
     "no object": (raw(PLACES, lambda d: b"[]\n" + d.split(b"\n", 1)[1]), "line 1"),
@@ -210,7 +210,7 @@ def test_large_pictures_are_not_even_read(content: bytes, shelf: Atlas, tmp_path
 def test_places_that_nothing_could_hold(content: bytes, values: dict[str, Any], precision: str) -> None:
     manifest = parts_of(content)[0]
     manifest["map"] |= {**values, "precision": precision}
-    with pytest.raises(InvalidArchive, match="what cannot be"):
+    with pytest.raises(InvalidArchive, match="is impossible"):
         layout_of(Manifest.model_validate(manifest))
 
 
