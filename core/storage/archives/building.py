@@ -23,14 +23,14 @@ from core.storage.archives.reading import Archive, PartReader
 from core.storage.cameras import MOST_CAMERAS
 from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE, connect
-from core.storage.database.ledger import moment_text, named_segments
+from core.storage.database.ledger import moment_text, segment_entries
 from core.storage.database.schema import NO_SEQUENCE
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder
 from core.storage.records import MapRecord
-from core.storage.writing import name_appended
+from core.storage.writing import record_appended
 
 CHUNK_BYTES = 16 << 20
 """Bytes of descriptors that are written, synced and committed together."""
@@ -200,7 +200,7 @@ class _Building:
             for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
                 self._insert(line, row, checksum, images)
             row_checksums.write_checksums(self.connection, "places", "row >= ?", self.rows)
-            name_appended(self.connection, self.layout, self.rows, checksums)
+            record_appended(self.connection, self.layout, self.rows, checksums)
         self.rows += len(chunk)
         self.advance(self.rows, self.archive.manifest.places)
 
@@ -272,7 +272,7 @@ class _Building:
         for (line,) in self.connection.execute("PRAGMA quick_check").fetchall():
             if line != "ok":
                 raise Damage(f"{FILE}: {line}")
-        if sum(segment.rows for segment in named_segments(self.connection, self.layout)) != self.rows:
+        if sum(segment.rows for segment in segment_entries(self.connection, self.layout)) != self.rows:
             raise Damage(f"{FILE} does not record the rows that were written")
 
 

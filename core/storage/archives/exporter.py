@@ -39,7 +39,7 @@ from core.storage.archives.virtual_archive import ROW, ROWS, LinkedSegments, Vir
 from core.storage.cameras import Access
 from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE
-from core.storage.database.ledger import named_segments
+from core.storage.database.ledger import segment_entries
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.opening import OpenMap, read_layout
 
@@ -103,8 +103,8 @@ class Exporter:
             for table in ("places", "cameras"):
                 if broken := row_checksums.mismatched(connection, table):
                     raise Damage(f"{FILE}: {broken[0]!r} of {table} does not match its checksum")
-            named = named_segments(connection, layout)
-            for segment in named:
+            entries = segment_entries(connection, layout)
+            for segment in entries:
                 if segment.removed:
                     continue
                 self._expect_there()

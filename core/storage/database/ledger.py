@@ -54,7 +54,7 @@ class StoredPlace:
 
 
 @dataclass(frozen=True)
-class NamedSegment:
+class SegmentEntry:
     """What SQLite records of a segment file.
 
     number: counted from 0.
@@ -360,7 +360,7 @@ def delete_sequence(connection: sqlite3.Connection, name: str) -> None:
 # Segment files
 
 
-def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[NamedSegment]:
+def segment_entries(connection: sqlite3.Connection, layout: Layout) -> list[SegmentEntry]:
     """The segments in their order.
 
     Raises:
@@ -368,7 +368,7 @@ def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[Named
     """
     query = "SELECT number, rows, checksum, removed FROM segments ORDER BY number"
     rows = connection.execute(query).fetchall()
-    found = [NamedSegment(number, count, checksum, bool(removed)) for number, count, checksum, removed in rows]
+    found = [SegmentEntry(number, count, checksum, bool(removed)) for number, count, checksum, removed in rows]
     for position, segment in enumerate(found):
         if not all(isinstance(value, int) for value in (segment.number, segment.rows, segment.checksum)):
             raise Damage(f"map.sqlite: its entry of segment {position + 1} is invalid")
@@ -378,7 +378,7 @@ def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[Named
     return found
 
 
-def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
+def put_segment_entry(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
     """Record that a segment file holds ``rows`` rows, and the checksum of their checksums."""
     statement = "INSERT OR REPLACE INTO segments (number, rows, checksum) VALUES (?, ?, ?)"
     connection.execute(statement, (segment, rows, checksum))

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from core.index import Coder, Codes, InvertedLists
-from core.storage.database.ledger import NamedSegment
+from core.storage.database.ledger import SegmentEntry
 from core.storage.files.arrays import Arrays, StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
 from core.storage.search.tiers import Recall, Tier
@@ -76,20 +76,20 @@ class IndexFiles:
         """Write the map's coder; returns whether it was written."""
         return write_arrays(self._folder / "coder.index", "coder", self._map, coder.tensors())
 
-    def named_group(self, named: Sequence[NamedSegment], group: int) -> Sequence[NamedSegment]:
+    def group_entries(self, entries: Sequence[SegmentEntry], group: int) -> Sequence[SegmentEntry]:
         """The segments of a group; empty after the last group."""
-        return named[group * self.group_size : (group + 1) * self.group_size]
+        return entries[group * self.group_size : (group + 1) * self.group_size]
 
-    def _group_of(self, coder: Coder, named: Sequence[NamedSegment]) -> str:
-        listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in named])
+    def _group_of(self, coder: Coder, entries: Sequence[SegmentEntry]) -> str:
+        listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in entries])
         return f"{self._made_by(coder)} {hashlib.sha256(listed.encode()).hexdigest()}"
 
-    def read_codes(self, coder: Coder, named: Sequence[NamedSegment]) -> Codes:
-        """Read the codes of the rows of a group, whose segments are ``named``."""
-        path = self._folder / codes_name(named[0].number // self.group_size)
-        arrays = read_arrays(path, "codes", self._group_of(coder, named))
+    def read_codes(self, coder: Coder, entries: Sequence[SegmentEntry]) -> Codes:
+        """Read the codes of the rows of a group, whose segments are ``entries``."""
+        path = self._folder / codes_name(entries[0].number // self.group_size)
+        arrays = read_arrays(path, "codes", self._group_of(coder, entries))
         sketches, bits, scales = coder.shape
-        rows = sum(segment.rows for segment in named)
+        rows = sum(segment.rows for segment in entries)
         wanted = {
             "sketches": ((rows, sketches), np.dtype("<u8")),
             "bits": ((rows, bits), np.dtype("<u8")),
@@ -99,16 +99,16 @@ class IndexFiles:
             raise StaleArrays("it holds other codes than expected")
         return Codes(arrays["sketches"], arrays["bits"], arrays["scales"])
 
-    def write_codes(self, coder: Coder, named: Sequence[NamedSegment], codes: Codes) -> bool:
+    def write_codes(self, coder: Coder, entries: Sequence[SegmentEntry], codes: Codes) -> bool:
         """Write the codes of a group; returns whether they were written."""
-        path = self._folder / codes_name(named[0].number // self.group_size)
+        path = self._folder / codes_name(entries[0].number // self.group_size)
         arrays: Arrays = {"sketches": codes.sketches, "bits": codes.bits, "scales": codes.scales}
-        return write_arrays(path, "codes", self._group_of(coder, named), arrays)
+        return write_arrays(path, "codes", self._group_of(coder, entries), arrays)
 
-    def read_lists(self, coder: Coder, rows: int, named: Sequence[NamedSegment]) -> tuple[InvertedLists, int]:
+    def read_lists(self, coder: Coder, rows: int, entries: Sequence[SegmentEntry]) -> tuple[InvertedLists, int]:
         """Read the lists of at most ``rows`` rows, and how many rows there were when their centres were computed.
 
-        Lists are stale if the full segments among their rows are not those of ``named``.
+        Lists are stale if the full segments among their rows are not those of ``entries``.
         """
         arrays = read_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
         try:
@@ -118,19 +118,19 @@ class IndexFiles:
             raise StaleArrays(f"it holds no lists: {error}") from error
         if lists.rows > rows:
             raise StaleArrays("it lists rows that do not exist")
-        if listed != self._full_within(named, lists.rows):
+        if listed != self._full_within(entries, lists.rows):
             raise StaleArrays("it lists other rows than those of the map")
         return lists, centred
 
-    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int, named: Sequence[NamedSegment]) -> bool:
+    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int, entries: Sequence[SegmentEntry]) -> bool:
         """Write the lists; returns whether they were written."""
-        listed = np.frombuffer(self._full_within(named, lists.rows), np.uint8)
+        listed = np.frombuffer(self._full_within(entries, lists.rows), np.uint8)
         arrays = {**lists.tensors(), _CENTRED: np.array([centred]), _LISTED: listed}
         return write_arrays(self._folder / "lists.index", "lists", self._made_by(coder), arrays)
 
-    def _full_within(self, named: Sequence[NamedSegment], rows: int) -> bytes:
+    def _full_within(self, entries: Sequence[SegmentEntry], rows: int) -> bytes:
         """A digest of the full segments among the first ``rows`` rows; full segments never change."""
-        full = named[: rows // self._rows_per_segment]
+        full = entries[: rows // self._rows_per_segment]
         listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in full])
         return hashlib.sha256(listed.encode()).digest()
 
@@ -149,7 +149,7 @@ class IndexFiles:
         made_of = f"{self._made_by(coder)} {tier}"
         return write_arrays(self._folder / "recall.index", "recall", made_of, {"recall": values})
 
-    def check(self, named: Sequence[NamedSegment], tier: Tier) -> tuple[int, list[str]]:
+    def check(self, entries: Sequence[SegmentEntry], tier: Tier) -> tuple[int, list[str]]:
         """Read all files that a map of this tier should have; returns the bytes checked, and which files are stale."""
         if tier == "exact":
             return 0, []
@@ -159,7 +159,7 @@ class IndexFiles:
             checked += check_arrays(self._folder / "coder.index", "coder", self._map)
         except StaleArrays as error:
             return 0, [f"coder.index: {error}"]
-        full = [self.named_group(named, group) for group in range(len(named) // self.group_size)]
+        full = [self.group_entries(entries, group) for group in range(len(entries) // self.group_size)]
         for group in full:
             if group[-1].rows < group[0].rows:
                 continue  # the group still grows
@@ -171,7 +171,7 @@ class IndexFiles:
         if tier == "inverted":
             try:
                 checked += check_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
-                self.read_lists(coder, sum(segment.rows for segment in named), named)
+                self.read_lists(coder, sum(segment.rows for segment in entries), entries)
             except StaleArrays as error:
                 stale.append(f"lists.index: {error}")
         return checked, stale

@@ -20,7 +20,7 @@ import numpy as np
 from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, CodeTable, InvertedLists
-from core.storage.database.ledger import NamedSegment
+from core.storage.database.ledger import SegmentEntry
 from core.storage.files.arrays import StaleArrays
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.rebuilding import codes_of, fitted_coder, rebuilt
@@ -50,14 +50,14 @@ class IndexedMap:
     snapshot: returns the newest snapshot.
     publish: replaces the newest snapshot by a change of it, while no write can happen; raises Stopped if the map was
         closed.
-    named: returns the segments as SQLite has them.
+    entries: returns the segments as SQLite has them.
     quarantine: takes the map out of service, because it is damaged.
     """
 
     setting: Callable[[], TierSetting]
     snapshot: Callable[[], Snapshot]
     publish: Callable[[Callable[[Snapshot], Snapshot]], Snapshot]
-    named: Callable[[], Sequence[NamedSegment]]
+    entries: Callable[[], Sequence[SegmentEntry]]
     quarantine: Callable[[Damage], None]
 
 
@@ -84,7 +84,7 @@ class Indexer:
         self._stopping = threading.Event()
         self._progress = 0.0
         self._recall: tuple[Tier, Recall] | None = None
-        self._written: set[tuple[NamedSegment, ...]] = set()
+        self._written: set[tuple[SegmentEntry, ...]] = set()
         self._centred = 0  # rows when the centres of the lists were computed
 
     def wake(self) -> None:
@@ -228,7 +228,7 @@ class Indexer:
             self._keep_codes()
             if made.lists is not None:
                 self._centred = made.lists.rows
-                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.named())
+                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.entries())
         finally:
             self._building.release()
             self.wake()
@@ -262,11 +262,11 @@ class Indexer:
 
     def _code_group(self, coder: Coder, start: int) -> Snapshot:
         """Add the codes of the next rows: those of a whole group from its file if that is good, else computed ones."""
-        named = self._map.named()
+        entries = self._map.entries()
         newest = self._map.snapshot()
         per_segment = newest.rows_per_segment
         group = start // per_segment // self._files.group_size
-        of_group = self._files.named_group(named, group)
+        of_group = self._files.group_entries(entries, group)
         if start == group * self._files.group_size * per_segment:
             with suppress(StaleArrays):
                 codes = self._files.read_codes(coder, of_group)
@@ -279,11 +279,11 @@ class Indexer:
         newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None:
             newest = self._publish(lambda now: now.holding(number, None))
-        if stop == sum(segment.rows for segment in named[: (group + 1) * self._files.group_size]):
+        if stop == sum(segment.rows for segment in entries[: (group + 1) * self._files.group_size]):
             self._keep_group(of_group)
         return newest
 
-    def _keep_group(self, of_group: Sequence[NamedSegment]) -> None:
+    def _keep_group(self, of_group: Sequence[SegmentEntry]) -> None:
         snapshot = self._map.snapshot()
         first = of_group[0].number * snapshot.rows_per_segment
         if tuple(of_group) in self._written or snapshot.table is None:
@@ -294,16 +294,16 @@ class Indexer:
 
     def _keep_codes(self) -> None:
         """Write the codes of every complete group to its file, including codes that writes have added."""
-        named = self._map.named()
-        for group in range(len(named) // self._files.group_size):
-            of_group = self._files.named_group(named, group)
+        entries = self._map.entries()
+        for group in range(len(entries) // self._files.group_size):
+            of_group = self._files.group_entries(entries, group)
             if of_group[-1].rows == of_group[0].rows:
-                self._report(group, len(named))
+                self._report(group, len(entries))
                 self._keep_group(of_group)
 
-    def keep_tail(self, snapshot: Snapshot, named: Sequence[NamedSegment]) -> None:
+    def keep_tail(self, snapshot: Snapshot, entries: Sequence[SegmentEntry]) -> None:
         """Write the codes of the last, incomplete group, so that the next start need not compute them."""
-        of_group = self._files.named_group(named, max(0, len(named) - 1) // self._files.group_size)
+        of_group = self._files.group_entries(entries, max(0, len(entries) - 1) // self._files.group_size)
         if of_group and snapshot.table is not None and snapshot.coded == snapshot.rows:
             first = of_group[0].number * snapshot.rows_per_segment
             if tuple(of_group) not in self._written:
@@ -318,8 +318,8 @@ class Indexer:
         lists = snapshot.lists
         if lists is None or not self._centred:  # the file says how many rows there were when the centres were computed
             with suppress(StaleArrays):
-                named = self._map.named()
-                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, named)
+                entries = self._map.entries()
+                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, entries)
         # Centres are computed again when the rows have doubled.
         if lists is None or 2 * self._centred < snapshot.coded:
             lists, self._centred = InvertedLists.built(snapshot.table, progress=self._report), snapshot.coded
@@ -328,7 +328,7 @@ class Indexer:
         else:
             lists = lists.extended(snapshot.table)
         self._publish(lambda now: replace(now, lists=lists))
-        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.named())
+        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.entries())
 
     # Recall
 

@@ -346,7 +346,7 @@ class Snapshot:
         """
         if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
             raise ValueError("every place of this map has local descriptors")
-        named = [0] * len(descriptors) if checksums is None else checksums
+        sums = [0] * len(descriptors) if checksums is None else checksums
         segments, done = list(self.segments), 0
         while done < len(descriptors):
             if not segments or len(segments[-1]) == self.rows_per_segment:
@@ -356,7 +356,7 @@ class Snapshot:
                 segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
-                descriptors[done:stop], locations[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
+                descriptors[done:stop], locations[done:stop], local[done:stop], sums[done:stop], self.rows_per_segment
             )
             done = min(stop, len(descriptors))
         table = self.table
