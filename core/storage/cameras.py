@@ -15,7 +15,7 @@ from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
 from core.frames.masks import Mask
 from core.places import Camera, Timestamp
-from core.storage.database import row_checksums as seals
+from core.storage.database import row_checksums
 from core.storage.database.ledger import moment_text
 from core.storage.writing import Write
 
@@ -91,7 +91,7 @@ class Cameras:
                 "INSERT OR REPLACE INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)",
                 (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
             )
-            seals.seal(write.connection, "cameras", "name = ?", name)
+            row_checksums.write_checksums(write.connection, "cameras", "name = ?", name)
         self._forget_known()
         return made, name not in known
 
@@ -125,7 +125,7 @@ class Cameras:
 def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
     found = {}
     for name, mask, moment, seal in connection.execute("SELECT name, mask, updated_at, seal FROM cameras").fetchall():
-        if not seals.is_sound((name, mask, moment), seal):
+        if not row_checksums.is_sound((name, mask, moment), seal):
             raise Damage(f"map.sqlite: camera {name!r} does not match its checksum")
         kept = None if mask is None else Mask.model_validate_json(mask)
         found[name] = CameraRecord(name=name, mask=kept, updated_at=moment)

@@ -29,7 +29,7 @@ from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
 from core.storage.database import ledger
 from core.storage.database.connections import DatabaseClosed
-from core.storage.database.ledger import NamedSegment, named_segments
+from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, open_map
 from core.storage.pagination import page_of_places, page_of_sequences
 from core.storage.records import (
@@ -160,7 +160,7 @@ class Map:
                 return
             if indexer is not None and last is not None and not deleted:
                 with suppress(Damage, OSError, sqlite3.Error), opened.database.reading() as connection:
-                    indexer.keep_tail(last, named_segments(connection, opened.layout))
+                    indexer.keep_tail(last, segment_entries(connection, opened.layout))
             opened.database.close()
 
     def _expect_open(self) -> OpenMap:
@@ -223,11 +223,11 @@ class Map:
                 self._snapshot = change(self._snapshot)
                 return self._snapshot
 
-        def named() -> Sequence[NamedSegment]:
+        def entries() -> Sequence[SegmentEntry]:
             with self._reading() as connection:
-                return named_segments(connection, opened.layout)
+                return segment_entries(connection, opened.layout)
 
-        return IndexedMap(lambda: self._record.index, self.snapshot, publish, named, self._quarantine)
+        return IndexedMap(lambda: self._record.index, self.snapshot, publish, entries, self._quarantine)
 
     def index_status(self) -> IndexStatus:
         """How the map is searched; this does not read it from disk."""

@@ -21,12 +21,18 @@ from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_fol
 from core.disk.sqlite_file import transaction
 from core.index import Codes, CodeTable
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
-from core.storage.database import ledger
-from core.storage.database import row_checksums as seals
+from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
-from core.storage.database.ledger import NamedSegment, named_segments
-from core.storage.database.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
+from core.storage.database.ledger import SegmentEntry, segment_entries
+from core.storage.database.schema import (
+    NO_SEQUENCE,
+    check_schema,
+    migrate,
+    rebuild_metadata_index,
+    stale_metadata_index,
+    wrong_sequence_ends,
+)
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.arrays import StaleArrays
@@ -91,7 +97,7 @@ def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     """The map's record and the layout of its segment files.
 
     Raises:
-        Damage: the record makes no sense.
+        Damage: the record is invalid.
     """
     try:
         record, rows_per_segment = ledger.read_record(connection)
@@ -137,23 +143,23 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
         connection.close()
 
 
-def _load_segment(folder: Path, layout: Layout, named: NamedSegment, checksums: NDArray[np.uint32]) -> Held:
+def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: NDArray[np.uint32]) -> Held:
     """The descriptors of a segment, each of them checked; ``checksums`` are those that SQLite has of its rows."""
-    index = flat_index(named.rows, layout.dimension, layout.precision == HALF)
-    local = np.zeros((named.rows, *layout.local_shape), dtype=np.int8)
+    index = flat_index(entry.rows, layout.dimension, layout.precision == HALF)
+    local = np.zeros((entry.rows, *layout.local_shape), dtype=np.int8)
     target, filled = vectors(index), 0
-    for records in descriptors.read_checked(folder, layout, named.number, named.rows, named.checksum):
+    for records in descriptors.read_checked(folder, layout, entry.number, entry.rows, entry.checksum):
         part = slice(filled, filled + len(records))
         foreign = (checksums[part] != 0) & (checksums[part] != records["checksum"])
         for offset in np.flatnonzero(foreign)[:1].tolist():
             row = int(records["row"][offset])
-            raise Damage(f"{descriptors.segment_name(named.number)}: row {row} is of another frame")
+            raise Damage(f"{descriptors.segment_name(entry.number)}: row {row} is of another frame")
         target[part], local[part] = layout.descriptors_of(records), layout.locals_of(records)
         filled += len(records)
     return Held(index, local)
 
 
-def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable | None:
+def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable | None:
     """The codes of the first groups of segments that have good files; None if there is no coder."""
     try:
         coder = files.read_coder()
@@ -162,7 +168,7 @@ def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable |
     parts = []
     with suppress(StaleArrays):
         group = 0
-        while of_group := files.named_group(named, group):
+        while of_group := files.group_entries(entries, group):
             parts.append(files.read_codes(coder, of_group))
             group += 1
     if not parts:
@@ -183,13 +189,13 @@ def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
         ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
         if line != "ok":
             raise Damage(f"{FILE}: {line}")
-    if broken := seals.broken(connection, "places"):
+    if broken := row_checksums.mismatched(connection, "places"):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := cut_sequences(connection):
+    if found := wrong_sequence_ends(connection):
         raise Damage(f"{FILE}: {found[0]}")
-    if found := misfiled(connection):  # it can be made again from the places, which are sound
+    if found := stale_metadata_index(connection):  # it can be made again from the places, which are sound
         log.warning("The index of the metadata of map %s is rebuilt: %s.", folder.name, found[0])
-        refile(connection)
+        rebuild_metadata_index(connection)
 
 
 def read_snapshot(
@@ -209,8 +215,8 @@ def read_snapshot(
         Damage: SQLite and the segment files do not agree, or a checksum fails.
         OSError, sqlite3.Error: the disk refuses.
     """
-    named = named_segments(connection, layout)
-    total = sum(segment.rows for segment in named)
+    entries = segment_entries(connection, layout)
+    total = sum(segment.rows for segment in entries)
     columns = read_columns(connection, total)
     whereabouts = Whereabouts(
         np.full(total, NO_POSE, np.int8),
@@ -222,11 +228,11 @@ def read_snapshot(
         getattr(whereabouts, name)[columns.rows] = column
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
-    table = _load_codes(files, named)
+    table = _load_codes(files, entries)
     tier = tier_for(record.index, len(columns.rows), "exact" if table is None else "compact")
     holds = tier == "exact"
     segments = []
-    for segment in named:
+    for segment in entries:
         first = segment.number * layout.rows_per_segment
         part = slice(first, first + segment.rows)
         there = Whereabouts(**{name: column[part] for name, column in vars(whereabouts).items()})
@@ -244,7 +250,7 @@ def read_snapshot(
     lists = None
     if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
         with suppress(StaleArrays):
-            lists, _ = files.read_lists(table.coder, len(table), named)
+            lists, _ = files.read_lists(table.coder, len(table), entries)
     return Snapshot(
         layout.dimension,
         layout.rows_per_segment,
@@ -275,7 +281,7 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
             record, layout = _adopt(folder, connection)
             row_reader, files = RowReader(folder, layout), IndexFiles(folder, layout)
             snapshot = read_snapshot(folder, layout, connection, record, row_reader, files)
-            clear_folder(folder, named_segments(connection, layout))
+            clear_folder(folder, segment_entries(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # the name of SQLite's log
         # Earlier versions stored the descriptors of full segments twice, for FAISS.
@@ -291,7 +297,7 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
         raise Damage(f"map.sqlite: {validation_message(error)}") from error
     except TypeError as error:  # NULL where the tables allow none
         database.close()
-        raise Damage(f"{FILE}: a value makes no sense: {error}") from error
+        raise Damage(f"{FILE}: a value is invalid: {error}") from error
     except BaseException:
         database.close()
         raise

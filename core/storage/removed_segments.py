@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from core.storage.database.ledger import NamedSegment
+from core.storage.database.ledger import SegmentEntry
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.search.snapshot import Snapshot
 
@@ -87,9 +87,9 @@ class RemovedSegments:
                 del self._waiting[number]
 
 
-def clear_folder(folder: Path, named: Sequence[NamedSegment]) -> None:
+def clear_folder(folder: Path, entries: Sequence[SegmentEntry]) -> None:
     """Delete the files of removed segments of a map that is not open."""
-    for segment in named:
+    for segment in entries:
         if segment.removed:
             _delete(folder / segment_name(segment.number))
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage
-from core.storage.database import row_checksums as seals
+from core.storage.database import row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
-from core.storage.database.ledger import NamedSegment, named_segments
+from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.database.schema import check_schema, contradictions
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
@@ -107,12 +107,12 @@ def inspect(
     with findings.noting():
         _check_tables(connection, findings)
     with findings.noting():
-        _check_seals(connection, findings)
+        _check_row_checksums(connection, findings)
     with findings.noting():
         findings.problems += [f"{FILE}: {found}" for found in contradictions(connection)]
     with findings.noting():
         _, layout = read_layout(connection)
-        segments = named_segments(connection, layout)
+        segments = segment_entries(connection, layout)
         findings.rows = sum(segment.rows for segment in segments)
         (findings.places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         with findings.noting():
@@ -141,9 +141,9 @@ def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
         findings.problems.append(f"{FILE}: row {row} of {table} belongs to nothing in {parent}")
 
 
-def _check_seals(connection: sqlite3.Connection, findings: _Findings) -> None:
+def _check_row_checksums(connection: sqlite3.Connection, findings: _Findings) -> None:
     for table, kind in (("map", "map"), ("places", "place"), ("cameras", "camera")):
-        names = seals.broken(connection, table)
+        names = row_checksums.mismatched(connection, table)
         for name in names[:_MOST_LISTED]:
             findings.problems.append(f"{FILE}: {kind} {name!r} does not match its checksum")
         if len(names) > _MOST_LISTED:
@@ -172,43 +172,43 @@ def _check_descriptors(
     folder: Path,
     layout: Layout,
     places: dict[int, tuple[str, int]],
-    segments: list[NamedSegment],
+    segments: list[SegmentEntry],
     snapshot: Snapshot | None,
     findings: _Findings,
 ) -> None:
     for row, (place, _) in places.items():
         if row >= findings.rows:
             findings.problems.append(f"{FILE}: place {place!r} has row {row}, but there are {findings.rows}")
-    for named in segments:
-        findings.progress(named.number * layout.rows_per_segment, findings.rows)
+    for entry in segments:
+        findings.progress(entry.number * layout.rows_per_segment, findings.rows)
         with findings.noting():
-            _check_segment(folder, layout, named, places, snapshot, findings)
+            _check_segment(folder, layout, entry, places, snapshot, findings)
 
 
 def _check_segment(
     folder: Path,
     layout: Layout,
-    named: NamedSegment,
+    entry: SegmentEntry,
     places: dict[int, tuple[str, int]],
     snapshot: Snapshot | None,
     findings: _Findings,
 ) -> None:
-    row = named.number * layout.rows_per_segment
-    if named.removed:
-        for place in [places[one][0] for one in range(row, row + named.rows) if one in places][:_MOST_LISTED]:
+    row = entry.number * layout.rows_per_segment
+    if entry.removed:
+        for place in [places[one][0] for one in range(row, row + entry.rows) if one in places][:_MOST_LISTED]:
             findings.problems.append(f"{FILE}: the segment of place {place!r} is recorded as removed")
         return
     damaged: list[int] = []
     foreign: list[int] = []
     differing: list[int] = []
     running = 0
-    searched = None if snapshot is None else snapshot.segments[named.number]
-    for records in descriptors.read_records(folder, layout, named.number, named.rows):
+    searched = None if snapshot is None else snapshot.segments[entry.number]
+    for records in descriptors.read_records(folder, layout, entry.number, entry.rows):
         damaged += descriptors.damaged_rows(layout, records, row)
         running = descriptors.segment_checksum(records["checksum"], running)
-        named_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
-        for offset, (named_sum, record) in enumerate(zip(named_sums, records, strict=True), start=row):
-            if named_sum not in (None, record["checksum"]):
+        expected_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
+        for offset, (expected_sum, record) in enumerate(zip(expected_sums, records, strict=True), start=row):
+            if expected_sum not in (None, record["checksum"]):
                 foreign.append(offset)
         if searched is not None:
             differing += [row + offset for offset in _differing(searched, row - searched.first_row, layout, records)]
@@ -220,14 +220,14 @@ def _check_segment(
         (foreign, f"is not the one that {FILE} records"),
         (differing, "is not what is searched"),
     ):
-        name = descriptors.segment_name(named.number)
+        name = descriptors.segment_name(entry.number)
         for found in rows[:_MOST_LISTED]:
             whose = f"place {places[found][0]!r}" if found in places else "of no place"
             findings.problems.append(f"{name}: row {found} ({whose}) {what}")
         if len(rows) > _MOST_LISTED:
             findings.problems.append(f"{name}: the same is true of {len(rows) - _MOST_LISTED} more rows")
-    if not damaged and running != named.checksum:
-        findings.problems.append(f"{descriptors.segment_name(named.number)}: its rows are not those in {FILE}")
+    if not damaged and running != entry.checksum:
+        findings.problems.append(f"{descriptors.segment_name(entry.number)}: its rows are not those in {FILE}")
 
 
 def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np.void]) -> list[int]:
@@ -238,8 +238,8 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
     """
     rows = slice(start, start + len(records))
     if segment.held is None:
-        named = segment.checksums[rows]
-        return [int(offset) for offset in np.flatnonzero((named != 0) & (named != records["checksum"]))]
+        expected = segment.checksums[rows]
+        return [int(offset) for offset in np.flatnonzero((expected != 0) & (expected != records["checksum"]))]
     stored = zip(layout.descriptors_of(records), layout.locals_of(records), strict=True)
     held = zip(vectors(segment.index)[rows].astype(np.float32, copy=False), segment.local[rows], strict=True)
     return [

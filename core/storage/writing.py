@@ -14,7 +14,7 @@ from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
 from core.places import Place, PlaceFields, check_place_id
 from core.storage.database import ledger
-from core.storage.database.ledger import StoredPlace, named_segments
+from core.storage.database.ledger import StoredPlace, segment_entries
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
@@ -61,7 +61,7 @@ def _location(stored: StoredPlace) -> Location:
     return location_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
 
 
-def name_appended(
+def record_appended(
     connection: sqlite3.Connection, layout: Layout, first_row: int, checksums: list[int]
 ) -> dict[int, int]:
     """Record in SQLite the rows that were appended to the segment files.
@@ -77,9 +77,9 @@ def name_appended(
     while done < len(checksums):
         number, offset = divmod(first_row + done, layout.rows_per_segment)
         part = checksums[done : done + layout.rows_per_segment - offset]
-        named = connection.execute("SELECT checksum FROM segments WHERE number = ?", (number,)).fetchone()
-        checksum = descriptors.segment_checksum(part, named[0] if named else 0)
-        ledger.name_rows(connection, number, offset + len(part), checksum)
+        before = connection.execute("SELECT checksum FROM segments WHERE number = ?", (number,)).fetchone()
+        checksum = descriptors.segment_checksum(part, before[0] if before else 0)
+        ledger.put_segment_entry(connection, number, offset + len(part), checksum)
         if offset + len(part) == layout.rows_per_segment:
             filled[number] = checksum
         done += len(part)
@@ -205,7 +205,7 @@ class Write:
             self.appending = True
             records = self._records[: self._appended]
             descriptors.append(self._folder, self._layout, before.rows, records)
-            self.filled = name_appended(self.connection, self._layout, before.rows, records["checksum"].tolist())
+            self.filled = record_appended(self.connection, self._layout, before.rows, records["checksum"].tolist())
             # Halves are held in memory as they are stored.
             vectors = records["descriptor"] if before.halves else self._layout.descriptors_of(records)
             local = self._layout.locals_of(records)
@@ -260,16 +260,16 @@ class FailedWrites:
             Damage: rows of successful writes are missing or damaged.
         """
         if self._log:
-            opened.database.settle()
+            opened.database.empty_log()
             self._log = False
         if self._rows:
             descriptors.rewind(self._folder, opened.layout, rows)
             # The failed sync may also have lost a block that holds the end of the last good row.
             with opened.database.reading() as connection:
-                named = named_segments(connection, opened.layout)
-            if sum(segment.rows for segment in named) != rows:
+                entries = segment_entries(connection, opened.layout)
+            if sum(segment.rows for segment in entries) != rows:
                 raise Damage("map.sqlite refers to other rows than were written")
-            for last in named[-1:]:
+            for last in entries[-1:]:
                 for _ in descriptors.read_checked(self._folder, opened.layout, last.number, last.rows, last.checksum):
                     pass
             self._rows = False

@@ -1,7 +1,7 @@
-"""A moment of a map, kept in a folder of its own while it is being read by somebody far away.
+"""Exporting a map: keeping its state at one moment in a folder, from which the export file is then read.
 
-What the database says of that moment is copied, pictures included.  The descriptors are not: their files only ever
-grow, so a second name for each (a hard link) keeps all rows of that moment, whatever becomes of the map.
+The content of the database is copied, including pictures.  Descriptors are not copied: their files only ever grow, so a
+hard link to each keeps all rows of that moment, whatever happens to the map.
 """
 
 from __future__ import annotations
@@ -37,29 +37,28 @@ from core.storage.archives.manifest import (
 )
 from core.storage.archives.virtual_archive import ROW, ROWS, LinkedSegments, VirtualArchive
 from core.storage.cameras import Access
-from core.storage.database import ledger
-from core.storage.database import row_checksums as seals
+from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE
-from core.storage.database.ledger import named_segments
+from core.storage.database.ledger import segment_entries
 from core.storage.files.segment_files import Layout, segment_name
 from core.storage.opening import OpenMap, read_layout
 
 PLACES_PER_GROUP = 1024
 BYTES_PER_GROUP = 256 << 20
-"""A group that has so many bytes of pictures, or of descriptors, is full, too."""
+"""A group is also full when it has so many bytes of pictures or of descriptors."""
 
 Advance = Callable[[int], None]
-"""Is told how many places were read; may raise to break the work off."""
+"""Is called with the number of places that were read; what it raises ends the work."""
 
 
 class Exporter:
-    """What can be asked of a map by whoever makes it a file; from any thread.
+    """Keeps moments of one map for export.  Any thread may use it.
 
     Args:
         folder: of the map.
-        reading: gives a connection to its database.
-        opened: the map in use, if it is.
-        guarded: names the errors of the disk; a map that turns out to be damaged goes out of service.
+        reading: opens a connection to its database.
+        opened: returns the open map, or None.
+        guarded: turns errors of the disk in its block into ours, and quarantines the map if it is damaged.
     """
 
     def __init__(
@@ -72,24 +71,24 @@ class Exporter:
         self._folder, self._reading, self._opened, self._guarded = folder, reading, opened, guarded
 
     def state(self) -> object | None:
-        """As long as this is the same object, nothing was written to the map; None while it is not open."""
+        """An object that is the same as long as nothing is written to the map; None while the map is not open."""
         opened = self._opened()
         return None if opened is None else opened.database.state
 
     def into(self, folder: Path, advance: Advance = lambda _read: None) -> VirtualArchive:
-        """Keep this moment of the map in ``folder``, which is made; nothing of it is left if this raises.
+        """Keep the present state of the map in ``folder``, which is made; nothing of it is left if this raises.
 
-        The map is read in one transaction of SQLite, which keeps no writer waiting; then its descriptors are read
-        and checked once, without any hold on the map.
+        The database is read in one transaction, which does not hold up writes; then the descriptors are read and
+        checked once, independently of the map.
 
         Raises:
-            UnknownMap, MapQuarantined: it was deleted meanwhile, or is damaged.
+            UnknownMap, MapQuarantined: the map was deleted meanwhile, or is damaged.
             StorageFull, StorageFailure.
         """
         try:
             with self._guarded("export"):
                 folder.mkdir(parents=True)
-                # Deleting the map waits for its readers: they give up as soon as it is asked for.
+                # Deleting the map waits for its readers, so this ends as soon as the map is closed.
                 with self._reading() as connection, self._files_kept():
                     taken = self._take(connection, folder, advance)
                 return _described(taken, folder, advance)
@@ -102,10 +101,10 @@ class Exporter:
         try:
             record, layout = read_layout(connection)
             for table in ("places", "cameras"):
-                if broken := seals.broken(connection, table):
+                if broken := row_checksums.mismatched(connection, table):
                     raise Damage(f"{FILE}: {broken[0]!r} of {table} does not match its checksum")
-            named = named_segments(connection, layout)
-            for segment in named:
+            entries = segment_entries(connection, layout)
+            for segment in entries:
                 if segment.removed:
                     continue
                 self._expect_there()
@@ -120,7 +119,7 @@ class Exporter:
                     advance(taken.places)
             return taken
         finally:
-            if connection.in_transaction:  # SQLite may have ended it by itself: what it met is told, not this
+            if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
                 connection.execute("ROLLBACK")
 
     def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[list[StoredLine]]:
@@ -138,7 +137,7 @@ class Exporter:
             yield group
 
     def _files_kept(self) -> AbstractContextManager[None]:
-        """The file of no segment is removed within."""
+        """No segment file is deleted during the block."""
         opened = self._opened()
         return nullcontext() if opened is None else opened.removed_segments.kept()
 
@@ -149,7 +148,7 @@ class Exporter:
 
 @dataclass
 class _Taken:
-    """What was read within the transaction.  groups: the parts of places and of pictures of each group."""
+    """What was read in the transaction.  groups: the parts of places and of pictures of each group."""
 
     record: ArchivedRecord
     layout: Layout
@@ -163,7 +162,7 @@ def _link(source: Path, target: Path) -> None:
         os.link(source, target)
     except FileNotFoundError:
         raise UnknownMap(f"The map {source.parent.name!r} was deleted while it was read.") from None
-    except OSError:  # a file system without links, or one that has as many as it can
+    except OSError:  # the file system has no hard links, or no more of them
         shutil.copyfile(source, target)
 
 
@@ -180,7 +179,7 @@ def _write_lines(path: Path, lines: Iterator[bytes]) -> Part:
 def _write_group(
     folder: Path, number: int, connection: sqlite3.Connection, group: list[StoredLine], rows: BinaryIO
 ) -> tuple[Part, Part]:
-    """Copy the lines and pictures of a group, and note where its descriptors are."""
+    """Write the lines and pictures of a group, and the rows of its descriptors."""
     places_name, _, pictures_name = group_names(number)
     places = _write_lines(folder / places_name, (line.text for line in group))
     digest, size = hashlib.sha256(), 0
@@ -197,7 +196,7 @@ def _write_group(
 
 
 def _described(taken: _Taken, folder: Path, advance: Advance) -> VirtualArchive:
-    """Read all descriptors, each checked, for their SHA-256; write the manifest."""
+    """Read and check all descriptors for their SHA-256, and write the manifest."""
     parts = list(taken.parts)
     links, first = LinkedSegments(folder, taken.layout), 0
     for number, (places, pictures) in enumerate(taken.groups):

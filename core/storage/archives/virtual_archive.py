@@ -1,4 +1,4 @@
-"""The bytes of an export file, from any position on, out of the folder that keeps a moment of a map."""
+"""The bytes of an export file, computed from any position on from a folder that keeps a moment of a map."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from core.storage.files.segment_files import HEADER_BYTES, Layout, segment_name
 
 ROWS = "rows.bin"
 ROW = np.dtype([("row", "<u8"), ("checksum", "<u4")])
-"""Of each place in the file's order: the row of its descriptor, and the checksum that the database names of it."""
+"""Of each place in the order of the file: the row of its descriptor, and that row's checksum in the database."""
 
 CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
 class LinkedSegments:
-    """The segment files of that moment."""
+    """The segment files of the moment that is kept, linked into a folder."""
 
     folder: Path
     layout: Layout
 
     def chunks(self, rows: NDArray[np.void], most: int = CHUNK_BYTES) -> Iterator[NDArray[np.void]]:
-        """Frames at rest (:attr:`Layout.frame`) of rows, in the order of the rows, about ``most`` bytes at a time.
+        """The stored descriptors (:attr:`Layout.frame`) of rows, in their order, about ``most`` bytes at a time.
 
         Raises:
-            Damage: one is not what the database names.
+            Damage: a row does not match its checksum in the database.
             OSError: the disk refuses.
         """
         step = max(1, most // self.layout.record.itemsize)
@@ -45,7 +45,7 @@ class LinkedSegments:
     def _frames(self, rows: NDArray[np.void]) -> NDArray[np.void]:
         frames = np.zeros(len(rows), self.layout.frame)
         numbers = rows["row"].astype(np.int64)
-        # Rows that follow each other in one file are read at once.
+        # Consecutive rows of one file are read at once.
         breaks = np.flatnonzero((np.diff(numbers) != 1) | (numbers[1:] % self.layout.rows_per_segment == 0)) + 1
         for run in np.split(np.arange(len(rows)), breaks):
             first = int(numbers[run[0]])
@@ -69,7 +69,7 @@ class LinkedSegments:
 
 
 def _read_at(path: Path, offset: int, size: int) -> bytes:
-    """Bytes of a file; fewer where it ends before them."""
+    """Bytes of a file; fewer if it ends before."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         parts = []
@@ -83,9 +83,10 @@ def _read_at(path: Path, offset: int, size: int) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class VirtualArchive:
-    """An export file that is nowhere written as one.  From any thread.
+    """An export file whose bytes are computed when they are read.  Any thread may read it.
 
-    text: the bytes of the manifest; their SHA-256 is ``tag``, which names all bytes of the file.
+    folder: keeps the moment of the map.
+    text: the bytes of the manifest; their SHA-256 is ``tag``, which identifies all bytes of the file.
     """
 
     folder: Path
@@ -96,17 +97,17 @@ class VirtualArchive:
 
     @cached_property
     def tape(self) -> TarLayout:
-        """Where in the file each part lies."""
+        """Where each part lies in the file."""
         return TarLayout(self.manifest, len(self.text))
 
     @property
     def size(self) -> int:
-        """Bytes of the whole file."""
+        """The size of the file in bytes."""
         return self.tape.size
 
     @cached_property
     def _firsts(self) -> dict[str, int]:
-        """The first place of each part of descriptors."""
+        """The first place of each part of descriptors, by the part's name."""
         firsts, first = {}, 0
         for number in range(self.manifest.groups):
             part = self.manifest.group(number)[1]
@@ -114,10 +115,10 @@ class VirtualArchive:
         return firsts
 
     def read(self, start: int, most: int) -> bytes:
-        """Up to ``most`` bytes of the file from ``start`` on; b"" at its end.
+        """Up to ``most`` bytes of the file from ``start`` on; empty at its end.
 
         Raises:
-            StorageFailure: the disk refuses, or has lost what it held.
+            StorageFailure: the disk refuses, or a file is damaged.
         """
         with disk_errors("read an export"):
             most = min(most, self.size - start)
@@ -129,7 +130,7 @@ class VirtualArchive:
             return b"".join(parts)
 
     def _piece(self, position: int, most: int) -> bytes:
-        """At least one byte, of what is of one kind."""
+        """One or more bytes at a position, all of the same part."""
         member = self.tape.member_at(position)
         if member is None:
             return bytes(most)
@@ -164,5 +165,5 @@ class VirtualArchive:
         return found[skipped : skipped + most]
 
     def discard(self) -> None:
-        """Give its room back."""
+        """Delete the folder."""
         shutil.rmtree(self.folder, ignore_errors=True)

@@ -93,8 +93,8 @@ class RowReader:
         found = self._read(rows, *part)
         whole = self._sound(found, rows, name)
         stated = found["checksum"].tolist()
-        for row, named, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
-            if not sound or (named and named != checksum):
+        for row, expected, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
+            if not sound or (expected and expected != checksum):
                 where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
                 raise Damage(f"{where} {'is of another frame' if sound else 'does not match its checksum'}")
         return found

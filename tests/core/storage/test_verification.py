@@ -172,7 +172,7 @@ def test_the_log_can_be_emptied_while_descriptors_are_read(hall: Map, folder: Pa
             hall.enrol([frame("late")])
             for i in range(4):
                 hall.forget(f"p{i}")
-            opened.database.settle()
+            opened.database.empty_log()
             assert log.stat().st_size == 0
         told.append(done)
 

@@ -194,6 +194,6 @@ def test_what_comes_while_lists_are_made_is_encoded_before_the_lock_is_taken(atl
         if begun.count(0) == 2 and done == 0:  # codes begin, lists begin
             lab.enrol([frame(f"late{i}", dimension=DIMENSION) for i in range(20)])
 
-    made = rebuilding.remade(lab.snapshot, True, progress)
+    made = rebuilding.rebuilt(lab.snapshot, True, progress)
     assert len(made.table) == lab.snapshot().rows == PLACES + 20
     assert made.lists is not None and made.lists.rows == PLACES
