@@ -46,7 +46,7 @@ def read_orientation(block: bytes | None) -> int:
     return int(value[0]) if value and value[0] in range(1, 9) else 1
 
 
-def read_whereabouts(data: bytes) -> tuple[Pose | None, datetime | None]:
+def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
     """The pose and the time that an image file was taken at, according to its metadata; None for what is missing.
 
     The pose is in degrees (WGS 84).  Its heading is the image direction if that is relative to true north; a magnetic
