@@ -27,35 +27,35 @@ HALF_TURN = math.pi * EARTH_RADIUS
 """Half of the Earth's girth, metres."""
 
 FARTHEST_STEPS = 16
-"""A motion of more reaches than this is as good as a jump: it leaves no belief in any place."""
+"""A motion of more steps than this counts as a jump to any place."""
 
 DRIFT = 0.1
-"""Standard deviation of odometry beside what it says of itself: wheels slip by a tenth."""
+"""Standard deviation of odometry, as a share of the distance, in addition to its own variance: wheels slip."""
 
 HEADING_SPREAD = math.radians(20)
 """Standard deviation between a place's heading and that of a robot that sees the same."""
 
 TURN_NOTED = math.radians(15)
-"""A robot that has turned by this much sees something else, wherever it stands."""
+"""A robot that has turned by this much sees something else, even if it has not moved."""
 
 
 @dataclass(frozen=True)
 class Stride:
-    """Frames of a map's sequence that go by from one frame of a run to the next.
+    """By how many frames of a map's sequence a robot advances from one frame of its run to the next.
 
-    advance: the usual number, at least 0: 1 for a robot at the pace of the traverse, 0.1 for a camera ten times as
-        fast.
-    backwards: whether it may go against the sequence as readily; else a frame's slip is allowed.
+    advance: the usual number, at least 0: 1 for a robot at the pace of the traverse, 0.1 for a camera with ten times
+        the frame rate.
+    backwards: whether the robot may as well go against the sequence; otherwise it goes back by at most one frame.
     """
 
     advance: float = 1.0
     backwards: bool = False
 
     def kernel(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Offsets along the sequence and their probabilities: two-sided exponential around ``advance``.
+        """Offsets along the sequence, int64 [m], and their probabilities, float64 [m].
 
-        The scale is half a frame and two fifths of the advance, so that a pace that is not known well, as it never
-        is, costs little.
+        They are a two-sided exponential distribution around ``advance``.  Its scale is half a frame plus two fifths of
+        the advance, as the pace is never known well.
         """
         scale = 0.5 + 0.4 * self.advance
         farthest = math.ceil(self.advance + 4 * scale)
@@ -67,7 +67,7 @@ class Stride:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Motion since the frame before, in the robot's frame of then: metres and radians, with variances."""
+    """Motion since the frame before, in the robot's coordinates at that frame: metres and radians, with variances."""
 
     forward: float
     left: float = 0.0
@@ -76,9 +76,9 @@ class Odometry:
     turn_variance: float = 0.0
 
     def then(self, other: Odometry) -> Odometry:
-        """This motion, followed by another."""
+        """This motion followed by another."""
         cos, sin = math.cos(self.turn), math.sin(self.turn)
-        swing = self.turn_variance * (other.forward**2 + other.left**2)  # a turn not known well moves what follows
+        swing = self.turn_variance * (other.forward**2 + other.left**2)  # an uncertain turn displaces what follows
         return Odometry(
             self.forward + cos * other.forward - sin * other.left,
             self.left + sin * other.forward + cos * other.left,
@@ -88,7 +88,7 @@ class Odometry:
         )
 
     def part(self, count: int) -> Odometry:
-        """The ``count``-th part of it, taken as a straight line in the direction of the whole and then the turn."""
+        """One of ``count`` equal parts: a straight line in the direction of the whole, then a part of the turn."""
         share = 1 / count
         return Odometry(
             share * self.forward,
@@ -100,17 +100,17 @@ class Odometry:
 
     @property
     def distance(self) -> float:
-        """Metres as the crow flies."""
+        """The straight distance in metres."""
         return math.hypot(self.forward, self.left)
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is known of the motion between two frames; nothing, in a run's first.
+    """What is known about the motion between two frames; nothing for a run's first frame.
 
-    odometry: None where the robot tells none.
-    reach: metres that it can have gone, by its speed limit and the time between; None where that is not known.
-    frames: by how many the run's frame number grew; 1 where every frame arrives.
+    odometry: None if the robot reports none.
+    reach: the metres that the robot can have moved, by its speed limit and the time between; None if not known.
+    frames: by how much the run's frame number grew; 1 if every frame arrives.
     """
 
     odometry: Odometry | None = None
@@ -120,7 +120,7 @@ class Step:
 
 @dataclass
 class Pending:
-    """Motion told and not yet applied: less than half the distance between places, which no place would show."""
+    """Motion that was reported but not yet applied, as it is less than half the distance between places."""
 
     odometry: Odometry = field(default_factory=lambda: Odometry(0.0))
     reach: float = 0.0
@@ -275,19 +275,22 @@ def _half_turn(graph: PlaceGraph) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """One step's matrix on one graph: a few moves, one after the other.
+    """One step's transition on one graph: a few moves, one after the other.
 
-    jumps: nothing that a place held stays near it; the moves are not looked at.
+    jumps: the robot may be anywhere; the moves are ignored.
     """
 
     moves: tuple[Move, ...]
     jumps: bool = False
 
     def forward(self, masses: Masses, floor: float) -> tuple[Masses, float, float]:
-        """Where masses float32 [n] go, what of them is to be spread over all places, and what has left the map.
+        """Move masses, float32 [n].
 
         Args:
-            floor: masses up to this are spread instead of moved: what all hold alike stays alike.
+            floor: masses up to this are not moved, but are to be spread over all places.
+
+        Returns:
+            The moved masses, float32 [n]; the mass to be spread over all places; the mass that has left the map.
         """
         if self.jumps:
             return np.zeros_like(masses), float(masses.sum(dtype=np.float64)), 0.0
@@ -299,7 +302,7 @@ class Transition:
         return masses if self.moves else masses.copy(), spread, gone
 
     def backward(self, values: Masses, outside: float) -> Masses:
-        """The mean of ``values`` float32 [n] over the successors of each place; ``outside`` where there is none."""
+        """The mean of ``values``, float32 [n], over the successors of each place; ``outside`` counts for the rest."""
         if self.jumps:
             return np.full_like(values, values.mean(dtype=np.float64))
         for move in reversed(self.moves):
@@ -310,10 +313,13 @@ class Transition:
 
 
 def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) -> Transition:
-    """The matrix of one step.
+    """The transition of one step.
 
     Args:
-        pending: motion too small to show is put into it, and taken out when it has become enough.
+        graph: of the map's places.
+        step: what is known about the motion.
+        stride: the usual advance along a sequence.
+        pending: collects motion that is too small to apply, until it is enough; changed.
     """
     moves: list[Move] = []
     if step.frames > FARTHEST_STEPS:

@@ -1,4 +1,4 @@
-"""From colour pixels to the network's input (thesis, section 4.3: the frame is resized whole)."""
+"""From colour pixels to the network's input (thesis, section 4.3: the whole frame is resized)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INTERPOLATION = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
 
 class InputDefinition(BaseModel):
-    """What a network wants to see: ``(pixels - mean) * scale`` at its own size.
+    """The input of a network: ``(pixels - mean) * scale`` at its own size.
 
     ``mean`` (0–255 units) and ``scale`` are in the channel order of the network.
     """
@@ -36,16 +36,16 @@ class InputDefinition(BaseModel):
 
 
 def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-    """One frame as network input.
+    """Make a frame the input of a network.
 
     The whole frame is resized without a crop; its aspect ratio is not kept (method, section 1).
 
     Args:
-        pixels: H x W x 3 uint8, BGR.
-        out: where to put it, contiguous; None: a new array.
+        pixels: uint8 [H, W, 3], BGR.
+        out: where to put the result, contiguous; None: a new array.
 
     Returns:
-        height x width x 3 float32 in the network's channel order.
+        float32 [height, width, 3], in the network's channel order.
     """
     height, width = definition.height, definition.width
     if pixels.shape[:2] != (height, width):
@@ -62,7 +62,7 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
 
 @lru_cache(maxsize=32)
 def _of_a_row(values: tuple[float, float, float], width: int) -> NDArray[np.float32]:
-    """What each channel has, for a row of pixels; float32 [3 W]."""
+    """The three channels' values, repeated for each pixel of a row; float32 [3 W]."""
     return np.tile(np.array(values, np.float32), width)
 
 
@@ -70,8 +70,8 @@ def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
     """The largest standard deviation of a colour channel, in 0–255 units, over a grid of some 5 000 pixels.
 
     Args:
-        pixels: H x W x 3 uint8.
-        mask: what not to count; 0 where nothing is left.
+        pixels: uint8 [H, W, 3].
+        mask: pixels that it covers do not count; the contrast is 0 if none is left.
     """
     stride = max(1, min(pixels.shape[:2]) // 64)
     sampled = np.ascontiguousarray(pixels[::stride, ::stride])

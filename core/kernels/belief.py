@@ -19,8 +19,7 @@ import numpy as np
 from core.places import NO_POSE
 
 MISFIT = 12.0
-"""Places that fit a motion worse than this (five standard deviations) are no successors."""
-
+"""A place with at least this misfit to a motion (five standard deviations) is no successor."""
 
 FITS = math.exp(-2.0)
 """Weight of a place that fits a motion well enough: two standard deviations off."""
@@ -32,11 +31,7 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @_compiled
 def _settle(p, i, targets, begin, count, weights, total, back, outside, moved):  # type: ignore[no-untyped-def]
-    """Share out the mass of one place by its successors' weights, or gather theirs; returns what fits none.
-
-    Where even all successors together fit worse than FITS, the robot was probably not there, or is where there is no
-    place: the motion is an observation, too.
-    """
+    """Divide the mass of one place among its successors by their weights, or gather theirs; return what fits none."""
     scale = max(total, FITS)
     if back:
         gathered = outside * (scale - total)
@@ -52,7 +47,7 @@ def _settle(p, i, targets, begin, count, weights, total, back, outside, moved): 
 
 @_compiled
 def along_sequence(p, moving, first, last, offsets, weights, least, back, moved):  # type: ignore[no-untyped-def]
-    """Along the sequences, places in ``moving`` alone; at the end of one, by what is left of the kernel."""
+    """Along the sequences, only places in ``moving``; at the end of a sequence by what is left of the kernel."""
     negligible, gone = 0.0, 0.0
     for i in range(len(p)):
         if not moving[i]:
@@ -88,7 +83,7 @@ def _displacement(coordinates, i, j, half_turn, shrink):  # type: ignore[no-unty
 def within_reach(  # type: ignore[no-untyped-def]
     p, starts, targets, coordinates, shrink, half_turn, reach, softness, least, back, outside, moved
 ):
-    """To the joined places within ``reach`` alike, and to those just beyond it a little."""
+    """To the joined places within ``reach`` alike, and a little to those just beyond it."""
     negligible, gone = 0.0, 0.0
     weights = np.empty(1 + np.max(starts[1:] - starts[:-1]), np.float64)
     for i in range(len(p)):
@@ -115,7 +110,7 @@ def within_reach(  # type: ignore[no-untyped-def]
 def by_odometry(  # type: ignore[no-untyped-def]
     p, starts, targets, coordinates, shrink, half_turn, heading, motion, least, back, outside, moved
 ):
-    """To the joined places by how well each fits ``motion``: forward, left, turn, and the precisions of both."""
+    """To the joined places by how well each fits ``motion``: forward, left, turn, and two precisions."""
     negligible, gone = 0.0, 0.0
     forward, left, turn, precision, turn_precision = motion
     weights = np.empty(1 + np.max(starts[1:] - starts[:-1]), np.float64)
@@ -153,7 +148,7 @@ def by_odometry(  # type: ignore[no-untyped-def]
 
 @_compiled
 def add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
-    """Add each place's gain to the end of the path that was at that place ``shift`` frames of the sequence before."""
+    """Add each place's gain to the path through it, which ends ``shift`` places further along the sequence."""
     for k in range(len(places)):
         place = places[k]
         if place >= 0 and first[place] <= place + shift < last[place]:
@@ -162,7 +157,7 @@ def add_along(places, gains, shift, first, last, totals):  # type: ignore[no-unt
 
 @_compiled
 def same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
-    """As ``Whereabouts.near`` has it, among the places joined and those beside it in its sequence; ascending."""
+    """The same places by ``Whereabouts.near`` among those joined and those beside it in its sequence; ascending."""
     low, high = max(first, place - frames), min(last, place + frames + 1)
     found = np.empty(len(joined) + high - low, np.int64)
     count = 0

@@ -1,8 +1,8 @@
-"""A linear view of a feature in which the same spot looks alike under any light, and different spots do not.
+"""A linear projection of features under which the same spot looks alike in any light, and different spots do not.
 
-Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
-The differences between a cell's feature and that of the same cell under other conditions span what does not
-matter; features are whitened by their covariance, and of what is then left the directions of most spread are kept.
+This is Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
+The differences between a cell's feature and that of the same cell under other conditions show which directions do not
+matter.  Features are whitened by the covariance of these differences, and the directions of largest variance are kept.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from core.method.equations import unit_length
 Array = NDArray[np.float32]
 
 SHRINKAGE = 0.5
-"""Share of the mean variance added to every direction's, so that quiet directions are not blown up into noise."""
+"""This share of the mean variance is added to that of every direction, so that whitening does not amplify noise."""
 
 
 @dataclass(frozen=True)
 class Projection:
-    """From a feature of K values to one of fewer.
+    """A projection of features from K values to fewer.
 
-    mean: float32 [K], of unit-length features.
-    matrix: float32 [K, d], columns by falling importance, so that the first ones are a projection too.
+    mean: m, float32 [K], the mean of unit-length features.
+    matrix: W, float32 [K, d], columns by falling importance, so that the first columns are a projection, too.
     """
 
     mean: Array
@@ -51,7 +51,7 @@ class Projection:
         return projected
 
     def products(self, features: Array) -> Array:
-        """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
+        """f W of features f, float32 [n, K] to [n, d]; the product of a sum of features is the sum of products."""
         return self._product(features)
 
     @cached_property
@@ -64,13 +64,15 @@ class Projection:
         return np.asarray(self.mean @ self.matrix, np.float32)
 
     def finish(self, products: Array, features: Array, values: int) -> Array:
-        """Unit-length projections of n features whose products are known; float32 [n, values].
-
-        (f/|f| - m) W = f W / |f| - m W.
+        """Project features whose products are known: (f/|f| - m) W = f W / |f| - m W, then to unit length.
 
         Args:
-            products: float32 [n, d].
-            features: float32 [n, K].
+            products: f W, float32 [n, d].
+            features: f, float32 [n, K].
+            values: how many columns of W to use.
+
+        Returns:
+            float32 [n, values].
         """
         projected = np.empty((len(features), values), np.float32)
         finish_rows(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
@@ -78,7 +80,7 @@ class Projection:
 
 
 def fit_projection(clear: Array, changed: Array, values: int) -> Projection:
-    """The projection under which pairs agree best in relation to all features' spread.
+    """Fit the projection under which pairs differ least, relative to the variance of all features.
 
     Args:
         clear, changed: float32 [n, K], unit-length features of the same n cells under two conditions.

@@ -17,7 +17,7 @@ from scipy.io import savemat
 
 from core.errors import InvalidArchive, InvalidCursor, InvalidImage, InvalidModel, PlacerecError
 from core.frames.containers import find_exif
-from core.frames.exif import read_orientation, read_whereabouts
+from core.frames.exif import read_orientation, read_pose_and_time
 from core.frames.images import decode
 from core.method.catalogue import load_encoder
 from core.networks.checkpoints import read_checkpoint
@@ -168,7 +168,7 @@ TURNED = bytes.fromhex("49492a00080000000200120103000100000006000000258804000100
 @given(damaged(TURNED))
 def test_exif_blocks(block: bytes) -> None:
     assert 1 <= read_orientation(block) <= 8
-    read_whereabouts(b"\xff\xd8\xff\xe1" + (len(block) + 8).to_bytes(2, "big") + b"Exif\0\0" + block + b"\xff\xd9")
+    read_pose_and_time(b"\xff\xd8\xff\xe1" + (len(block) + 8).to_bytes(2, "big") + b"Exif\0\0" + block + b"\xff\xd9")
 
 
 @FEW

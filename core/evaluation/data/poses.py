@@ -140,9 +140,9 @@ def _named(path: Path) -> Pose | None:
 
 
 def _embedded(path: Path) -> Pose | None:
-    from core.frames.exif import read_whereabouts
+    from core.frames.exif import read_pose_and_time
 
     try:
-        return read_whereabouts(path.read_bytes())[0]
+        return read_pose_and_time(path.read_bytes())[0]
     except OSError as error:
         raise InvalidGroundTruth(f"{path} cannot be read: {error.strerror}.") from error

@@ -128,11 +128,11 @@ def test_they_agree_with_a_frame_as_copies_do(values: int) -> None:
     query = lying.blocks[1][0]
     gains = agreement(query, lying, COLUMNS, stage)
     assert gains[2] > gains[0] > 0
-    np.testing.assert_array_equal(gains, agreement(query, lying.together(), COLUMNS, stage))
+    np.testing.assert_allclose(gains, agreement(query, lying.together(), COLUMNS, stage), rtol=1e-6)
     backwards = lying.together()[::-1]
-    np.testing.assert_array_equal(gains[::-1], agreement(query, backwards, COLUMNS, stage))
+    np.testing.assert_allclose(gains[::-1], agreement(query, backwards, COLUMNS, stage), rtol=1e-6)
     query.flags.writeable = False
-    np.testing.assert_array_equal(gains, agreement(query, lying, COLUMNS, stage))
+    np.testing.assert_allclose(gains, agreement(query, lying, COLUMNS, stage), rtol=1e-6)
 
 
 def test_addresses_are_those_of_the_blocks() -> None:

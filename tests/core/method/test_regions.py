@@ -75,7 +75,7 @@ def test_fusion_keeps_the_layers_apart() -> None:
     fused = extract_regions(layers, (1.0, 1.0), 20)
     assert len(fused) == 40
     assert fused.layers.tolist() == [0] * 20 + [1] * 20
-    np.testing.assert_array_equal(fused.features[20:], extract_regions(layers[1:], (1.0,), 20).features)
+    np.testing.assert_allclose(fused.features[20:], extract_regions(layers[1:], (1.0,), 20).features, rtol=1e-5)
 
 
 def test_layers_of_other_channels_cannot_be_fused() -> None:
