@@ -31,9 +31,10 @@ from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tar_layout import BLOCK
-from core.storage.files.disk import Damage, refusals, sync_folder, write_at
+from core.storage.files.disk import Damage, refusals
 from service.errors.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
 from service.http.bodies import in_pieces
+from service.http.incoming_file import IncomingFile
 from service.jobs.context import JobContext
 from service.jobs.records import Job
 from service.worker_threads import to_its_end
@@ -127,12 +128,12 @@ class Imports:
             raise TooManyImports("Too many maps are being imported; send this one again in a while.")
         name = secrets.token_hex(8)
         self._held.add(name)
-        arriving = _Arriving(self._folder / f".{name}", announced, accept)
+        arriving = _ArrivingMap(self._folder / f".{name}", self._folder / name, announced, accept)
         try:
             await to_its_end(arriving.open)
             async for piece in in_pieces(chunks):
-                await to_its_end(partial(arriving.add, piece))
-            await to_its_end(lambda: arriving.finish(digests, self._folder / name))
+                await to_its_end(partial(arriving.write, piece))
+            await to_its_end(lambda: arriving.check_and_complete(digests))
         except BaseException:
             await to_its_end(lambda: self._give_up(arriving, name))
             raise
@@ -232,7 +233,7 @@ class Imports:
             (self._folder / name).unlink(missing_ok=True)
             self._held.discard(name)
 
-    def _give_up(self, arriving: _Arriving, name: str) -> None:
+    def _give_up(self, arriving: _ArrivingMap, name: str) -> None:
         arriving.discard()
         self._remove(name)
 
@@ -287,69 +288,54 @@ class Imports:
         self._remove(str(job.arguments["file"]))
 
 
-class _Arriving:
-    """A file that is being written; from one thread at a time."""
+class _ArrivingMap(IncomingFile):
+    """The file of a map that is being written; its manifest is examined as soon as it has arrived."""
 
-    def __init__(self, path: Path, announced: int, accept: Accept) -> None:
-        self._path, self._announced, self._accept = path, announced, accept
+    def __init__(self, temporary: Path, final: Path, announced: int, accept: Accept) -> None:
+        super().__init__(temporary, final)
+        self._announced, self._accept = announced, accept
         self._hash = hashlib.sha256()
         self._found: tuple[Manifest, str, str] | None = None
-        self.size = 0
-        self._file = -1
 
     def open(self) -> None:
-        path, announced = self._path, self._announced
+        folder, announced = self.temporary.parent, self._announced
         with refusals("take in a map"):
-            path.parent.mkdir(exist_ok=True)
-            # As a file and as a map it is there twice for a moment.
-            if shutil.disk_usage(path.parent).free < 2 * announced:
+            folder.mkdir(exist_ok=True)
+            # For a moment the disk has to hold both the file and the map.
+            if shutil.disk_usage(folder).free < 2 * announced:
                 raise StorageFull(f"The disk has no room for {announced} bytes twice over, as a file and as a map.")
-            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            super().open()
 
     @property
     def found(self) -> tuple[Manifest, str, str]:
-        """Manifest, its tag, and the id of the map that is to be made."""
+        """The manifest, its tag, and the id of the map that is to be made."""
         assert self._found is not None
         return self._found
 
-    def add(self, data: bytes) -> None:
+    def write(self, data: bytes) -> None:
         with refusals("take in a map"):
-            write_at(self._file, data, self.size)
+            super().write(data)
         self._hash.update(data)
-        self.size += len(data)
         if self._found is None and self.size >= BLOCK:
             self._look()
 
     def _look(self) -> None:
-        opening = opening_of(os.pread(self._file, BLOCK, 0), lambda offset, size: os.pread(self._file, size, offset))
+        file = self.descriptor
+        opening = opening_of(os.pread(file, BLOCK, 0), lambda offset, size: os.pread(file, size, offset))
         if opening is not None:
             manifest, tape, tag = opening
             if self._announced and tape.size != self._announced:
                 raise InvalidArchive(f"The file is to have {tape.size} bytes, but {self._announced} are announced.")
             self._found = manifest, tag, self._accept(manifest)
 
-    def finish(self, digests: list[bytes], there: Path) -> None:
+    def check_and_complete(self, digests: list[bytes]) -> None:
+        """Check that the file is whole and has these digests, and give it its final name."""
         if any(digest != self._hash.digest() for digest in digests):
             raise DigestMismatch("The body does not have the SHA-256 that its header says.")
         if self._found is None:
             raise InvalidArchive(f"The file ends after {self.size} bytes, within its manifest.")
         with refusals("take in a map"):
-            os.fsync(self._file)
-            os.rename(self._path, there)
-            sync_folder(there.parent)
-            sync_folder(there.parent.parent)
-        self._close()
-
-    def discard(self) -> None:
-        """Remove what there is of it, unless it has its name already."""
-        self._close()
-        with suppress(OSError):
-            self._path.unlink(missing_ok=True)
-
-    def _close(self) -> None:
-        file, self._file = self._file, -1
-        if file >= 0:
-            os.close(file)
+            self.complete()
 
 
 def _check_picture(content: bytes, limits: Limits) -> None:

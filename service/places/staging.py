@@ -13,16 +13,17 @@ import os
 import secrets
 import shutil
 import threading
-from collections.abc import AsyncIterator, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
 from core.errors import StorageFailure, StorageFull
-from core.storage.files.disk import refusals, sync_folder, write_at, write_file
+from core.storage.files.disk import refusals, write_at, write_file
 from service.errors.faults import StagingFull
 from service.http.bodies import in_pieces
+from service.http.incoming_file import IncomingFile
 from service.http.multipart import FormReader, Part
 from service.worker_threads import to_its_end
 
@@ -171,6 +172,12 @@ class Staging:
         if shutil.disk_usage(self._folder).free < coming + self._reserve:
             raise StorageFull(f"The disk has no room for {coming} bytes of frames that are to wait, and for the maps.")
 
+    def _open(self, form: IncomingFile) -> None:
+        with refusals(f"write {form.temporary}"):
+            form.temporary.mkdir(parents=True)
+            self._expect_room()
+            form.open()
+
     async def receive(
         self,
         chunks: AsyncIterator[bytes],
@@ -193,15 +200,15 @@ class Staging:
         """
         name = secrets.token_hex(8)
         self._claim(name, announced)
-        form = _Arriving(self._folder / f".{name}", self._folder / name)
+        form = IncomingFile(self._folder / f".{name}", self._folder / name, "form")
         try:
-            await to_its_end(lambda: form.open(self._expect_room))
-            writer = _Writer(content_type, max_parts, max_part_bytes, form.file)
+            await to_its_end(lambda: self._open(form))
+            writer = _Writer(content_type, max_parts, max_part_bytes, form.descriptor)
             async for piece in in_pieces(chunks):
                 await to_its_end(partial(_feed, writer, piece))
                 self._coming[name] = max(0, self._coming[name] - len(piece))
             writer.close()
-            size = await to_its_end(lambda: form.finish(writer.staged))
+            size = await to_its_end(lambda: _complete(form, writer.staged))
         except BaseException:
             await to_its_end(form.discard)
             with self._lock:
@@ -213,41 +220,13 @@ class Staging:
         return name
 
 
-class _Arriving:
-    """The folder of a form that is being written; from one thread at a time."""
-
-    def __init__(self, folder: Path, there: Path) -> None:
-        self._folder, self._there = folder, there
-        self.file = -1
-
-    def open(self, expect_room: Callable[[], None]) -> None:
-        with refusals(f"write {self._folder}"):
-            self._folder.mkdir(parents=True)
-            expect_room()
-            self.file = os.open(self._folder / "form", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-
-    def finish(self, staged: Sequence[StagedPart]) -> int:
-        """Sync it and give it its name; its size."""
-        with refusals(f"write {self._there}"):
-            os.fsync(self.file)
-            size = os.fstat(self.file).st_size
-            write_file(self._folder / "parts", json.dumps([asdict(part) for part in staged]).encode())
-            os.rename(self._folder, self._there)
-            sync_folder(self._there.parent)
-            sync_folder(self._there.parent.parent)
-        self._close()
-        return size
-
-    def discard(self) -> None:
-        """Remove what there is of it, under either name."""
-        self._close()
-        for folder in (self._folder, self._there):
-            shutil.rmtree(folder, ignore_errors=True)
-
-    def _close(self) -> None:
-        file, self.file = self.file, -1
-        if file >= 0:
-            os.close(file)
+def _complete(form: IncomingFile, parts: Sequence[StagedPart]) -> int:
+    """Write the list of a form's parts, and give the form its final name; its size in bytes."""
+    with refusals(f"write {form.final}"):
+        size = os.fstat(form.descriptor).st_size
+        write_file(form.temporary / "parts", json.dumps([asdict(part) for part in parts]).encode())
+        form.complete()
+    return size
 
 
 def _feed(writer: _Writer, data: bytes) -> None:

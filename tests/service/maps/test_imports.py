@@ -16,7 +16,7 @@ from core.storage.files import segment_files as descriptors
 from core.storage.files.disk import write_at
 from service.engine.engine import Engine
 from service.errors.faults import TooManyImports
-from service.maps import imports
+from service.http import incoming_file
 from service.maps.imports import Arrived
 from tests.core.storage.archives.files import exported
 from tests.service.engines import ENCODER, engine_at, enrolments
@@ -69,7 +69,7 @@ class Gate:
 async def test_cancelled_while_it_arrives(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     with engine_at(tmp_path) as engine:
         gate = Gate(write_at)
-        monkeypatch.setattr(imports, "write_at", gate)
+        monkeypatch.setattr(incoming_file, "write_at", gate)
         task = asyncio.create_task(received(engine, content))
         await gate.cancelled_there(task)
         with (tmp_path / "another").open("xb") as another:  # which would get the number of a file that was closed
