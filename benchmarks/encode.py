@@ -21,7 +21,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.vlad import Words, aggregate
 from core.threads import cores, share_cores
-from service.commands.memory_arenas import settle_heap
+from service.commands.malloc import configure_malloc
 
 LIMIT = 1.4
 TOGETHER = 8
@@ -62,7 +62,7 @@ def main(
     threads: Annotated[int, typer.Option(min=0, help="0: every core.")] = 0,
 ) -> None:
     """Medians of interleaved runs."""
-    settle_heap()  # as the service does
+    configure_malloc()  # as the service does
     share_cores(threads or cores())
     data = jpeg(sample_frame()) if image is None else image.read_bytes()
     chosen = EncoderCatalogue().get(encoder)

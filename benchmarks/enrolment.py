@@ -26,7 +26,7 @@ from benchmarks.report import report, verdict
 from benchmarks.service import BATCH, SETTLE, encode_in_batches
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import share_cores
-from service.commands.memory_arenas import settle_heap
+from service.commands.malloc import configure_malloc
 
 LIMIT = 0.7
 
@@ -62,7 +62,7 @@ def main(
     again: list[float] = []
     starts: list[float] = []
     memory: dict[str, float] = {}
-    settle_heap()  # as the service does
+    configure_malloc()  # as the service does
     share_cores(torch.get_num_threads())
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)

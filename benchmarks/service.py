@@ -34,7 +34,7 @@ from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
 from service.commands.load import measure
-from service.commands.memory_arenas import settle_heap
+from service.commands.malloc import configure_malloc
 
 MAP = "benchmark"
 PATH = f"/v1/maps/{MAP}/query"
@@ -95,7 +95,7 @@ def main(
     threads: Annotated[int, typer.Option(min=0, help="Of a forward pass, there and here; 0: torch's choice.")] = 0,
 ) -> None:
     """Take turns and compare."""
-    settle_heap()  # as the service does
+    configure_malloc()  # as the service does
     share_cores(threads or torch.get_num_threads())
     chosen = EncoderCatalogue().get(encoder)
     frames, content = camera_frames(64)

@@ -1,4 +1,4 @@
-"""Blocking work, that of maps above all, beside the event loop."""
+"""Blocking work, mostly of maps, in threads beside the event loop."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Result = TypeVar("Result")
 
 
 async def in_thread(work: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-    """Run blocking work in a thread of the pool; it is not broken off.
+    """Run blocking work in a thread of the pool, which is never interrupted.
 
-    Whoever waits for it is: a task that is cancelled goes on at once, its work by itself.  So this is for work that
-    shares nothing with what its caller does afterwards; :func:`to_its_end` is for the rest.
+    A task that is cancelled does not wait for it: it continues at once, and the work ends by itself.  So use this only
+    for work that shares nothing with what its caller does afterwards, and :func:`to_its_end` otherwise.
     """
     return await to_thread.run_sync(lambda: work(*args, **kwargs))
 
@@ -26,15 +26,18 @@ async def to_its_end(
     limiter: CapacityLimiter | None = None,
     give_up: Callable[[], None] = lambda: None,
 ) -> Result:
-    """Run blocking work in a thread, and wait for its end even if the task is cancelled; then that is told.
+    """Run blocking work in a thread, and wait for its end even if the task is cancelled.
 
-    It is run whatever comes, also if the task was cancelled before it had begun.  So no file is closed and nothing
-    is cleared away while a thread still writes.
+    The work is always run, even if the task is cancelled before it has begun.  So no file is closed or removed while a
+    thread still writes to it.
 
     Args:
-        work: an error of it is told unless the task was cancelled.
-        limiter: who else may run; the pool of all threads if left out.
+        work: what to run; its error is raised unless the task was cancelled.
+        limiter: limits how many threads run; that of the whole pool if left out.
         give_up: is called when the task is cancelled; it may ask the work to end soon.
+
+    Raises:
+        CancelledError: the task was cancelled; the work has ended.
     """
     running = asyncio.create_task(_run(work, limiter))
     try:
@@ -45,10 +48,10 @@ async def to_its_end(
             while not running.done():
                 try:
                     await asyncio.wait({running})
-                except asyncio.CancelledError:  # a server may say so more than once
+                except asyncio.CancelledError:  # a server may cancel more than once
                     continue
         if not running.cancelled():
-            running.exception()  # it was seen: nobody is to be warned of it
+            running.exception()  # retrieved, so that asyncio does not warn of it
         raise
 
 

@@ -1,10 +1,10 @@
-"""Keys as they are stored: one small SQLite file in the data directory, apart from the maps and not under their lock.
+"""The stored keys: one small SQLite file in the data directory, apart from the maps and not under their lock.
 
-A key reads ``placerec_<id>_<secret>``.  Kept of it is its SHA-256 alone: a slow hash protects secrets that somebody
-chose and others can guess; 256 random bits cannot be guessed however fast each guess is checked.
+A key has the form ``placerec_<id>_<secret>``.  Only its SHA-256 is stored: a slow hash protects secrets that a person
+chose and others can guess, but 256 random bits cannot be guessed however fast a guess can be checked.
 
-The file fails closed.  That it is there means that keys are demanded, whatever it holds; each row carries a checksum;
-a file that is empty, damaged, of a later version, or that others may write to, lets nobody in.
+The file fails closed.  If it exists, keys are needed, whatever it contains; each row has a checksum; and nobody is let
+in if the file is empty, damaged, of a later version, or writable by others.
 """
 
 from __future__ import annotations
@@ -57,10 +57,16 @@ _COLUMNS = "id, name, role, maps, digest, created_at, expires_at, revoked_at, se
 class Key:
     """A key without its secret.
 
-    maps: that it is limited to; None: all.
-    digest: SHA-256 of the whole key, as its holder sends it.
-    expires_at: None: never.
-    last_used_at: some time after its last use; written now and then only.
+    Args:
+        id: 12 hexadecimal digits, which are part of the key.
+        name: whose it is; unique among the keys in force.
+        role: what it may do.
+        maps: ids of the maps that it is limited to; None for all maps.
+        digest: SHA-256 of the whole key, as its holder sends it.
+        created_at: when it was created.
+        expires_at: when it expires; None for never.
+        revoked_at: when it was revoked; None if it was not.
+        last_used_at: roughly when it was last used, since this is written only from time to time.
     """
 
     id: str
@@ -74,7 +80,7 @@ class Key:
     last_used_at: datetime | None = None
 
     def seal(self) -> bytes:
-        """Checksum over all but the last use."""
+        """The checksum of all fields but the last use."""
         values = [
             self.id,
             self.name,
@@ -87,21 +93,22 @@ class Key:
 
 
 def digest_of(token: bytes) -> bytes:
-    """What is kept of a key."""
+    """The SHA-256 of a key, which is all that is stored of its secret."""
     return hashlib.sha256(token).digest()
 
 
 class KeyStore:
-    """The keys of a data directory; each method opens the file anew, so processes may share it.
+    """The keys of a data directory.  Each method opens the file anew, so several processes may use it.
 
-    All methods may raise KeysUnreadable: the file is damaged, of a later version, unsafe, or the disk refuses.
+    All methods may raise KeysUnreadable: the file is damaged, of a later version or writable by others, or the disk
+    failed.
     """
 
     def __init__(self, directory: Path) -> None:
         self.path = directory / FILE
 
     def exists(self) -> bool:
-        """Whether keys are demanded: one was created at some time."""
+        """Whether keys are needed, because one was ever created."""
         try:
             self.path.lstat()
         except (FileNotFoundError, NotADirectoryError):
@@ -113,20 +120,22 @@ class KeyStore:
     def create(
         self, name: str, role: Role, maps: Iterable[str] | None = None, expires_at: datetime | None = None
     ) -> tuple[Key, str]:
-        """A new key, on disk when this returns, and its text, which is kept nowhere.
+        """Create a key; return it and its text, which is not stored.  It is on disk when this returns.
 
         Raises:
             InvalidRequest: the name, the role or the expiry cannot be used, or another key in force has the name.
-            InvalidIdentifier: a map's id is none.
+            InvalidIdentifier: the id of a map is not valid.
         """
         if not NAME.fullmatch(name) or ID.fullmatch(name) or name in RESERVED:
-            raise InvalidRequest(f"{name[:80]!r} cannot name a key: letters, digits and . _ @ -, at most 64.")
+            raise InvalidRequest(
+                f"A key cannot have the name {name[:80]!r}. Use at most 64 letters, digits and . _ @ -."
+            )
         if LEVELS.get(role, 0) < 1:
-            raise InvalidRequest(f"{role!r} is no role of a key: query, enrol or admin.")
+            raise InvalidRequest(f"{role!r} is not a role. Use query, enrol or admin.")
         limits = None if maps is None else frozenset(check_map_id(map_id) for map_id in maps)
         now = datetime.now(UTC)
         if expires_at is not None and expires_at <= now:
-            raise InvalidRequest("The key would have expired already.")
+            raise InvalidRequest("The expiry of the key is in the past.")
         if not self.exists():
             self._make()
         identity = secrets.token_hex(6)
@@ -134,7 +143,7 @@ class KeyStore:
         key = Key(identity, name, role, limits, digest_of(token.encode()), now, expires_at)
         with self.changing() as connection:
             if any(other.name == name and in_force(other, now) for other in read_keys(connection)):
-                raise InvalidRequest(f"There is a key {name!r} already; revoke it first, or choose another name.")
+                raise InvalidRequest(f"There is already a key {name!r}. Revoke it first, or choose another name.")
             _put(connection, key)
         return key, token
 
@@ -146,28 +155,28 @@ class KeyStore:
             return read_keys(connection)
 
     def revoke(self, id_or_name: str) -> Key:
-        """Let nobody in with a key any more; done already is no error.
+        """Revoke a key; it is no error if it is already revoked.
 
         Raises:
-            InvalidRequest: there is none, or several had the name.
+            InvalidRequest: there is no such key, or several have the name.
         """
         now = datetime.now(UTC)
         if not self.exists():
-            raise InvalidRequest("No key was ever created here.")
+            raise InvalidRequest("No key was ever created in this data directory.")
         with self.changing() as connection:
             keys = read_keys(connection)
             found = [key for key in keys if key.id == id_or_name]
             found = found or [key for key in keys if key.name == id_or_name and key.revoked_at is None]
             found = found or [key for key in keys if key.name == id_or_name]
             if len(found) != 1:
-                many = "Several keys have this name: give the id of one" if found else "There is no such key"
+                many = "Several keys have this name; give an id" if found else "There is no such key"
                 raise InvalidRequest(f"{many} ({id_or_name[:80]!r}).")
             key = found[0] if found[0].revoked_at is not None else replace(found[0], revoked_at=now)
             _put(connection, key)
         return key
 
     def note_uses(self, moments: dict[str, datetime]) -> None:
-        """Write down when keys were last used; a moment never goes back."""
+        """Store when keys were last used; an earlier time never replaces a later one."""
         with self.changing() as connection:
             connection.executemany(
                 "UPDATE keys SET last_used_at = max(coalesce(last_used_at, ''), ?) WHERE id = ?",
@@ -175,7 +184,7 @@ class KeyStore:
             )
 
     def open(self) -> sqlite3.Connection:
-        """A connection to the file, which is checked to be whole and ours."""
+        """Open a connection to the file, after checking that it is intact and a file of keys."""
         with _refusals(self.path):
             status = self.path.stat()
             if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
@@ -194,7 +203,7 @@ class KeyStore:
 
     @contextmanager
     def changing(self) -> Iterator[sqlite3.Connection]:
-        """A connection within a transaction, which is on disk when the block ends."""
+        """A connection in a transaction, which is on disk when the context ends."""
         with closing(self.open()) as connection, _refusals(self.path):
             # A rollback journal: the file is all there is of the keys.  EXTRA syncs the folder too, or a power
             # cut could bring the journal back, and with it a key that was revoked.
@@ -220,7 +229,7 @@ class KeyStore:
 
 
 def in_force(key: Key, now: datetime) -> bool:
-    """Whether a key would be let in at a moment, as the clock stands."""
+    """Whether a key is neither revoked nor expired at a moment."""
     return key.revoked_at is None and (key.expires_at is None or now < key.expires_at)
 
 
@@ -228,7 +237,7 @@ def read_keys(connection: sqlite3.Connection) -> list[Key]:
     """Every key of an open file, the oldest first.
 
     Raises:
-        KeysUnreadable: a row is not what was written.
+        KeysUnreadable: a row is damaged.
     """
     keys = []
     for row in connection.execute(f"SELECT {_COLUMNS} FROM keys ORDER BY created_at, id").fetchall():

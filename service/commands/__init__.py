@@ -5,12 +5,12 @@ commands that need them, so that ``placerec --help`` answers at once.
 """
 
 from service.commands.application import application
-from service.commands.memory_arenas import settle_heap
+from service.commands.malloc import configure_malloc
 
 
 def main() -> None:
     """Run the command line of this process; the entry point ``placerec``."""
-    settle_heap()
+    configure_malloc()
     application(prog_name="placerec")
 
 

@@ -1,4 +1,4 @@
-"""The command line's table of contents."""
+"""The command line: all commands under ``placerec``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``placerec calibrate``: when a map's answers are to be believed, measured on the map."""
+"""``placerec calibrate``: choose the threshold and the margin of a map from measurements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, media_type, path_of, read_bytes
+from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of, read_bytes
 from service.commands.console import Failure, number, output, remark, show, show_json, table
 from service.commands.jobs import submit
 
@@ -17,38 +17,51 @@ SHOWN_POINTS = 9
 
 
 def calibrate(
-    map_id: Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)],
+    map_id: MapId,
     frames: Annotated[
         Path | None,
-        typer.Option(help="CSV with the columns file,place: labelled frames beside it; no place: the map lacks it."),
+        typer.Option(
+            help="CSV with the columns file,place of labelled frames beside it; leave place empty if the map lacks it."
+        ),
     ] = None,
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the labelled frames; its mask is applied.")
     ] = None,
-    sequence: Annotated[str | None, typer.Option(help="A traverse of the map, held against its others.")] = None,
+    sequence: Annotated[
+        str | None, typer.Option(help="Ask for the frames of this traverse of the map in its other traverses.")
+    ] = None,
     pairs: Annotated[
         Path | None,
-        typer.Option(help="CSV with the columns place,shows: what each place of the sequence shows; default: by pose."),
+        typer.Option(help="With --sequence: CSV with the columns place,shows of equal places; default: by pose."),
     ] = None,
-    itself: Annotated[bool, typer.Option("--itself", help="By the map's own frames: better than nothing.")] = False,
-    precision: Annotated[float | None, typer.Option(help="So many of the answers believed are right (0.95).")] = None,
+    itself: Annotated[
+        bool,
+        typer.Option(
+            "--itself", help="Ask for the map's own frames among their neighbours: less reliable, but needs no labels."
+        ),
+    ] = False,
+    precision: Annotated[
+        float | None, typer.Option(help="Share of the recognized answers that is to be right; default: 0.95.")
+    ] = None,
     false_accept_rate: Annotated[
-        float | None, typer.Option(help="At most so many unknown places are believed.")
+        float | None, typer.Option(help="Greatest share of frames of unknown places that may be recognized.")
     ] = None,
-    mean_of_negatives: Annotated[bool, typer.Option("--mean-of-negatives", help="The rule of the thesis.")] = False,
-    most: Annotated[int | None, typer.Option(help="Stored frames to ask, spread evenly.")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and tell, store nothing.")] = False,
+    mean_of_negatives: Annotated[
+        bool, typer.Option("--mean-of-negatives", help="Use the rule of the thesis (section 3.4.3).")
+    ] = False,
+    most: Annotated[int | None, typer.Option(help="Most stored frames to ask for; they are spread evenly.")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and report only; store nothing.")] = False,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Choose a map's threshold, margin and probabilities by frames whose place is known."""
+    """Choose the threshold, the margin and the probabilities of a map by frames whose place is known."""
     if (frames is not None) + (sequence is not None) + itself != 1:
-        raise typer.BadParameter("name one of --frames, --sequence and --itself")
+        raise typer.BadParameter("give exactly one of --frames, --sequence and --itself")
     if pairs is not None and sequence is None:
-        raise typer.BadParameter("--pairs goes with --sequence")
+        raise typer.BadParameter("--pairs needs --sequence")
     if camera is not None and frames is None:
-        raise typer.BadParameter("--camera goes with --frames")
+        raise typer.BadParameter("--camera needs --frames")
     order: dict[str, Any] = {"target": _target(precision, false_accept_rate, mean_of_negatives), "dry_run": dry_run}
     order |= {} if most is None else {"most": most}
     target, path = Target(url, data_dir), path_of("maps", map_id, "calibrate")
@@ -71,7 +84,9 @@ def calibrate(
         order |= {"method": "map"} if itself else {"method": "sequence", "sequence": sequence}
         if pairs is not None:
             order["pairs"] = {place: shown or None for place, shown in _rows(pairs, ("place", "shows"))}
-        job = submit(target, path, order | {"background": True}, wait=True)  # it may take longer than a request may
+        job = submit(
+            target, path, order | {"background": True}, wait=True
+        )  # it may take longer than a request is allowed to
         if job["state"] != "succeeded":
             raise Failure(job["problem"]["detail"] if job["problem"] else f"The job {job['id']} was cancelled.")
         report = job["result"]
@@ -80,7 +95,7 @@ def calibrate(
 
 def _target(precision: float | None, false_accept_rate: float | None, mean_of_negatives: bool) -> dict[str, Any]:
     if (precision is not None) + (false_accept_rate is not None) + mean_of_negatives > 1:
-        raise typer.BadParameter("name one of --precision, --false-accept-rate and --mean-of-negatives")
+        raise typer.BadParameter("give at most one of --precision, --false-accept-rate and --mean-of-negatives")
     if mean_of_negatives:
         return {"rule": "mean_of_negatives"}
     if false_accept_rate is not None:
@@ -92,7 +107,7 @@ def _rows(path: Path, columns: tuple[str, str]) -> list[tuple[str, str]]:
     """The two columns of a CSV file with a header; the second may be empty.
 
     Raises:
-        Failure: it cannot be read, lacks a column, or has no row.
+        Failure: the file cannot be read, lacks a column, or has no row.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -105,7 +120,7 @@ def _rows(path: Path, columns: tuple[str, str]) -> list[tuple[str, str]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise Failure(f"{path} is not a CSV file in UTF-8: {error}.") from error
     if not rows:
-        raise Failure(f"{path} has no row.")
+        raise Failure(f"{path} has no rows.")
     return rows
 
 

@@ -1,4 +1,4 @@
-"""What all commands share: where they write, how they fail, how they show progress."""
+"""What all commands share: output, errors, progress bars, tables."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from service.commands.connection.credentials import add_key
 from service.errors.faults import Fault
 
 output = Console()
-"""Results."""
+"""Standard output: results."""
 
 messages = Console(stderr=True)
-"""Progress, remarks, errors: kept out of what a script reads."""
+"""Standard error: progress, remarks, errors."""
 
 
 class Failure(Exception):
-    """A command cannot do what it was asked; the text is one plain sentence for the caller."""
+    """A command failed for a foreseen reason, which its text tells the user."""
 
 
 class Commands(TyperGroup):
-    """A group of commands whose foreseen errors end in a sentence and exit status 1, not in a traceback."""
+    """A group of commands that ends foreseen errors with a message and exit status 1, without a traceback."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         found = super().get_command(ctx, cmd_name)
@@ -56,17 +56,17 @@ class Commands(TyperGroup):
 
 
 def complain(sentence: str) -> None:
-    """Write an error for a person."""
+    """Write an error to standard error."""
     messages.print(Text.assemble(("Error: ", "bold red"), sentence), soft_wrap=True)
 
 
 def remark(sentence: str) -> None:
-    """Write something worth knowing."""
+    """Write a remark to standard error."""
     messages.print(Text(sentence), soft_wrap=True)
 
 
 class Rate(ProgressColumn):
-    """How many are done in a second."""
+    """The column of a progress bar that shows the items a second."""
 
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
@@ -74,7 +74,7 @@ class Rate(ProgressColumn):
 
 
 def progress() -> Progress:
-    """A bar on standard error; on anything but a terminal only its last state is written."""
+    """A progress bar on standard error; if that is no terminal, only the last state is written."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -87,12 +87,12 @@ def progress() -> Progress:
 
 
 def show_json(value: Any) -> None:
-    """Write a value as JSON, one line if it is an item of a stream."""
+    """Write a value as indented JSON to standard output."""
     typer.echo(json.dumps(value, indent=2, ensure_ascii=False))
 
 
 def table(*columns: str, title: str | None = None) -> Table:
-    """An empty table; columns that start with ``#`` hold numbers."""
+    """An empty table; a column whose name starts with ``#`` is aligned right, for numbers."""
     made = Table(title=title, title_justify="left", box=None, pad_edge=False, header_style="bold")
     for column in columns:
         made.add_column(column.removeprefix("#"), justify="right" if column.startswith("#") else "left")
@@ -100,7 +100,7 @@ def table(*columns: str, title: str | None = None) -> Table:
 
 
 def show(made: Table) -> None:
-    """Write a table; off a terminal it is as wide as it needs to be."""
+    """Write a table; if the output is no terminal, it is as wide as its contents."""
     if output.is_terminal:
         output.print(made)
     else:
@@ -108,7 +108,7 @@ def show(made: Table) -> None:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number for a table; a dash where there is none."""
+    """A number for a table; a dash for None."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 
@@ -116,7 +116,7 @@ def write_file(path: Path, text: str) -> None:
     """Write a file whole or not at all.
 
     Raises:
-        Failure: it cannot be written.
+        Failure: the file cannot be written.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""``placerec enroll``: the frames of a directory become places of a map."""
+"""``placerec enroll``: enrol the images of a directory as places of a map."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from service.commands.connection.bulk import Outcome, enrol_frames
+from service.commands.connection.batches import Outcome, enrol_frames
 from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress, remark
-from service.commands.manifest import Frame, read_traverse, unlisted
+from service.commands.traverse import Frame, read_traverse, unlisted
 
 
 @dataclass
 class Report:
-    """What became of the frames so far."""
+    """The outcomes of the frames so far."""
 
     changes: Counter[str] = field(default_factory=Counter)
     posed: int = 0
@@ -42,15 +42,17 @@ def enroll(
     map_id: Annotated[str, typer.Option("--map", "-m", help="The map to enrol into.", show_default=False)],
     create: Annotated[bool, typer.Option("--create", help="Create the map if there is none.")] = False,
     encoder: Annotated[
-        str | None, typer.Option(help="Encoder of the map: of the one that is created, or as a check.")
+        str | None,
+        typer.Option(help="Encoder of a map that is created; for an existing map, the encoder that it must have."),
     ] = None,
     keep: Annotated[
-        Literal["none", "thumbnail", "image"] | None, typer.Option(help="What a map that is created keeps of a frame.")
+        Literal["none", "thumbnail", "image"] | None,
+        typer.Option(help="What a map that is created keeps of each frame."),
     ] = None,
     sequence: Annotated[
-        str | None, typer.Option(help="Name of the traverse; default: the directory's name.", show_default=False)
+        str | None, typer.Option(help="Name of the traverse; default: the name of DIR.", show_default=False)
     ] = None,
-    id_prefix: Annotated[str, typer.Option(help="Put before the ids made of file names.")] = "",
+    id_prefix: Annotated[str, typer.Option(help="Prefix of the ids that are made from file names.")] = "",
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
@@ -59,14 +61,14 @@ def enroll(
 ) -> None:
     """Enrol the images of DIR, in natural order, as places of a map.
 
-    Poses come from places.csv in DIR (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is needed), or
-    else from the images' EXIF data. Ids are the files' names without their ending. It can be broken off and run
-    again: a frame whose bytes are known is not encoded again.
+    Poses come from places.csv in DIR (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or
+    else from the EXIF data of the images. Ids are the file names without their extension. The command can be
+    interrupted and run again: a frame that is already enrolled is not encoded again.
     """
     frames = [replace(frame, camera=camera) for frame in read_traverse(directory, sequence, id_prefix)]
     left_out = unlisted(directory, frames)
     if left_out:
-        remark(f"{left_out} images of {directory} are not in places.csv and are left out.")
+        remark(f"{left_out} images of {directory} are not listed in places.csv and are left out.")
     began = time.monotonic()
     report = run(_enroll(Target(url, data_dir), map_id, frames, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, frames, time.monotonic() - began)
@@ -81,7 +83,7 @@ async def _enroll(
     async with open_service(target) as service:
         await _ready_map(service, map_id, create, {key: value for key, value in wanted.items() if value is not None})
         if (camera := frames[0].camera) is not None:
-            await service.get(path_of("maps", map_id, "cameras", camera))  # or else each frame would be refused
+            await service.get(path_of("maps", map_id, "cameras", camera))  # otherwise each frame would be refused
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
@@ -95,25 +97,25 @@ async def _enroll(
             except Failure as failure:
                 done = sum(report.changes.values())
                 raise Failure(
-                    f"{failure} {done} of {len(frames)} frames are enrolled; the same command goes on from there."
+                    f"{failure} {done} of {len(frames)} frames are enrolled; run the command again to continue."
                 ) from failure
     return report
 
 
 async def _ready_map(service: Service, map_id: str, create: bool, settings: dict[str, str]) -> None:
-    """See that the map is there, or create it."""
+    """Check that the map exists, or create it."""
     try:
         await service.get(path_of("maps", map_id))
     except Refused as refused:
         if refused.slug != "unknown-map":
             raise
         if not create:
-            raise Failure(f"There is no map {map_id!r}; --create makes it.") from refused
+            raise Failure(f"There is no map {map_id!r}. Give --create to create it.") from refused
         await service.request("POST", path_of("maps"), json={"id": map_id, **settings})
 
 
 async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> frozenset[str]:
-    """Which of the frames' ids the map has; refuses to overwrite the places of another traverse with the same names."""
+    """The frames' ids that the map already has; those of another traverse are refused, not overwritten."""
     wanted = {frame.id for frame in frames}
     known: dict[str, Any] = {}
     async for page in service.pages(path_of("maps", map_id, "places")):
@@ -122,7 +124,7 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> 
     if taken:
         other = known[taken[0].id]
         raise Failure(
-            f"{len(taken)} ids of this traverse are taken by places of another one ({taken[0].id!r} is of "
+            f"{len(taken)} ids of this traverse belong to places of another one ({taken[0].id!r} is in "
             f"{'no sequence' if other is None else repr(other)}). Give --id-prefix, for instance "
             f"--id-prefix {taken[0].sequence}-, or the right --sequence."
         )

@@ -1,4 +1,4 @@
-"""``placerec jobs``: long work, listed, followed and cancelled."""
+"""``placerec jobs``: list, follow and cancel jobs."""
 
 from __future__ import annotations
 
@@ -20,15 +20,17 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, progress, remark, show, show_json, table
 
-jobs = typer.Typer(cls=Commands, help="List, follow and cancel long work.", no_args_is_help=True)
+jobs = typer.Typer(
+    cls=Commands, help="List, follow and cancel jobs, which do long work in the background.", no_args_is_help=True
+)
 
 JobId = Annotated[str, typer.Argument(metavar="JOB", help="The job's id.", show_default=False)]
 Wait = Annotated[
-    bool, typer.Option("--wait/--no-wait", help="Wait for the job's end; it goes on in the service either way.")
+    bool, typer.Option("--wait/--no-wait", help="Wait until the job ends; it continues in the service either way.")
 ]
 
 WAIT_SECONDS = 1.0
-"""Of one question: how often the bar moves."""
+"""How long one request waits for news of a job, and so how often the progress bar moves."""
 
 OPEN = ("queued", "running")
 
@@ -37,7 +39,8 @@ OPEN = ("queued", "running")
 def list_jobs(
     map_id: Annotated[str | None, typer.Option("--map", "-m", help="Only the jobs of this map.")] = None,
     state: Annotated[
-        Literal["queued", "running", "succeeded", "failed", "cancelled"] | None, typer.Option(help="Only those.")
+        Literal["queued", "running", "succeeded", "failed", "cancelled"] | None,
+        typer.Option(help="Only jobs in this state."),
     ] = None,
     url: Url = None,
     data_dir: DataDir = None,
@@ -58,35 +61,35 @@ def list_jobs(
 @jobs.command("show")
 def show_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
     """Show one job."""
-    tell(ask(Target(url, data_dir), "GET", path_of("jobs", job_id)).json(), as_json)
+    show_outcome(ask(Target(url, data_dir), "GET", path_of("jobs", job_id)).json(), as_json)
 
 
 @jobs.command("wait")
 def wait_for_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """Follow a job to its end; the exit status is 1 unless it succeeds."""
+    """Wait until a job ends; the exit status is 1 unless it succeeds."""
 
     async def work() -> dict[str, Any]:
         async with open_service(Target(url, data_dir)) as service:
             return await followed(service, await service.get(path_of("jobs", job_id)))
 
-    tell(run(work()), as_json)
+    show_outcome(run(work()), as_json)
 
 
 @jobs.command("cancel")
 def cancel_job(job_id: JobId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """Ask a job to stop; it does so where it can."""
+    """Ask a job to stop; it stops at its next safe point."""
     job = ask(Target(url, data_dir), "POST", path_of("jobs", job_id, "cancel")).json()
     if as_json:
         show_json(job)
     else:
-        remark(f"The job {job_id} is {job['state']}{', and is to stop' if job['state'] in OPEN else ''}.")
+        remark(f"The job {job_id} is {job['state']}{' and will stop' if job['state'] in OPEN else ''}.")
 
 
 async def followed(service: Service, job: dict[str, Any]) -> dict[str, Any]:
-    """A job at its end, its progress shown meanwhile.
+    """Wait until a job ends, with a progress bar, and return it.
 
     Raises:
-        Refused, Failure: the service does not tell.
+        Refused, Failure: the service refuses the request, or does not answer.
     """
     with progress() as bar:
         task = bar.add_task(job["kind"], total=None)
@@ -99,14 +102,13 @@ async def followed(service: Service, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def submit(target: Target, path: str, body: dict[str, Any], wait: bool) -> dict[str, Any]:
-    """The job that is asked for, at its end if it is to be waited for.
+    """Submit a job, wait until it ends if ``wait`` is set, and return it.
 
     Raises:
-        Failure: it is not to be waited for, but the service would end with this command.
-        Refused: the service does not take it.
+        Failure: ``wait`` is not set, but the service ends with this command.
+        Refused: the service refuses the job.
     """
-    if not wait and target.url is None:
-        raise Failure("Without --url the service ends with this command, and the job would only go on with the next.")
+    check_outlives(target, wait)
 
     async def work() -> dict[str, Any]:
         async with open_service(target) as service:
@@ -116,11 +118,21 @@ def submit(target: Target, path: str, body: dict[str, Any], wait: bool) -> dict[
     return run(work())
 
 
-def tell(job: dict[str, Any], as_json: bool) -> None:
-    """Write a job.
+def check_outlives(target: Target, wait: bool) -> None:
+    """Refuse not to wait for a job if its service ends with this command.
 
     Raises:
-        Failure: it has failed, or was cancelled.
+        Failure: ``wait`` is not set, and there is no URL.
+    """
+    if not wait and target.url is None:
+        raise Failure("Without --url the service ends with this command. Leave out --no-wait, or give --url.")
+
+
+def show_outcome(job: dict[str, Any], as_json: bool) -> None:
+    """Show a job.
+
+    Raises:
+        Failure: the job has failed or was cancelled.
     """
     if as_json:
         show_json(job)

@@ -1,4 +1,4 @@
-"""``placerec keys``: who is let in.  Works on the data directory, beside a service that runs or without one."""
+"""``placerec keys``: create, list and revoke the keys of a data directory, which a service may be using."""
 
 from __future__ import annotations
 
@@ -22,20 +22,24 @@ SPAN = re.compile(r"([0-9]{1,6})([mhdw])")
 
 @keys.command("create")
 def create(
-    name: Annotated[str, typer.Argument(help="Whose it is; it stands in logs.", show_default=False)],
+    name: Annotated[str, typer.Argument(help="Whose key it is; the name appears in logs.", show_default=False)],
     role: Annotated[
         Literal["query", "enrol", "admin"],
-        typer.Option(help="What it may do: enrol may also query, admin everything.", show_default=False),
+        typer.Option(help="What it may do; enrol includes query, and admin includes everything.", show_default=False),
     ],
-    maps: Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this map; several times.")] = None,
-    expires: Annotated[str | None, typer.Option(help="After 30m, 12h, 30d or 8w, or at a date (UTC).")] = None,
+    maps: Annotated[
+        list[str] | None, typer.Option("--map", "-m", help="Limit the key to this map; may be repeated.")
+    ] = None,
+    expires: Annotated[
+        str | None, typer.Option(help="When it expires: after 30m, 12h, 30d or 8w, or at a date (UTC).")
+    ] = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Create a key and write it to standard output: it is shown this once, and kept nowhere.
+    """Create a key and write it to standard output. It is shown only this once and stored nowhere.
 
-    The first key of a data directory makes keys necessary for every request, within a second also in a service that
-    runs already. It stays so when all keys are revoked or have expired.
+    As soon as a data directory has its first key, every request needs one; a running service knows within a second.
+    That remains so even when all keys are revoked or have expired.
     """
     store = _store(data_dir)
     is_first = not store.exists()
@@ -46,12 +50,12 @@ def create(
         typer.echo(token)
     if is_first:
         remark("From now on every request needs a key.")
-    remark(f"The key {key.name} ({key.id}, {_described(key)}) is shown this once: keep it now.")
+    remark(f"The key {key.name} ({key.id}, {_described(key)}) is shown only this once. Store it now.")
 
 
 @keys.command("list")
 def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """List every key that was ever created, without its secret; the last use may be a minute behind."""
+    """List every key that was ever created, without its secret. The last use may be a minute out of date."""
     found = _store(data_dir).all()
     if as_json:
         show_json([_view(key) for key in found])
@@ -63,27 +67,27 @@ def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
         shown.add_row(key.id, key.name, key.role, maps, state_of(key), *moments)
     show(shown)
     if not found:
-        remark("No key was ever created: the service asks nobody for one.")
+        remark("No key was ever created, so the service needs none.")
 
 
 @keys.command("revoke")
 def revoke(
-    wanted: Annotated[str, typer.Argument(metavar="ID|NAME", help="Of the key.", show_default=False)],
+    wanted: Annotated[str, typer.Argument(metavar="ID|NAME", help="Id or name of the key.", show_default=False)],
     data_dir: DataDir = None,
 ) -> None:
-    """Let nobody in with a key any more; a running service knows within a second."""
+    """Revoke a key, so that nobody is let in with it; a running service knows within a second."""
     store = _store(data_dir)
     revoked = store.revoke(wanted)
     remark(f"The key {revoked.name} ({revoked.id}) is revoked.")
     if not any(state_of(other) == "in force" for other in store.all()):
-        remark("No key is in force: the service refuses every request that is not open to all.")
+        remark("No key is in force now: the service refuses every request that needs one.")
 
 
 def moment(text: str) -> datetime:
-    """The moment that a span from now, a date or a date and time names; UTC unless it says otherwise.
+    """Parse a span from now, a date, or a date and time, which is in UTC unless it has an offset.
 
     Raises:
-        Failure: it is none of them.
+        Failure: the text is none of them.
     """
     span = SPAN.fullmatch(text)
     if span is not None:
@@ -91,14 +95,14 @@ def moment(text: str) -> datetime:
     try:
         found = datetime.fromisoformat(text)
     except ValueError as error:
-        raise Failure(f"{text!r} is no span such as 30d and no date such as 2027-01-31.") from error
+        raise Failure(f"{text!r} is neither a span such as 30d nor a date such as 2027-01-31.") from error
     if len(text) == len("2027-01-31"):
         found = datetime.combine(found.date(), time())
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
 def state_of(key: Key) -> str:
-    """Whether a key is in force, by this machine's clock."""
+    """Whether a key is in force, revoked or expired by this machine's clock."""
     if key.revoked_at is not None:
         return "revoked"
     return "expired" if key.expires_at is not None and key.expires_at <= datetime.now(UTC) else "in force"

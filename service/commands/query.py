@@ -1,4 +1,4 @@
-"""``placerec query``: where were these frames taken?"""
+"""``placerec query``: recognize the places where frames were taken."""
 
 from __future__ import annotations
 
@@ -23,36 +23,42 @@ from service.commands.connection.client import (
 from service.commands.console import Failure, complain, number, show, table
 
 PATIENCE = 30.0
-"""Seconds for which a frame is sent again while the service is overloaded."""
+"""Seconds for which a frame is repeated while the service is overloaded."""
 
 
 def query(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE…", help="Frames to localize.", show_default=False)],
     map_id: Annotated[str, typer.Option("--map", "-m", help="The map to search.", show_default=False)],
-    k: Annotated[int, typer.Option("-k", min=1, max=100, help="How many matches to ask for.")] = 5,
+    k: Annotated[int, typer.Option("-k", min=1, max=100, help="How many matches to return.")] = 5,
     near: Annotated[
-        str | None, typer.Option(help="X,Y in metres, or LATITUDE,LONGITUDE with --geographic; with --radius.")
+        str | None,
+        typer.Option(help="Search only within --radius of X,Y in metres, or LATITUDE,LONGITUDE with --geographic."),
     ] = None,
-    radius: Annotated[float | None, typer.Option(min=0, help="Metres around --near where the place is.")] = None,
-    geographic: Annotated[bool, typer.Option("--geographic", help="--near is in degrees.")] = False,
-    bbox: Annotated[str | None, typer.Option(help="WEST,SOUTH,EAST,NORTH in degrees.")] = None,
-    sequences: Annotated[str | None, typer.Option(help="Traverses, with commas, of which the place is.")] = None,
-    after: Annotated[str | None, typer.Option(help="The place was taken at this time or later.")] = None,
-    before: Annotated[str | None, typer.Option(help="The place was taken at this time or earlier.")] = None,
-    where: Annotated[str | None, typer.Option(help="JSON object: what the place's metadata has.")] = None,
+    radius: Annotated[float | None, typer.Option(min=0, help="Metres around --near.")] = None,
+    geographic: Annotated[bool, typer.Option("--geographic", help="Read --near as degrees.")] = False,
+    bbox: Annotated[str | None, typer.Option(help="Search only in WEST,SOUTH,EAST,NORTH, in degrees.")] = None,
+    sequences: Annotated[str | None, typer.Option(help="Search only in these traverses, separated by commas.")] = None,
+    after: Annotated[str | None, typer.Option(help="Search only places of this time or later.")] = None,
+    before: Annotated[str | None, typer.Option(help="Search only places of this time or earlier.")] = None,
+    where: Annotated[
+        str | None, typer.Option(help="Search only places whose metadata has the values of this JSON object.")
+    ] = None,
     soft: Annotated[
-        str | None, typer.Option(help="What of this is no filter but a prior: position, bbox, sequences, time, where.")
+        str | None,
+        typer.Option(
+            help="Use these as priors, not as filters: position, bbox, sequences, time, where, separated by commas."
+        ),
     ] = None,
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
     url: Url = None,
     data_dir: DataDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a frame and line.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a line for each frame.")] = False,
 ) -> None:
-    """Say for each image which place of a map it shows, if any.
+    """Recognize the place of a map that each image shows, if any.
 
-    An unknown place is an answer, not an error; the exit status is 1 only if an image got none.
+    An unknown place is an answer, not an error: the exit status is 1 only if an image cannot be used.
     """
     known: dict[str, Any] = {
         "bbox": bbox,

@@ -1,4 +1,4 @@
-"""``placerec settings``: what the service would run with."""
+"""``placerec settings``: the settings that the service would run with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.commands.console import remark, show, show_json, table
 
 
 def settings(as_json: Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")] = False) -> None:
-    """Show every setting: its variable, its value in this environment, its default, what it does."""
+    """Show every setting: its variable, its value in this environment, its default, and what it does."""
     from service.settings import PREFIX, Settings, unknown_variables
 
     found = read_settings()

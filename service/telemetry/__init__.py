@@ -1,1 +1,1 @@
-"""What is told of requests: metrics, log lines, traces."""
+"""Metrics, logs and traces of requests."""

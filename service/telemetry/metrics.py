@@ -1,4 +1,4 @@
-"""What Prometheus scrapes: requests, queue, encoding stages, searches, and the answers of each map."""
+"""Metrics for Prometheus: requests, the queue, stages of encoding, searches, and the answers of each map."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ITEMS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
 class MapCollector(Collector):
-    """Gauges that are read from the maps when somebody scrapes.
+    """Gauges that are read from the maps when Prometheus asks.
 
     Args:
-        count_places: gives the number of places of each map.
-        count_quarantined: gives the number of maps out of service.
+        count_places: returns the number of places of each map.
+        count_quarantined: returns the number of maps that are out of service.
     """
 
     def __init__(self, count_places: Callable[[], Mapping[str, int]], count_quarantined: Callable[[], int]) -> None:
@@ -41,7 +41,7 @@ class MapCollector(Collector):
 
 
 class Metrics:
-    """All series of one application, in a registry of its own."""
+    """The metrics of one application, in a registry of its own."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry(auto_describe=False)
@@ -103,21 +103,21 @@ class Metrics:
         )
 
     def observe_request(self, route: str, method: str, status: int, seconds: float) -> None:
-        """Count one request."""
+        """Count a request and its duration."""
         key = (route, method, status)
-        if key not in self._requests:  # looking a series up costs more than counting in it
+        if key not in self._requests:  # looking up a series costs more than counting in it
             self._requests[key] = self.requests.labels(route, method, str(status))
         self._requests[key].observe(seconds)
 
     def observe_stages(self, milliseconds: Mapping[str, float]) -> None:
-        """Count the stages of one encoding."""
+        """Count the durations of the stages of an encoding."""
         for stage, duration in milliseconds.items():
             if stage not in self._stages:
                 self._stages[stage] = self.stages.labels(stage)
             self._stages[stage].observe(duration / 1e3)
 
     def observe_answer(self, map_id: str, verdict: str, score: float | None) -> None:
-        """Count the answer to one query."""
+        """Count the answer to a query."""
         key = (map_id, verdict)
         if key not in self._verdicts:
             self._verdicts[key] = self.verdicts.labels(map_id, verdict)
@@ -138,5 +138,5 @@ class Metrics:
                 self.verdicts.remove(map_id, verdict)
 
     def expose(self) -> bytes:
-        """The text that Prometheus reads."""
+        """All metrics in the text format of Prometheus."""
         return generate_latest(self.registry)

@@ -1,6 +1,6 @@
-"""What libraries write to standard error by themselves, past Python: made into lines of the log.
+"""Turns what native libraries write to standard error into log lines.
 
-libjpeg and libpng say "Corrupt JPEG data" there, which would stand between the lines of JSON.
+libjpeg and libpng, for example, write "Corrupt JPEG data" there, which would appear between the lines of JSON.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 LONGEST = 500
-"""Bytes of a line; the rest of it is left out."""
+"""Most bytes of a line; the rest is left out."""
 
 NOISE = re.compile(r"JPEG|libpng|WebP|\[ *WARN:.*grfmt_")
-"""Said of frames that are broken, whose callers hear of it: of no use to an operator."""
+"""Messages about damaged frames, which are reported to their callers and so of no use to an operator."""
 
 log = logging.getLogger("placerec.native")
 
 
 @contextmanager
 def logged_stderr() -> Iterator[None]:
-    """Within, descriptor 2 leads into the log, and ``sys.stderr`` to where descriptor 2 led before.
+    """Lead file descriptor 2 into the log, and ``sys.stderr`` to where descriptor 2 led before.
 
-    Set logging up within: a handler that holds the old ``sys.stderr`` would be logged in turn.  A crash of the
-    interpreter is still told on the old one.
+    Configure logging within this context: a handler with the old ``sys.stderr`` would be logged in turn.  A crash of
+    the interpreter is still reported on the old descriptor.
     """
     before = sys.stderr
     before.flush()
     kept = os.dup(2)
     reading, writing = os.pipe()
-    # A library that finds the pipe full goes on without its line, rather than to wait for a thread that waits for it.
+    # If the pipe is full, a library loses its line instead of waiting for a thread that may wait for it.
     os.set_blocking(writing, False)
     os.dup2(writing, 2)
     os.close(writing)
@@ -46,11 +46,11 @@ def logged_stderr() -> Iterator[None]:
     try:
         yield
     finally:
-        os.dup2(kept, 2)  # which closes the last end that writes
+        os.dup2(kept, 2)  # this closes the last writing end of the pipe
         thread.join(1.0)
         faulthandler.enable(kept)
         sys.stderr = before
-        # Both stay open: a handler of the log may still hold the one, the crash handler the other.
+        # Both descriptors stay open: a log handler may still use one, and the crash handler the other.
 
 
 def _log_lines(reading: int) -> None:

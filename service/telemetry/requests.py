@@ -1,4 +1,4 @@
-"""Around every request: its id, its trace, its log line, its place in the histogram, the answer when all else fails."""
+"""Telemetry of every request: its id, its trace, its log line, its metrics; and the answer to unexpected errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.telemetry.metrics import Metrics
 from service.telemetry.traces import Origin, Trace, origin, read_trace
 
 _ids = random.Random()
-"""Ids need to differ, not to be secret: asking the system for each one's bytes would cost more than all of its use."""
+"""Ids have to differ but need not be secret, so they do not cost a system call each."""
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:-]{0,127}")
 UNMATCHED = "(none)"
@@ -32,13 +32,13 @@ FIELDS = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", 
 
 LONGEST_PATH = 300
 LONGEST_TEXT, LONGEST_TRACEBACK = 4096, 32_768
-"""Characters of one value of a line of the log: nothing that a caller sends makes a line of megabytes."""
+"""Most characters of one value in a log line, so that no request makes a line of megabytes."""
 
 log = logging.getLogger("placerec.requests")
 
 
 class JsonLines(logging.Formatter):
-    """One JSON object a line: time, level, logger, message, and what the caller put in ``extra``."""
+    """Formats records as JSON objects of time, level, logger, message, ids of the request, and values of ``extra``."""
 
     def format(self, record: logging.LogRecord) -> str:
         moment = datetime.fromtimestamp(record.created, UTC)
@@ -62,13 +62,13 @@ class JsonLines(logging.Formatter):
 
 
 def cut(text: str, longest: int) -> str:
-    """The text, or its first characters and how many more there were."""
+    """The text; if it is too long, its first characters and how many more there were."""
     return text if len(text) <= longest else f"{text[:longest]}… ({len(text) - longest} more)"
 
 
 def configure_logging(level: str) -> None:
-    """Send the service's and the server's logs to standard error as JSON lines."""
-    # In detail the server would tell the heads of requests, and with them keys.
+    """Send the logs of the service and of the server to standard error as JSON lines."""
+    # At level debug uvicorn would log the heads of requests, and with them keys.
     servers = "INFO" if level == "debug" else level.upper()
     logging.config.dictConfig(
         {
@@ -79,17 +79,17 @@ def configure_logging(level: str) -> None:
             "root": {"handlers": ["stderr"], "level": "WARNING"},
             "loggers": {
                 "placerec": {"level": level.upper()},
-                # Whatever the level of the other logs: who changed what, and who is let in.
+                # These do not depend on the level: who changed what, and who is let in.
                 "placerec.audit": {"level": "INFO"},
                 "placerec.access": {"level": "INFO"},
                 "core": {"level": level.upper()},
                 "uvicorn": {"handlers": [], "level": servers, "propagate": True},
                 "uvicorn.error": {"handlers": [], "level": servers, "propagate": True},
-                # Each request, each WebSocket and each refusal of a connection has a line of our own.
+                # Requests, WebSockets and refused connections are logged by this service itself.
                 "uvicorn.streams": {"handlers": [], "level": "WARNING", "propagate": True},
                 "uvicorn.http": {"handlers": [], "level": "ERROR", "propagate": True},
                 "uvicorn.access": {"handlers": [], "level": "CRITICAL", "propagate": False},
-                # Broken forms are the caller's affair.
+                # Malformed forms are reported to the caller.
                 "python_multipart": {"level": "CRITICAL"},
             },
         }
@@ -97,7 +97,7 @@ def configure_logging(level: str) -> None:
 
 
 def request_id(headers: list[tuple[bytes, bytes]]) -> str:
-    """The caller's ``X-Request-Id`` if it is a plain one, else a new id."""
+    """The caller's ``X-Request-Id`` if it has a valid form, otherwise a new id."""
     for name, value in headers:
         if name == b"x-request-id":
             given = value.decode("latin-1")
@@ -107,11 +107,11 @@ def request_id(headers: list[tuple[bytes, bytes]]) -> str:
 
 
 class Telemetry:
-    """Outermost ASGI layer of the application.
+    """The outermost ASGI middleware of the application.
 
-    Sets ``request_id``, ``started`` (``time.monotonic``), ``trace`` and ``trace_id`` (None outside of a trace) in the
-    request's state, returns the ids in ``X-Request-Id`` and ``traceresponse``, and answers GET's route for HEAD (the
-    server drops the body).
+    It sets ``request_id``, ``started`` (``time.monotonic``), ``trace`` and ``trace_id`` (None without a trace) in the
+    request's state, returns the ids in ``X-Request-Id`` and ``traceresponse``, and answers HEAD with the route for GET
+    (the server drops the body).
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -136,7 +136,7 @@ class Telemetry:
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         method, state = scope["method"], scope["state"]
         inner = {**scope, "method": "GET"} if method == "HEAD" else scope
-        state["method"] = method  # for routes whose answer is long to make
+        state["method"] = method  # for routes whose answer takes long to make
         status, sent = 0, 0
 
         async def send_marked(message: Message) -> None:
@@ -150,12 +150,14 @@ class Telemetry:
 
         try:
             await self.app(inner, receive, send_marked)
-        except asyncio.CancelledError:  # by the server, which cannot wait any longer
+        except asyncio.CancelledError:  # the server stops and cannot wait any longer
             if status:
                 raise
-            stopped = Stopping("The service stopped before the request was done; whether it was, is not known.")
+            stopped = Stopping(
+                "The service stopped before the request was answered; it may or may not have been carried out."
+            )
             await problem_response(Request(inner), stopped)(inner, receive, send_marked)
-        except Exception as error:  # a defect of ours: logged there, and told to nobody else
+        except Exception as error:  # a defect of the service: it is logged, but its text is not sent
             if status:
                 log.exception("the answer broke off", extra={"request_id": state["request_id"]})
             else:
@@ -164,7 +166,7 @@ class Telemetry:
             self._record(inner, method, status, sent)
 
     async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """A WebSocket: one line at its end."""
+        """Pass a WebSocket on, and log it when it ends."""
         counts = {"messages_in": 0, "messages_out": 0}
         status = 0
 

@@ -1,4 +1,4 @@
-"""The trace that a request is part of (W3C Trace Context), and what every line of the log says of its request."""
+"""The trace of a request (W3C Trace Context), and the ids that every log line of a request has."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from dataclasses import dataclass
 
 TRACEPARENT = re.compile(rb"([0-9a-f]{2})-([0-9a-f]{32})-([0-9a-f]{16})-([0-9a-f]{2})(-.*)?")
 LONGEST = 512
-"""Bytes of a header that a later version of the standard may have made longer."""
+"""Most bytes of a header; later versions of the standard may make it longer than today."""
 
 _ids = random.Random()
 
 
 @dataclass(frozen=True)
 class Trace:
-    """One request's part of a trace.
+    """The span of one request in a trace.
 
-    trace_id: of the whole, 32 hexadecimal digits; parent_id: of the caller's part, 16; span_id: of ours, 16.
-    sampled: whether the caller records its part.
+    Args:
+        trace_id: of the trace, 32 hexadecimal digits.
+        parent_id: of the caller's span, 16 hexadecimal digits.
+        span_id: of this request's span, 16 hexadecimal digits.
+        sampled: whether the caller records its span.
     """
 
     trace_id: str
@@ -30,12 +33,12 @@ class Trace:
 
     @property
     def response(self) -> str:
-        """The value of ``traceresponse``: what the caller may link to."""
+        """The value of the header ``traceresponse``."""
         return f"00-{self.trace_id}-{self.span_id}-{int(self.sampled):02x}"
 
 
 def read_trace(headers: Iterable[tuple[bytes, bytes]]) -> Trace | None:
-    """The trace of a request by its ``traceparent``; None without one, or if it is not to the letter of the standard.
+    """The trace of a request by its ``traceparent``; None without one, or if it does not conform to the standard.
 
     Args:
         headers: names in lower case.
@@ -57,11 +60,11 @@ def read_trace(headers: Iterable[tuple[bytes, bytes]]) -> Trace | None:
 
 @dataclass(frozen=True)
 class Origin:
-    """The request for which something is done."""
+    """The ids of the request for which something is done."""
 
     request_id: str
     trace_id: str | None
 
 
 origin: ContextVar[Origin | None] = ContextVar("origin", default=None)
-"""Of what is done now; threads that work for a request know it, too."""
+"""The origin of what is being done now; threads that work for a request inherit it."""

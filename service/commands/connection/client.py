@@ -1,7 +1,7 @@
-"""The service as the commands see it: at a URL, or in this process on the data directory itself.
+"""The client of the commands, which talks to a service at a URL or runs the application in this process.
 
-Without a URL the application runs here, without a socket, under the data directory's exclusive
-lock: the commands take the same path through the same routes either way.
+Without a URL the application runs here, without a socket, under the exclusive lock of the data directory; the requests
+take the same routes either way.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import httpx
 import typer
 
 from core.errors import DataDirectoryLocked
-from service.commands.connection.credentials import VARIABLE, given_key, headers_for, travels_openly
+from service.commands.connection.credentials import VARIABLE, given_key, headers_for, is_unencrypted
 from service.commands.console import Failure, remark
 
 if TYPE_CHECKING:
@@ -39,13 +39,14 @@ Url = Annotated[
     typer.Option(
         "--url",
         envvar="PLACEREC_URL",
-        help="The service to talk to. Without it the data directory is opened here; refused while a service holds it.",
+        help="URL of the service. Without it the command opens the data directory itself, unless a service uses it.",
     ),
 ]
 DataDir = Annotated[
     Path | None,
-    typer.Option("--data-dir", help="Data directory to open where no URL is given; else PLACEREC_DATA_DIR."),
+    typer.Option("--data-dir", help="Data directory to open if no URL is given; default: PLACEREC_DATA_DIR."),
 ]
+MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Write JSON instead of a table.")]
 
 
@@ -54,7 +55,7 @@ class Refused(Failure):
 
     Args:
         status: HTTP status.
-        slug: last part of the problem's type, such as ``unknown-map``; "" for an answer not of placerec.
+        slug: the last part of the problem's type, such as ``unknown-map``; "" if the answer is no problem object.
         detail: a sentence.
     """
 
@@ -65,7 +66,7 @@ class Refused(Failure):
 
 @dataclass
 class Target:
-    """Where a command's requests go."""
+    """Where the requests of a command go: a URL, or the data directory if there is none."""
 
     url: str | None
     data_dir: Path | None
@@ -90,15 +91,15 @@ class Service:
         """Send a request and return its successful answer.
 
         Args:
-            path: below the service's root, such as ``/v1/maps``.
-            patience: seconds for which the request is sent again, under the same id, while the
-                service is overloaded, starts, or cannot be reached.
-            final: problems after which it is not sent again all the same, by the last part of their type.
+            path: the path at the service, such as ``/v1/maps``.
+            patience: seconds for which the request is repeated, with the same id, while the service is overloaded,
+                starting, or unreachable.
+            final: problems after which it is not repeated, by the last part of their type.
             options: as for ``httpx.AsyncClient.request``.
 
         Raises:
             Refused: the service answers with an error.
-            Failure: it does not answer.
+            Failure: the service does not answer.
         """
         until = time.monotonic() + patience
         pause = FIRST_PAUSE
@@ -128,11 +129,11 @@ class Service:
             pause = min(2 * pause, LONGEST_PAUSE)
 
     async def get(self, path: str, **options: Any) -> Any:
-        """The JSON at ``path``; errors as for ``request``."""
+        """GET the JSON at ``path``; it raises what ``request`` raises."""
         return (await self.request("GET", path, **options)).json()
 
     async def pages(self, path: str, params: dict[str, Any] | None = None) -> AsyncIterator[dict[str, Any]]:
-        """The pages of a listing, one after the other; errors as for ``request``."""
+        """The pages of a listing in order; it raises what ``request`` raises."""
         cursor: str | None = None
         while True:
             more = {} if cursor is None else {"cursor": cursor}
@@ -144,37 +145,39 @@ class Service:
 
 
 def refusal(response: httpx.Response) -> Refused:
-    """The error that an unsuccessful answer stands for."""
+    """The error for an unsuccessful answer."""
     if response.headers.get("content-type", "").startswith(PROBLEM):
         problem = response.json()
         slug = problem["type"].rpartition(":")[2]
         hint = f" Set {VARIABLE} to a key of this service." if slug == "key-needed" else ""
         return Refused(response.status_code, slug, problem["detail"] + hint)
-    return Refused(response.status_code, "", f"{response.url} answered {response.status_code}: is it placerec?")
+    return Refused(
+        response.status_code, "", f"{response.url} answered {response.status_code}. Is it a placerec service?"
+    )
 
 
 def is_passing(response: httpx.Response) -> bool:
     """Whether the same request may succeed in a moment.
 
-    Some of the service's own 503 say that an operator is needed: they carry no ``Retry-After``.
+    A 503 of the service without ``Retry-After`` does not pass by itself: an operator has to act.
     """
     ours = response.headers.get("content-type", "").startswith(PROBLEM)
     return response.status_code in OVERLOADED and ("retry-after" in response.headers or not ours)
 
 
 def retry_after(response: httpx.Response, otherwise: float) -> float:
-    """Seconds that the service asks to wait."""
+    """Seconds to wait: what Retry-After says, or ``otherwise``."""
     asked = response.headers.get("retry-after", "")
     return float(asked) if asked.isdecimal() else otherwise
 
 
 def path_of(*parts: str) -> str:
-    """``/v1/…`` of names that may hold any character."""
+    """The path ``/v1/…`` with these parts, which are quoted."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts)
 
 
 def media_type(data: bytes) -> str:
-    """The content type of a frame by its first bytes; what is no image is left for the service to refuse."""
+    """The content type of a frame by its first bytes; image/jpeg if unknown, which the service then checks."""
     if data.startswith(b"\x89PNG"):
         return "image/png"
     return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "image/jpeg"
@@ -184,7 +187,7 @@ def read_bytes(path: Path) -> bytes:
     """The bytes of a file.
 
     Raises:
-        Failure: it cannot be read.
+        Failure: the file cannot be read.
     """
     try:
         return path.read_bytes()
@@ -197,29 +200,29 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
     """The service at the target's URL, or one in this process.
 
     Raises:
-        Failure: the URL is none, a setting is wrong, or another process holds the data directory.
+        Failure: the URL or a setting is wrong, or another process uses the data directory.
     """
     timeout = httpx.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS)
     if target.url is not None:
         if not target.url.startswith(("http://", "https://")):
-            raise Failure(f"{target.url} is not a URL: it starts with http:// or https://.")
+            raise Failure(f"{target.url} is not a URL of a service: it has to start with http:// or https://.")
         key = given_key()
-        if key is not None and travels_openly(target.url):
-            remark(f"The key travels to {target.url} unencrypted: put TLS in front.")
+        if key is not None and is_unencrypted(target.url):
+            remark(f"Warning: the key is sent to {target.url} without encryption. Use https.")
         async with httpx.AsyncClient(base_url=target.url, timeout=timeout, headers=headers_for(key)) as client:
             yield Service(client, target.url)
         return
     # Imported here because it takes a second: torch, FAISS and the service itself.
     from service.app.application import create_app
 
-    # Nobody else can reach it, so its address does not matter; what it would log is answered here.
+    # Nobody else can reach it, so its address does not matter; its warnings would only repeat its answers.
     settings = read_settings(target.data_dir).model_copy(update={"host": "127.0.0.1", "log_level": "error"})
     application = create_app(settings, as_owner=True)
     async with AsyncExitStack() as stack:
         try:
             await stack.enter_async_context(application.router.lifespan_context(application))
         except DataDirectoryLocked as error:
-            raise Failure(f"{error} Give --url to talk to the service that holds it.") from error
+            raise Failure(f"{error} Give --url to use the service that holds it.") from error
         transport = httpx.ASGITransport(application)
         client = httpx.AsyncClient(base_url="http://placerec", transport=transport, timeout=timeout)
         yield Service(await stack.enter_async_context(client), "The service in this process")
@@ -229,7 +232,7 @@ def read_settings(data_dir: Path | None = None) -> Settings:
     """The service's settings, with another data directory if one is given.
 
     Raises:
-        Failure: the environment sets one to a value that cannot be used.
+        Failure: the environment sets one of them to an invalid value.
     """
     from service import settings
 
@@ -241,7 +244,7 @@ def read_settings(data_dir: Path | None = None) -> Settings:
 
 
 def ask(target: Target, method: str, path: str, **options: Any) -> httpx.Response:
-    """One request and its answer, for commands that need no more; errors as for ``Service.request``."""
+    """Send one request and return its answer; it raises what ``Service.request`` raises."""
 
     async def work() -> httpx.Response:
         async with open_service(target) as service:
@@ -251,7 +254,7 @@ def ask(target: Target, method: str, path: str, **options: Any) -> httpx.Respons
 
 
 def list_items(target: Target, path: str, params: dict[str, Any] | None = None) -> list[Any]:
-    """All items of a listing; errors as for ``Service.request``."""
+    """All items of a listing; it raises what ``Service.request`` raises."""
 
     async def work() -> list[Any]:
         async with open_service(target) as service:
@@ -261,5 +264,5 @@ def list_items(target: Target, path: str, params: dict[str, Any] | None = None) 
 
 
 def run(work: Coroutine[Any, Any, Result]) -> Result:
-    """Run a command's work to its end."""
+    """Run the asynchronous work of a command."""
     return asyncio.run(work)

@@ -1,4 +1,4 @@
-"""The key that a command sends: ``--key`` of every command that takes ``--url``, or PLACEREC_KEY."""
+"""The key that a command sends: from ``--key``, which every command with ``--url`` has, or from PLACEREC_KEY."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _given: ContextVar[str | None] = ContextVar("key", default=None)
 
 
 def _take(value: str | None) -> str | None:
-    if value and not TOKEN.fullmatch(value.strip()):  # and do not repeat it
-        raise typer.BadParameter("it is not a key of the form placerec_…")
+    if value and not TOKEN.fullmatch(value.strip()):  # the message does not repeat the value
+        raise typer.BadParameter("a key has the form placerec_…")
     _given.set(value.strip() if value else None)
     return value
 
@@ -32,41 +32,41 @@ Key = Annotated[
         envvar=VARIABLE,
         callback=_take,
         expose_value=False,
-        help=f"With --url: the key to send. Better in {VARIABLE}: the words of a command can be seen by other users.",
+        help=f"Key to send with --url. Better set {VARIABLE}: other users can see the arguments of a command.",
     ),
 ]
 
 
 @cache
 def _option() -> object:
-    """The option as typer makes it."""
+    """The option as an object of the command-line library."""
     maker = typer.Typer()
 
     @maker.command()
     def take(key: Key = None) -> None:
-        """Never run: expose_value keeps the key out of the parameters."""
+        """Never called; expose_value keeps the key out of the parameters."""
 
     return next(option for option in typer.main.get_command(maker).params if option.name == "key")
 
 
 def add_key(command: Any) -> None:
-    """Let a command that talks to a service take a key; any other stays as it is."""
+    """Add ``--key`` to a command that has ``--url``."""
     names = {parameter.name for parameter in command.params}
     if "url" in names and "key" not in names:
         command.params.append(_option())
 
 
 def given_key() -> str | None:
-    """The key of the command that runs; None without one."""
+    """The key that the running command was given; None without one."""
     return _given.get()
 
 
 def headers_for(key: str | None) -> dict[str, str]:
-    """The header that carries a key; a key travels in no other way."""
+    """The headers that send a key."""
     return {} if key is None else {"Authorization": f"Bearer {key}"}
 
 
-def travels_openly(url: str) -> bool:
-    """Whether what is sent to a URL can be read on its way: over a network, without TLS."""
+def is_unencrypted(url: str) -> bool:
+    """Whether others on the network could read what is sent to a URL: it is not local and has no TLS."""
     parts = urlsplit(url)
     return parts.scheme == "http" and not _LOOPBACK.fullmatch(parts.hostname or "")

@@ -1,7 +1,7 @@
-"""``placerec backup``: all maps as files in a folder, checked, and brought back.
+"""Maps as files: ``placerec maps export`` and ``import`` for one map, ``placerec backup`` for all maps.
 
-DIR/index.json              which maps were saved, each with its file and the SHA-256 of that file's manifest
-DIR/<map>.<sha256…>.tar     a file is never written over: a new one gets its own name, then the index names it
+DIR/index.json              the saved maps, each with its file and the SHA-256 of that file's manifest
+DIR/<map>.<sha256…>.tar     a file is never overwritten: a new one has a name of its own, which the index then names
 """
 
 from __future__ import annotations
@@ -16,22 +16,76 @@ from typing import Annotated, Any
 import typer
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
-from service.commands.connection.downloads import PARTIAL, check_file, download, settle, upload
+from service.commands.connection.client import (
+    AsJson,
+    DataDir,
+    MapId,
+    Refused,
+    Service,
+    Target,
+    Url,
+    open_service,
+    path_of,
+    run,
+)
 from service.commands.console import Commands, Failure, complain, remark, show, table
-from service.commands.jobs import followed
+from service.commands.jobs import Wait, check_outlives, followed, show_outcome
+from service.commands.maps.transfers import PARTIAL, check_file, download, settle, upload
 
-backup = typer.Typer(cls=Commands, help="Save all maps in a folder, check them, bring them back.", no_args_is_help=True)
+backup = typer.Typer(cls=Commands, help="Save all maps in a folder, verify them, restore them.", no_args_is_help=True)
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the backup.", show_default=False)]
-Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this one; may be repeated.")]
+Maps = Annotated[list[str] | None, typer.Option("--map", "-m", help="Only this map; may be repeated.")]
 
 INDEX = "index.json"
 FORMAT = "placerec backup"
 
+File = Annotated[Path, typer.Argument(metavar="FILE", help="A tar file.", show_default=False)]
+
+
+def export(
+    map_id: MapId,
+    file: File,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    url: Url = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Save a map as a file. An interrupted download continues when the command is run again."""
+    if file.exists() and not overwrite:
+        raise Failure(f"{file} already exists. Give --overwrite to replace it.")
+    partial = file.with_name(file.name + PARTIAL)
+
+    async def work() -> str | None:
+        async with open_service(Target(url, data_dir)) as service:
+            return await download(service, map_id, partial)
+
+    tag = run(work())
+    settle(partial, file)
+    remark(f"The map {map_id} is in {file}; the SHA-256 of its manifest is {tag}.")
+
+
+def import_(
+    file: File,
+    map_id: Annotated[str | None, typer.Option("--id", help="Id of the new map; default: the id in the file.")] = None,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Create a map from a file, after all of the file was checked."""
+    check_outlives(Target(url, data_dir), wait)
+    check_file(file)
+
+    async def work() -> dict[str, object]:
+        async with open_service(Target(url, data_dir)) as service:
+            job = await upload(service, file, map_id)
+            return await followed(service, job) if wait else job
+
+    show_outcome(run(work()), as_json)
+
 
 class Entry(BaseModel):
-    """A map of a backup.  listed: the service had it when the backup was last made."""
+    """A map of a backup; ``listed`` is whether the service had it when the backup was last made."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -45,7 +99,7 @@ class Entry(BaseModel):
 
 
 class Index(BaseModel):
-    """What is in a backup."""
+    """The maps of a backup."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -62,7 +116,7 @@ def read_index(folder: Path) -> Index:
     """The index of a backup.
 
     Raises:
-        Failure: there is none, or it cannot be read.
+        Failure: there is no index, or it cannot be read.
     """
     path = folder / INDEX
     try:
@@ -78,9 +132,9 @@ def read_index(folder: Path) -> Index:
 
 @backup.command("create")
 def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir = None) -> None:
-    """Save every map. One whose file is there, whole, and holds what the map holds is not written again.
+    """Save every map. A map that has not changed since its file was written is not written again.
 
-    Maps that are gone from the service stay in the folder until they are removed by hand.
+    Maps that the service no longer has stay in the folder until they are removed by hand.
     """
     with _held(folder):
         index = read_index(folder) if (folder / INDEX).exists() else Index()
@@ -96,12 +150,12 @@ def create(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir
 
 
 async def _save_all(service: Service, folder: Path, index: Index, only: list[str] | None) -> list[str]:
-    """Save maps one after the other; returns those that could not be."""
+    """Save maps one after the other; return those that could not be saved."""
     pages = [page async for page in service.pages(path_of("maps"))]
     there = [item["id"] for page in pages for item in page["items"]]
     failed = [item["id"] for item in pages[0]["quarantined"] if only is None or item["id"] in only]
     for map_id in failed:
-        complain(f"{map_id} is damaged and out of service; what was saved of it before stays.")
+        complain(f"{map_id} is damaged and out of service; its earlier file stays.")
     if missing := set(only or ()) - {*there, *failed}:
         raise Failure(f"The service has no map {', '.join(sorted(missing))}.")
     for entry in index.maps:
@@ -121,7 +175,7 @@ async def _save(service: Service, folder: Path, index: Index, map_id: str) -> No
     before = index.find(map_id)
     known = None
     if before is not None:
-        with suppress(Failure):  # one that is gone or damaged is written again
+        with suppress(Failure):  # a missing or damaged file is written again
             check_file(folder / before.file, before.manifest_sha256)
             known = before.manifest_sha256
     partial = folder / f"{map_id}{PARTIAL}"
@@ -163,7 +217,7 @@ def _write_index(folder: Path, index: Index) -> None:
 
 
 def _remove_strays(folder: Path, index: Index) -> None:
-    """Remove earlier files of maps, which the index does not name any more."""
+    """Remove earlier files of maps, which the index no longer names."""
     named = {entry.file for entry in index.maps}
     for entry in index.maps:
         for path in folder.glob(f"{entry.id}.{'[0-9a-f]' * 16}.tar"):
@@ -192,11 +246,11 @@ def _held(folder: Path) -> Iterator[None]:
 
 @backup.command("verify")
 def verify(folder: Folder, only: Maps = None) -> None:
-    """Read every file of a backup and compare it with its checksums; needs no service."""
+    """Read every file of a backup and compare it with its checksums. This needs no service."""
     index, damaged = read_index(folder), []
     shown = table("map", "#places", "#bytes", "saved", "state")
     for entry in _chosen(index, only):
-        state = "good" if entry.listed else "good; gone from the service"
+        state = "good" if entry.listed else "good; no longer in the service"
         try:
             check_file(folder / entry.file, entry.manifest_sha256)
         except Failure as failure:
@@ -211,9 +265,9 @@ def verify(folder: Folder, only: Maps = None) -> None:
 
 @backup.command("restore")
 def restore(folder: Folder, only: Maps = None, url: Url = None, data_dir: DataDir = None) -> None:
-    """Make maps of the files of a backup; those whose ids are taken are left as they are, and named.
+    """Create maps from the files of a backup. Maps that exist are reported and left as they are.
 
-    Maps that were gone from the service when the backup was last made come back only if --map names them.
+    Maps that the service no longer had when the backup was last made are restored only if --map names them.
     """
     entries = [entry for entry in _chosen(read_index(folder), only) if entry.listed or only]
 

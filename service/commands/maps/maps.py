@@ -6,11 +6,10 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, open_service, path_of, run
+from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, open_service, path_of, run
 from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
-from service.commands.maps.places import places
-from service.commands.maps.sequences import sequences
-from service.commands.maps.transfers import export, import_
+from service.commands.maps.backup import export, import_
+from service.commands.maps.places import places, sequences
 from service.commands.maps.upkeep import health, merge, prune, rebuild, reencode
 
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
@@ -27,16 +26,18 @@ for name, command in (
 ):
     maps.command(name)(command)
 
-MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
-Description = Annotated[str | None, typer.Option(help="What the map is of.")]
-Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What is kept of each frame.")]
-Radius = Annotated[float | None, typer.Option(min=0, help="Metres within which two places are no rivals.")]
-Frames = Annotated[int | None, typer.Option(min=0, help="Without poses: frames within which they are no rivals.")]
+Description = Annotated[str | None, typer.Option(help="Description of the map.")]
+Keep = Annotated[Literal["none", "thumbnail", "image"] | None, typer.Option(help="What the map keeps of each frame.")]
+Radius = Annotated[float | None, typer.Option(min=0, help="Places within so many metres count as the same place.")]
+Frames = Annotated[
+    int | None,
+    typer.Option(min=0, help="Without poses: places within so many frames of a sequence count as the same place."),
+]
 
 
 @maps.command("list")
 def list_maps(url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """List all maps, the damaged ones too."""
+    """List all maps, including damaged ones."""
 
     async def work() -> list[dict[str, Any]]:
         async with open_service(Target(url, data_dir)) as service:
@@ -73,7 +74,7 @@ def create_map(
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Create a map, bound for life to one encoder."""
+    """Create a map. Its encoder cannot be changed later."""
     given = _given(description, keep, same_place_radius, same_place_frames)
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
     _show_map(ask(Target(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
@@ -86,7 +87,7 @@ def edit_map(
     keep: Keep = None,
     same_place_radius: Radius = None,
     same_place_frames: Frames = None,
-    threshold: Annotated[float | None, typer.Option(help="Least decision value that is believed.")] = None,
+    threshold: Annotated[float | None, typer.Option(help="Least decision value of a recognized place.")] = None,
     margin: Annotated[float | None, typer.Option(min=0, help="Least lead over the best rival.")] = None,
     default_calibration: Annotated[
         bool, typer.Option("--default-calibration", help="Go back to the encoder's threshold and margin.")
@@ -95,20 +96,20 @@ def edit_map(
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change a map's settings; what is left out stays as it is."""
+    """Change settings of a map; the others stay as they are."""
     changes = _given(description, keep, same_place_radius, same_place_frames)
     calibration = {"threshold": threshold, "margin": margin}
     calibration = {name: value for name, value in calibration.items() if value is not None}
     if calibration and default_calibration:
-        raise typer.BadParameter("--default-calibration goes without --threshold and --margin")
+        raise typer.BadParameter("--default-calibration cannot be combined with --threshold or --margin")
     if calibration or default_calibration:
         changes["calibration"] = calibration or None
     if not changes:
-        raise typer.BadParameter("name something to change")
+        raise typer.BadParameter("give at least one setting to change")
 
     async def work() -> Any:
         async with open_service(Target(url, data_dir)) as service:
-            # What was read is what is edited: a change by somebody else in between is refused.
+            # The edit is refused if somebody else has changed the map in between.
             seen = await service.request("GET", path_of("maps", map_id))
             headers = {"If-Match": seen.headers["ETag"]}
             return (await service.request("PATCH", path_of("maps", map_id), json=changes, headers=headers)).json()
@@ -132,14 +133,14 @@ def delete_map(
 
 @maps.command("verify")
 def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
-    """Read everything that is stored of a map again and check it; the exit status is 1 if it is damaged."""
+    """Read all that is stored of a map and check it; the exit status is 1 if it is damaged."""
     report = ask(Target(url, data_dir), "POST", path_of("maps", map_id, "verify")).json()
     if as_json:
         show_json(report)
     if not report["ok"]:
         raise Failure(f"The map {map_id} is damaged: {' '.join(report['problems'])}")
     if not as_json:
-        output.print(f"The map {map_id} is sound: {report['places']} places checked.", highlight=False)
+        output.print(f"The map {map_id} is not damaged: {report['places']} places were checked.", highlight=False)
 
 
 def _given(description: str | None, keep: str | None, radius: float | None, frames: int | None) -> dict[str, Any]:

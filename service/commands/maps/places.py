@@ -1,4 +1,4 @@
-"""``placerec maps places``: the places of a map."""
+"""``placerec maps places`` and ``placerec maps sequences``: the places and the traverses of a map."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from typing import Annotated, Any
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, list_items, open_service, path_of, run
+from service.commands.connection.client import (
+    AsJson,
+    DataDir,
+    MapId,
+    Target,
+    Url,
+    ask,
+    list_items,
+    open_service,
+    path_of,
+    run,
+)
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
-places = typer.Typer(cls=Commands, help="List, read, edit and forget the places of a map.", no_args_is_help=True)
+places = typer.Typer(cls=Commands, help="List, show, edit and forget the places of a map.", no_args_is_help=True)
 
-MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
 PlaceId = Annotated[str, typer.Argument(metavar="PLACE", help="The place's id.", show_default=False)]
 COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
 
@@ -21,7 +31,7 @@ COORDINATES = ("x", "y", "z", "latitude", "longitude", "heading")
 @places.command("list")
 def list_places(
     map_id: MapId,
-    sequence: Annotated[str | None, typer.Option(help="Only those of this traverse.")] = None,
+    sequence: Annotated[str | None, typer.Option(help="Only the places of this traverse.")] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
@@ -58,31 +68,31 @@ def edit_place(
     heading: Annotated[float | None, typer.Option(help="Degrees.")] = None,
     timestamp: Annotated[str | None, typer.Option(help="ISO 8601.")] = None,
     sequence: Annotated[str | None, typer.Option(help="Name of the traverse.")] = None,
-    metadata: Annotated[str | None, typer.Option(metavar="JSON", help="Merged into what is there.")] = None,
+    metadata: Annotated[str | None, typer.Option(metavar="JSON", help="Merged into the metadata of the place.")] = None,
     clear: Annotated[
         list[str] | None,
-        typer.Option(help="A field to empty first: pose, timestamp, sequence or metadata; may be repeated."),
+        typer.Option(help="Clear this field first: pose, timestamp, sequence or metadata; may be repeated."),
     ] = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Change what is known of a place; what is left out stays as it is."""
+    """Change fields of a place; the others stay as they are."""
     cleared = dict.fromkeys(clear or [])
     if unknown := set(cleared) - {"pose", "timestamp", "sequence", "metadata"}:
-        raise typer.BadParameter(f"--clear knows no field {', '.join(sorted(unknown))}")
+        raise typer.BadParameter(f"--clear: unknown field {', '.join(sorted(unknown))}")
     pose = dict(zip(COORDINATES, (x, y, z, latitude, longitude, heading), strict=True))
     given: dict[str, Any] = {"timestamp": timestamp, "sequence": sequence}
     given = {name: value for name, value in given.items() if value is not None}
     if any(value is not None for value in pose.values()):
-        # A new pose in the other frame of reference takes the place of the old one.
+        # With --clear pose the new pose may be in another frame of reference.
         kept = {name: value for name, value in pose.items() if value is not None}
         given["pose"] = dict.fromkeys(COORDINATES) | kept if "pose" in cleared else kept
     if metadata is not None:
         given["metadata"] = _object(metadata)
     changes = {**cleared, **given}
     if not changes:
-        raise typer.BadParameter("name something to change")
+        raise typer.BadParameter("give at least one field to change")
     path = path_of("maps", map_id, "places", place_id)
     _show_place(ask(Target(url, data_dir), "PATCH", path, json=changes).json(), as_json)
 
@@ -94,7 +104,7 @@ def forget_places(
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Forget places for good."""
+    """Forget places. This cannot be undone."""
 
     async def work() -> None:
         async with open_service(Target(url, data_dir)) as service:
@@ -113,7 +123,7 @@ def save_thumbnail(
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Save the picture that is kept of a place."""
+    """Save the picture that the map keeps of a place."""
     picture = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "places", place_id, "thumbnail")).content
     try:
         file.write_bytes(picture)
@@ -125,7 +135,7 @@ def _object(text: str) -> dict[str, Any]:
     try:
         value = json.loads(text)
     except ValueError as error:
-        raise Failure(f"--metadata is not JSON: {error}.") from error
+        raise Failure(f"--metadata is not valid JSON: {error}.") from error
     if not isinstance(value, dict):
         raise Failure("--metadata is not a JSON object.")
     return value
@@ -154,3 +164,34 @@ def _show_place(place: dict[str, Any], as_json: bool) -> None:
     for name in ("metadata", "picture", "created_at", "updated_at"):
         shown.add_row(name, json.dumps(place[name], ensure_ascii=False) if name == "metadata" else str(place[name]))
     show(shown)
+
+
+sequences = typer.Typer(cls=Commands, help="List and forget the traverses of a map.", no_args_is_help=True)
+
+
+@sequences.command("list")
+def list_sequences(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False) -> None:
+    """List the traverses of a map."""
+    found = list_items(Target(url, data_dir), path_of("maps", map_id, "sequences"))
+    if as_json:
+        show_json(found)
+        return
+    shown = table("sequence", "#places", "first", "last")
+    for item in found:
+        shown.add_row(item["name"] or "–", str(item["places"]), item.get("first_at") or "–", item.get("last_at") or "–")
+    show(shown)
+
+
+@sequences.command("forget")
+def forget_sequence(
+    map_id: MapId,
+    sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="Name of the traverse.", show_default=False)],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
+    url: Url = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Forget all places of a traverse. This cannot be undone."""
+    if not yes:
+        typer.confirm(f"Forget all places of the sequence {sequence} of the map {map_id}?", abort=True)
+    forgotten = ask(Target(url, data_dir), "DELETE", path_of("maps", map_id, "sequences", sequence)).json()
+    remark(f"The sequence {sequence} is forgotten: {forgotten['places']} places.")

@@ -1,4 +1,4 @@
-"""``placerec maps health``, ``prune``, ``merge``, ``re-encode``: looking after maps."""
+"""``placerec maps health``, ``re-encode``, ``rebuild``, ``prune`` and ``merge``: the upkeep of maps."""
 
 from __future__ import annotations
 
@@ -6,23 +6,26 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, Target, Url, ask, path_of
+from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, path_of
 from service.commands.console import number, output, remark, show, show_json, table
-from service.commands.jobs import Wait, submit, tell
+from service.commands.jobs import Wait, show_outcome, submit
 
-MapId = Annotated[str, typer.Argument(metavar="MAP", help="The map's id.", show_default=False)]
-Yes = Annotated[bool, typer.Option("--yes", help="Do it; without this it is only reported what would be done.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do it; otherwise the command only reports what it would do.")]
 
 
 def health(
     map_id: MapId,
-    limit: Annotated[int, typer.Option(min=1, max=1000, help="Most places, gaps and stretches to name each.")] = 20,
-    seconds: Annotated[float, typer.Option(min=0.1, max=20, help="Time to look at the map's frames.")] = 5.0,
+    limit: Annotated[
+        int, typer.Option(min=1, max=1000, help="Most places, gaps and stretches to list of each kind.")
+    ] = 20,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=20, help="Most seconds to spend on the frames of the map.")
+    ] = 5.0,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say how a map does: what never matches, what matches everything, gaps, drift, and where to go again."""
+    """Report how well a map works: places that never match or match too often, gaps, drift, stretches to redo."""
     asked = {"limit": limit, "seconds": seconds}
     report = ask(Target(url, data_dir), "GET", path_of("maps", map_id, "health"), params=asked).json()
     if as_json:
@@ -44,16 +47,16 @@ def health(
             drifting = "drifts" if trend["significant"] else "does not drift"
             facts.add_row(name.partition("_")[0], f"{drifting}: {trend['per_week']:+.4f} ± {trend['error']:.4f} a week")
     show(facts)
-    again = table("sequence", "from", "to", "why", "#weight", title="Go again")
+    again = table("sequence", "from", "to", "why", "#weight", title="Record again")
     for stretch in report["retraverse"]:
         why = ", ".join(stretch["reasons"])
         again.add_row(stretch["sequence"], stretch["first"], stretch["last"], why, number(stretch["weight"], 1))
     if report["retraverse"]:
         show(again)
     else:
-        output.print("Nowhere has to be gone again.", highlight=False)
+        output.print("No stretch has to be recorded again.", highlight=False)
     if not report["complete"]:
-        remark("The time was up before all of the map was looked at; --seconds gives more.")
+        remark("The time was up before the whole map was examined; --seconds gives it more.")
 
 
 def reencode(
@@ -65,51 +68,58 @@ def reencode(
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a map that keeps its images anew, for another encoder, under another id."""
+    """Create a new map from the images of a map, with another encoder."""
     body = {"to": to, **({} if encoder is None else {"encoder": encoder})}
-    tell(submit(Target(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "re-encode"), body, wait), as_json)
 
 
 def rebuild(
     map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 ) -> None:
-    """Make what a large map is searched by anew from its descriptors, while searches go on."""
-    tell(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+    """Rebuild the search index of a large map from its descriptors, while it is searched."""
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
 
 
 def prune(
     map_id: MapId,
-    max_recall_loss: Annotated[float, typer.Option(min=0, max=1, help="What it may cost in recall.")] = 0.01,
-    similarity: Annotated[float | None, typer.Option(help="How alike frames must look, instead.")] = None,
-    sequence: Annotated[str | None, typer.Option(help="Only places of this traverse may go.")] = None,
-    queries: Annotated[str | None, typer.Option(help="Measure the cost with the frames of this traverse.")] = None,
+    max_recall_loss: Annotated[
+        float, typer.Option(min=0, max=1, help="Greatest share of queries that may be lost.")
+    ] = 0.01,
+    similarity: Annotated[
+        float | None, typer.Option(help="Instead: least similarity of two frames for one to replace the other.")
+    ] = None,
+    sequence: Annotated[str | None, typer.Option(help="Forget only places of this traverse.")] = None,
+    queries: Annotated[str | None, typer.Option(help="Measure the loss with the frames of this traverse.")] = None,
     yes: Yes = False,
     wait: Wait = True,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Forget places that their neighbours stand in for; without --yes only say what that would cost."""
+    """Forget places that their neighbours can replace; without --yes only report the loss of recall."""
     given = {"similarity": similarity, "sequence": sequence, "queries": queries}
     body: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     body |= {"max_recall_loss": max_recall_loss, "dry_run": not yes}
-    tell(submit(Target(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "prune"), body, wait), as_json)
 
 
 def merge(
     map_id: MapId,
-    other: Annotated[str, typer.Argument(metavar="OTHER", help="The map whose places come.", show_default=False)],
+    other: Annotated[str, typer.Argument(metavar="OTHER", help="The map whose places are added.", show_default=False)],
     on_conflict: Annotated[
-        Literal["refuse", "rename", "skip"], typer.Option(help="Where a name means something else in the two maps.")
+        Literal["refuse", "rename", "skip"],
+        typer.Option(help="What to do with a name that means different things in the two maps."),
     ] = "refuse",
-    prefix: Annotated[str | None, typer.Option(help="For what is renamed; default: the other map's id.")] = None,
+    prefix: Annotated[
+        str | None, typer.Option(help="Prefix of renamed places, sequences and cameras; default: the id of OTHER.")
+    ] = None,
     yes: Yes = False,
     wait: Wait = True,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Take the places of another map into this one; without --yes only say what would come."""
+    """Add the places of another map to this one; without --yes only report what would be added."""
     body: dict[str, Any] = {"from": other, "on_conflict": on_conflict, "dry_run": not yes}
     body |= {} if prefix is None else {"prefix": prefix}
-    tell(submit(Target(url, data_dir), path_of("maps", map_id, "merge"), body, wait), as_json)
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "merge"), body, wait), as_json)

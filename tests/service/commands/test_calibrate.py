@@ -72,10 +72,10 @@ def test_labelled_frames_of_a_folder(placerec: Placerec, tmp_path: Path, strip: 
 
 
 def test_what_it_refuses(placerec: Placerec, tmp_path: Path, strip: str, there: list[str]) -> None:
-    assert "name one of" in placerec("calibrate", strip, *there, status=2).stderr
+    assert "give exactly one of" in placerec("calibrate", strip, *there, status=2).stderr
     both = ("--sequence", "tuesday", "--precision", 0.9, "--mean-of-negatives")
-    assert "name one of" in placerec("calibrate", strip, *both, *there, status=2).stderr
-    assert "goes with" in placerec("calibrate", strip, "--itself", "--pairs", tmp_path, *there, status=2).stderr
+    assert "give at most one of" in placerec("calibrate", strip, *both, *there, status=2).stderr
+    assert "needs --sequence" in placerec("calibrate", strip, "--itself", "--pairs", tmp_path, *there, status=2).stderr
     empty = tmp_path / "empty.csv"
     empty.write_text("file,place\n")
     assert "no row" in placerec("calibrate", strip, "--frames", empty, *there, status=1).stderr

@@ -17,7 +17,7 @@ import httpx
 import pytest
 from PIL import ExifTags, Image
 
-from service.commands.connection.bulk import FIRST_BATCH
+from service.commands.connection.batches import FIRST_BATCH
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
@@ -98,7 +98,7 @@ def test_a_bad_image_fails_alone_and_is_named(placerec: Placerec, monday: Path) 
 
 def test_a_map_is_made_only_when_asked_for(placerec: Placerec, monday: Path) -> None:
     refused = placerec("enroll", monday, "--map", "lab", status=1)
-    assert "There is no map 'lab'; --create makes it." in refused.stderr
+    assert "There is no map 'lab'. Give --create to create it." in refused.stderr
     placerec("enroll", monday, "--map", "lab", "--create", "--encoder", "region-vlad", "--keep", "none")
     made = json.loads(placerec("maps", "show", "lab", "--json").stdout)
     assert made["encoder"].startswith("region-vlad@")
@@ -112,7 +112,7 @@ def test_another_traverse_with_the_same_names_does_not_overwrite(placerec: Place
     placerec("enroll", monday, "--map", "lab", "--create")
     tuesday = monday.rename(monday.with_name("tuesday"))
     refused = placerec("enroll", tuesday, "--map", "lab", status=1)
-    assert "4 ids of this traverse are taken" in refused.stderr
+    assert "4 ids of this traverse belong" in refused.stderr
     assert "--id-prefix tuesday-" in refused.stderr
     placerec("enroll", tuesday, "--map", "lab", "--id-prefix", "tuesday-")
     sequences = json.loads(placerec("maps", "sequences", "list", "lab", "--json").stdout)
@@ -204,7 +204,7 @@ def test_a_full_disk_ends_the_run(placerec: Placerec, tmp_path: Path) -> None:
         threading.Thread(target=full.serve_forever, daemon=True).start()
         stopped = placerec("enroll", folder, "--map", "lab", "--url", f"http://127.0.0.1:{full.server_port}", status=1)
         full.shutdown()
-    assert f"The disk is full. {FIRST_BATCH} of 80 frames are enrolled; the same command goes on" in stopped.stderr
+    assert f"The disk is full. {FIRST_BATCH} of 80 frames are enrolled; run the command again" in stopped.stderr
     assert FullAfterOne.taken <= 3  # what comes after the batch that was under way meanwhile was not sent
 
 

@@ -14,7 +14,7 @@ from service.access.keys import KeyStore
 from service.access.roles import TOKEN
 from service.commands import application
 from service.commands.connection.client import Refused, refusal
-from service.commands.connection.credentials import travels_openly
+from service.commands.connection.credentials import is_unencrypted
 from service.commands.console import Failure
 from service.commands.keys import moment
 from service.commands.load import request
@@ -45,7 +45,9 @@ def test_what_cannot_be_done_ends_in_a_sentence(placerec: Placerec, tmp_path: Pa
     assert "No key was ever created" in placerec("keys", "list").stderr
     assert "No key was ever created" in placerec("keys", "revoke", "ann", status=1).stderr
     placerec("keys", "create", "ann", "--role", "root", status=2)
-    assert "no span" in placerec("keys", "create", "ann", "--role", "query", "--expires", "soon", status=1).stderr
+    assert (
+        "neither a span" in placerec("keys", "create", "ann", "--role", "query", "--expires", "soon", status=1).stderr
+    )
     KeyStore(tmp_path / "data").create("ann", "query")
     assert "already" in placerec("keys", "create", "ann", "--role", "query", status=1).stderr
     (tmp_path / "data" / "keys.sqlite").write_bytes(b"no database")
@@ -83,14 +85,14 @@ def test_every_command_that_talks_to_a_service_takes_a_key() -> None:
 def test_a_wrong_key_is_not_repeated(placerec: Placerec, monkeypatch: pytest.MonkeyPatch) -> None:
     url = ("--url", "http://127.0.0.1:9")
     told = placerec("maps", "list", *url, "--key", "sesame", status=2).stderr
-    assert "not a key" in told and "sesame" not in told
+    assert "a key has the form" in told and "sesame" not in told
     key = "placerec_0123456789ab_" + "A" * 43
     monkeypatch.setenv("PLACEREC_KEY", key)
     told = placerec("maps", "list", *url, status=1).stderr
-    assert "cannot be reached" in told and "AAAA" not in told and "unencrypted" not in told
+    assert "cannot be reached" in told and "AAAA" not in told and "encryption" not in told
 
 
-def test_a_key_that_travels_openly() -> None:
+def test_a_url_without_encryption() -> None:
     for url, openly in (
         ("http://10.0.0.7:8000", True),
         ("http://localhost.example", True),
@@ -99,7 +101,7 @@ def test_a_key_that_travels_openly() -> None:
         ("http://[::1]:8000", False),
         ("http://localhost", False),
     ):
-        assert travels_openly(url) is openly, url
+        assert is_unencrypted(url) is openly, url
 
 
 def test_a_refusal_names_the_variable() -> None:

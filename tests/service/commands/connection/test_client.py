@@ -86,7 +86,7 @@ def test_a_service_that_is_not_there(error: Exception, message: str) -> None:
 
 def test_another_service_is_told_apart() -> None:
     handle, _ = in_turn(httpx.Response(404, content=b"<html>"))
-    with pytest.raises(Failure, match="answered 404: is it placerec"):
+    with pytest.raises(Failure, match=r"answered 404\. Is it a placerec service"):
         ask(handle)
 
 

@@ -122,7 +122,7 @@ def test_backup_and_restore(
     placerec("backup", "create", folder, "--map", lab, *url)
     index = {entry["id"]: entry for entry in json.loads((folder / "index.json").read_text())["maps"]}
     assert (index["hall-to-save"]["listed"], index[lab]["listed"]) == (False, True)
-    assert "gone" in placerec("backup", "verify", folder).stdout
+    assert "no longer in the service" in placerec("backup", "verify", folder).stdout
 
     # Into the data directory of another installation, where no service runs; maps there are left alone.
     told = placerec("backup", "restore", folder).stderr

@@ -41,7 +41,7 @@ def test_a_map_from_its_making_to_its_end(placerec: Placerec, where: list[str]) 
     assert name in [item["id"] for item in listed["items"]]
     assert listed["quarantined"] == []
     assert name in placerec("maps", "list", *where).stdout
-    assert "is sound: 0 places" in placerec("maps", "verify", name, *where).stdout
+    assert "is not damaged: 0 places" in placerec("maps", "verify", name, *where).stdout
 
     placerec("maps", "delete", name, *where, status=1, stdin="n\n")
     placerec("maps", "delete", name, *where, stdin="y\n")
@@ -71,7 +71,7 @@ def test_places_and_sequences(placerec: Placerec, monday: Path, where: list[str]
     assert cleared["metadata"] == {}
     placerec(*edit, status=2)
     placerec(*edit, "--clear", "id", status=2)
-    assert "--metadata is not JSON" in placerec(*edit, "--metadata", "{", status=1).stderr
+    assert "--metadata is not valid JSON" in placerec(*edit, "--metadata", "{", status=1).stderr
 
     picture = tmp_path / "thumbnail.jpg"
     placerec("maps", "places", "thumbnail", name, "9", picture, *where)

@@ -10,11 +10,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.commands.connection import bulk
-from service.commands.connection.bulk import Outcome, enrol_frames
+from service.commands.connection import batches
+from service.commands.connection.batches import Outcome, enrol_frames
 from service.commands.connection.client import Refused, Service
 from service.commands.console import Failure
-from service.commands.manifest import Frame
+from service.commands.traverse import Frame
 from tests.service.commands.connection.test_client import problem
 from tests.service.places.test_batch_order import order
 from tests.service.scenes import jpeg
@@ -78,8 +78,8 @@ def enrol(server: Server, map_id: str, folder: Path, count: int, way: Mischief) 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bulk, "FIRST_BATCH", 4)
-    monkeypatch.setattr(bulk, "LARGEST_BATCH", 4)
+    monkeypatch.setattr(batches, "FIRST_BATCH", 4)
+    monkeypatch.setattr(batches, "LARGEST_BATCH", 4)
 
 
 def test_two_at_a_time_in_line(server: Server, map_id: str, tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, t
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("moment", [13, 30])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
-    monkeypatch.setattr(bulk, "PATIENCE", 0.0)
+    monkeypatch.setattr(batches, "PATIENCE", 0.0)
     server = Server(tmp_path / "service").wait()
     server.create_map("walk")
     way, ended = Mischief({}), list[BaseException]()

@@ -1,8 +1,8 @@
-"""Many frames to a service: in batches whose size follows the speed, and none sent that the service holds already.
+"""Enrol many frames in batches whose size adapts to the speed, without sending frames that the service already has.
 
-Two batches are under way at a time, so that one is encoded while the other is stored, and the next is read meanwhile.
-Each names the one before, after which it is to be stored: their order is that of the places in their sequence, and a
-verdict looks at a place's neighbours there.
+Two batches are under way at a time, so that one is encoded while the other is stored and the next is read from disk.
+Each batch names the one before, after which it is to be stored: that keeps the order of the places in their sequence,
+on which verdicts depend.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.commands.connection.client import Refused, Service, media_type, path_of
-from service.commands.manifest import Frame
+from service.commands.traverse import Frame
 
 PATIENCE = 120.0
-"""Seconds for which a batch is sent again while the service is overloaded or restarts."""
+"""Seconds for which a batch is repeated while the service is overloaded or restarts."""
 
 OF_THE_FRAME = frozenset({400, 413, 415, 422})
-"""Statuses that concern one frame; with any other the rest would most likely fail as well."""
+"""Statuses that concern one frame; with any other status the remaining frames would most likely fail as well."""
 
 OUT_OF_ORDER = "batch-out-of-order"
-"""The problem of a batch that came before the one that it is to follow."""
+"""The problem of a batch whose predecessor is not stored."""
 
 TOO_SLOW = frozenset({"deadline-exceeded"})
-"""Problems of a batch that it would have again, but smaller ones may not."""
+"""Problems that a batch would have again, but a smaller one might not."""
 
 FIRST_BATCH, LARGEST_BATCH, FASTEST_GROWTH = 16, 128, 8
 BATCH_BYTES = 16 * 1024 * 1024
-"""A batch is closed by the frame that reaches it; two that are sent, their forms and the next are in memory at once."""
+"""A batch ends with the frame that reaches this size; two batches, their forms and the next are in memory at once."""
 
 BATCH_SECONDS = 4.0
-"""How long a batch should take: long beside what each costs, short beside the time that the service gives it."""
+"""How long a batch should take: long compared with its fixed costs, short compared with the service's time limit."""
 
 KNOWN_AT_ONCE = 128
-"""Frames whose digests are asked about in one request."""
+"""Most frames whose digests one request asks about."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one frame: ``change``, or why it was refused; ``uploaded`` is whether its bytes were sent."""
+    """The result for one frame: its ``change``, or why it was refused, and whether its bytes were ``uploaded``."""
 
     frame: Frame
     change: str | None
@@ -55,7 +55,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Read:
-    """A frame with its bytes; none where it is only named by their digest, or cannot be read."""
+    """A frame that was read from disk; ``data`` is empty if only its digest is sent, or if it cannot be read."""
 
     frame: Frame
     entry: dict[str, Any] = field(default_factory=dict)
@@ -75,15 +75,16 @@ async def enrol_frames(
     encoder: str | None,
     tell: Callable[[Outcome], None],
 ) -> None:
-    """Enrol frames in their order; ``tell`` hears of each as soon as it is settled.
+    """Enrol frames in their order.
 
     Args:
-        known: ids that the map has; of these frames the service is asked first whether it holds them.
-        encoder: to be asserted; None: whichever is the map's.
+        known: ids that the map already has; for these frames the service is first asked whether it has their bytes.
+        encoder: the encoder that the map must have; None for any.
+        tell: is called with the outcome of each frame as soon as it is known.
 
     Raises:
-        Refused: the service refuses what is no frame's fault; what was told is done.
-        Failure: it does not answer.
+        Refused: the service refuses a request for a reason that concerns no single frame.
+        Failure: the service does not answer.
     """
     sender = _Sender(service, map_id, {} if encoder is None else {"encoder": encoder}, tell)
     asked = [frame for frame in frames if frame.id in known]
@@ -95,7 +96,7 @@ async def enrol_frames(
 
 @dataclass(frozen=True)
 class _Sent:
-    """A batch under way: its name, its number of frames, what becomes of them."""
+    """A batch under way: its name, its number of frames, and the task that sends it."""
 
     name: str
     frames: int
@@ -111,7 +112,7 @@ class _Sender:
         self._batch, self._most = FIRST_BATCH, LARGEST_BATCH
 
     async def ask(self, frames: Sequence[Frame]) -> set[str]:
-        """Apply fields to the places that hold these frames; the ids of those whose bytes are needed."""
+        """Update the places that have these frames; return the ids of the frames that have to be sent."""
         read = await asyncio.gather(*(asyncio.to_thread(_read, frame, digest=True) for frame in frames))
         needed = set()
         for one, item in await self._post(read):
@@ -122,7 +123,7 @@ class _Sender:
         return needed
 
     async def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send frames batch by batch: one is encoded while the one before is stored, and the next is read."""
+        """Send frames batch by batch: one is encoded while its predecessor is stored and the next is read."""
         position, started = 0, list[_Sent]()
         following = asyncio.ensure_future(asyncio.to_thread(self._read_batch, frames, position))
         try:
@@ -130,7 +131,7 @@ class _Sender:
                 position += len(batch)
                 following = asyncio.ensure_future(asyncio.to_thread(self._read_batch, frames, position))
                 started.append(self._begin(batch, started[-1] if started else None))
-                # The first one alone: it says what the service takes, and how fast it is.
+                # The first batch goes alone: it shows what the service accepts, and how fast it is.
                 if len(started) == 2 or position == len(batch):
                     await self._end(started.pop(0))
             for sent in started:
@@ -153,27 +154,27 @@ class _Sender:
         return _Sent(name, len(batch), asyncio.ensure_future(self._send(batch, name, before)))
 
     async def _end(self, sent: _Sent) -> None:
-        """Wait for the outcomes of a batch and tell of them; the next to be read follows the speed."""
+        """Wait for the outcomes of a batch, report them, and adapt the size of the next one to the speed."""
         for outcome in await sent.task:
             self._tell(outcome)
         rate = sent.frames / max(time.monotonic() - sent.began, 1e-3)
         self._batch = max(1, min(self._most, int(rate * BATCH_SECONDS), FASTEST_GROWTH * self._batch))
 
     async def _send(self, batch: Sequence[_Read], name: str, before: _Sent | None = None) -> list[Outcome]:
-        """Send a batch, to be stored after the one before; in halves if it is more than the service takes at a time."""
+        """Send a batch, to be stored after the one before; split it in halves if the service finds it too large."""
         order = {"batch": name} if before is None else {"batch": name, "after": before.name}
         try:
             return [_outcome(one, item, uploaded=True) for one, item in await self._post(batch, order)]
         except Refused as refused:
             if before is not None:
-                # Whatever it is, the one before comes first; if that fails, this one is of no interest.
+                # The error of the batch before comes first; if that batch failed, this one does not matter.
                 await asyncio.wait({before.task})
                 before.task.result()
                 if refused.slug == OUT_OF_ORDER:
                     return await self._send(batch, name)
             if len(batch) == 1 and refused.status in OF_THE_FRAME:
                 return [Outcome(batch[0].frame, None, refusal=str(refused))]
-            # Of a form as a whole these say that it is longer than this service takes.
+            # For a whole form these statuses mean that it is larger than the service accepts.
             if len(batch) == 1 or not (refused.status in OF_THE_FRAME or refused.slug in TOO_SLOW):
                 raise
             half = len(batch) // 2
@@ -184,7 +185,7 @@ class _Sender:
     async def _post(
         self, batch: Sequence[_Read], order: Mapping[str, str] | None = None
     ) -> list[tuple[_Read, dict[str, Any] | None]]:
-        """What the service says of each frame; None for one that could not be read, which is not sent."""
+        """The service's answer for each frame; None for a frame that could not be read and was not sent."""
         sent = [one for one in batch if one.refusal is None]
         items: dict[str, dict[str, Any]] = {}
         if sent:
@@ -204,7 +205,7 @@ class _Sender:
 
 
 def _outcome(one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome:
-    """What the service said of a frame, None where it was not sent, as callers hear it."""
+    """The outcome of a frame from the service's answer, which is None if it was not sent."""
     if item is None:
         return Outcome(one.frame, None, refusal=one.refusal, uploaded=False)
     if "problem" in item:
@@ -213,11 +214,11 @@ def _outcome(one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome
 
 
 def _read(frame: Frame, digest: bool = False) -> _Read:
-    """A frame's bytes and its entry; with ``digest`` the bytes are only named."""
+    """Read a frame and make its entry; with ``digest`` only the digest of its bytes is kept."""
     try:
         data = frame.path.read_bytes()
     except OSError as error:
-        return _Read(frame, refusal=f"it cannot be read: {error.strerror}.")
+        return _Read(frame, refusal=f"the file cannot be read: {error.strerror}.")
     entry = {"id": frame.id, **frame.parameters(data)}
     if digest:
         return _Read(frame, {**entry, "sha256": hashlib.sha256(data).hexdigest()})
@@ -225,7 +226,7 @@ def _read(frame: Frame, digest: bool = False) -> _Read:
 
 
 def _form(batch: Sequence[_Read], boundary: str) -> bytes:
-    """A multipart form: the JSON part first, then the frames."""
+    """A multipart form of the JSON part ``places`` and the frames."""
     places = json.dumps([one.entry for one in batch]).encode()
     chunks = [_part(boundary, "places", "application/json"), places]
     for one in batch:
@@ -236,7 +237,7 @@ def _form(batch: Sequence[_Read], boundary: str) -> bytes:
 
 
 def _part(boundary: str, name: str, kind: str, filename: str | None = None) -> bytes:
-    """The head of one part; ids are of letters, digits and ``._~-`` and need no quoting."""
+    """The head of one part; ids consist of letters, digits and ``._~-``, so they need no quoting."""
     file = "" if filename is None else f'; filename="{filename}"'
     return (
         f'--{boundary}\r\nContent-Disposition: form-data; name="{name}"{file}\r\nContent-Type: {kind}\r\n\r\n'.encode()

@@ -1,4 +1,4 @@
-"""A traverse to enrol: which frames a directory holds, under which ids, and where they were taken."""
+"""A traverse on disk that is to be enrolled: the frames of a directory, their ids and their poses."""
 
 from __future__ import annotations
 
@@ -24,8 +24,13 @@ COLUMNS = ("file", "id", *POSE, "timestamp")
 class Frame:
     """One image to enrol.
 
-    pose, timestamp: None where the file's own EXIF data decide.
-    camera: of the map, whose mask is applied; None: none.
+    Args:
+        path: the image file.
+        id: the id of its place.
+        sequence: the name of the traverse.
+        listed: whether ``places.csv`` lists it; otherwise pose and timestamp come from its EXIF data.
+        pose, timestamp: as listed; None if the list does not give them.
+        camera: the camera of the map that took it; None for none.
     """
 
     path: Path
@@ -52,7 +57,7 @@ class _Sequence(BaseModel):
 
 
 class _Row(BaseModel):
-    """The cells of one row of ``places.csv``; an empty cell counts as left out."""
+    """The cells of one row of ``places.csv`` that are not empty."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -66,15 +71,16 @@ class _Row(BaseModel):
 
 
 def read_traverse(directory: Path, sequence: str | None, prefix: str) -> list[Frame]:
-    """The frames of a directory: those of its ``places.csv`` in that order, else all its images.
+    """The frames of a directory: those that its ``places.csv`` lists, in that order, or all its images.
 
     Args:
-        sequence: name of the traverse; that of the directory if None.
-        prefix: put before the ids that are made from file names.
+        directory: of the images.
+        sequence: name of the traverse; None for the name of the directory.
+        prefix: of the ids that are made from file names.
 
     Raises:
-        InvalidTraverse: there is neither a list nor an image.
-        Failure: the list is malformed, names a file that is not there, or two frames have one id.
+        InvalidTraverse: the directory has neither a list nor an image.
+        Failure: the list is malformed or names a missing file, or two frames have the same id.
     """
     name = check_sequence(directory.resolve().name if sequence is None else sequence)
     listed = directory / FILE_NAME
@@ -89,39 +95,39 @@ def read_traverse(directory: Path, sequence: str | None, prefix: str) -> list[Fr
         if frame.id in first:
             raise Failure(
                 f"{first[frame.id].name} and {frame.path.name} would both have the id {frame.id!r}; "
-                f"name the ids in {FILE_NAME}."
+                f"give their ids in {FILE_NAME}."
             )
         first[frame.id] = frame.path
     return frames
 
 
 def check_sequence(name: str) -> str:
-    """``name`` if it can name a traverse.
+    """Return ``name`` if a traverse may have it.
 
     Raises:
-        Failure: it cannot.
+        Failure: a traverse may not have this name.
     """
     try:
         return _Sequence(name=name).name
     except ValidationError as error:
-        raise Failure(f"{name!r} cannot name a sequence; give another with --sequence.") from error
+        raise Failure(f"A sequence cannot have the name {name!r}; give another one with --sequence.") from error
 
 
 def place_id(path: Path, prefix: str = "") -> str:
-    """An id made of a file's name without its ending: what ids cannot hold becomes a hyphen.
+    """The id of a place made from a file name without its extension; other characters become hyphens.
 
     Raises:
-        Failure: nothing usable is left.
+        Failure: no character of an id is left.
     """
     made = re.sub(r"[^A-Za-z0-9._~-]+", "-", prefix + path.stem)
     made = re.sub(r"^[^A-Za-z0-9]+", "", made)[:128]
     if not made.strip("-"):
-        raise Failure(f"No id can be made of the file name {path.name!r}; name it in {FILE_NAME}.")
+        raise Failure(f"No id can be made from the file name {path.name!r}; give one in {FILE_NAME}.")
     return made
 
 
 def unlisted(directory: Path, frames: list[Frame]) -> int:
-    """How many images lie in the directory that its list leaves out."""
+    """The number of images in the directory that its list leaves out."""
     if not frames[0].listed:
         return 0
     return len({path.resolve() for path in find_images(directory)} - {frame.path.resolve() for frame in frames})
@@ -146,7 +152,7 @@ def _check_columns(path: Path, columns: list[str]) -> None:
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown or "file" not in columns or len(set(columns)) < len(columns):
         wrong = f"an unknown column {unknown[0]!r}" if unknown else "columns missing or given twice"
-        raise Failure(f"{path} has {wrong}: its first line names 'file' and, of these, what is known: {COLUMNS[1:]}.")
+        raise Failure(f"{path} has {wrong}. Its first line must name 'file' and may name {', '.join(COLUMNS[1:])}.")
 
 
 def _listed_frame(path: Path, line: int, cells: dict[str, str], sequence: str, prefix: str) -> Frame:

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-LOOK = "from service.commands.memory_arenas import settle_heap; print(settle_heap())"
+LOOK = "from service.commands.malloc import configure_malloc; print(configure_malloc())"
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="mallopt is of the GNU C library")
