@@ -62,7 +62,7 @@ def sample_descriptors(
 
 
 def one_sequence(_index: int) -> PlaceFields:
-    """The fields of a place of which nothing is known but that all are of one traverse."""
+    """The fields of a place without pose or metadata; all places are of one traverse."""
     return PlaceFields(sequence="benchmark")
 
 
