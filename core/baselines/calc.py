@@ -45,7 +45,7 @@ ABOUT = About(
 
 
 def grey_input(pixels: Pixels) -> Array:
-    """The frame as the authors show it: brightness equalized, grey, 120 x 160, from 0 to 1.
+    """The network's input as the authors prepare it: brightness equalized, grey, 120 x 160, from 0 to 1.
 
     Args:
         pixels: H x W x 3 uint8, BGR.
@@ -80,7 +80,7 @@ def _fill(module: nn.Conv2d, source: CaffeLayer | None, what: str) -> None:
     arrays = source.arrays() if source is not None and source.type == "Convolution" else []
     targets: list[Tensor] = [module.weight, *([] if module.bias is None else [module.bias])]
     wanted = [tuple(target.shape) for target in targets]
-    # The oldest files give all arrays four sides.
+    # The oldest files write all arrays with four dimensions.
     if len(arrays) != len(wanted) or arrays[0].shape != wanted[0] or arrays[1].size != wanted[1][0]:
         shapes = [array.shape for array in arrays] or "none"
         raise InvalidModel(f"{what} has arrays of the shapes {shapes}; CALC's are {wanted}.")

@@ -69,7 +69,7 @@ def mean_file(model: Path, names: Sequence[str]) -> Path | None:
 
 
 def import_published(model: Path, published: Published, side: int) -> tuple[NetworkDefinition, dict[str, Tensor]]:
-    """The convolutional trunk of a published ``.caffemodel`` as it is to be run on ``side`` x ``side`` pixels.
+    """The convolutional trunk of a published ``.caffemodel``, for an input of ``side`` x ``side`` pixels.
 
     Its mean is that of a mean file beside it, else that which the model itself names, else the published one.
 
@@ -229,7 +229,7 @@ class Places365(VectorSystem):
 
 
 def _head(definition: NetworkDefinition, layers: dict[str, CaffeLayer], what: str) -> nn.Sequential:
-    """What follows the last convolution: its pooling, then the fully connected layers, each rectified."""
+    """The layers after the last convolution: its pooling, then the fully connected layers, each rectified."""
     last = definition.convolutions()[-1]
     behind = definition.layers[definition.layers.index(last) + 1 :]
     modules = [build_layer(layer, last.channels) for layer in behind if not isinstance(layer, Relu)]

@@ -37,7 +37,7 @@ PAPERS = {
 
 
 def about_encoder(summary: EncoderSummary) -> About:
-    """An installed encoder as the catalogue shows it; of a damaged one, what is wrong with it."""
+    """An installed encoder as a system; for a damaged one, what is wrong with it in place of the paper."""
     definition = summary.definition
     if definition is None:
         return About(summary.name, summary.name, summary.damaged or "", {})
@@ -50,7 +50,7 @@ def about_encoder(summary: EncoderSummary) -> About:
 
 
 def constants(fields: Mapping[str, Any], within: str = "") -> dict[str, Any]:
-    """The fields of a definition, those of its parts as ``part.field``; what is not in use (None) is left out."""
+    """The fields of a definition without those that are None; fields of its parts are called ``part.field``."""
     flat: dict[str, Any] = {}
     for name, value in fields.items():
         if isinstance(value, Mapping):
@@ -61,7 +61,7 @@ def constants(fields: Mapping[str, Any], within: str = "") -> dict[str, Any]:
 
 
 class EncoderSystem:
-    """One vector a frame, compared by inner products, and local descriptors if there is a second stage."""
+    """One vector a frame, scored by inner products, and local descriptors if the encoder has a second stage."""
 
     sequential = False
 
@@ -100,7 +100,7 @@ class EncoderSystem:
 
 @dataclass(frozen=True)
 class TwoStages:
-    """The first candidates by inner product are examined cell by cell; local: int8 [R, C, L]."""
+    """An index whose best candidates by inner product are compared cell by cell; local: int8 [R, C, L]."""
 
     first: InnerProducts
     local: NDArray[np.int8]

@@ -1,9 +1,9 @@
-"""FAB-MAP: how probable a frame's visual words are at each place, and at a new one.
+"""FAB-MAP: the probability of a frame's visual words at each place, and at a new one.
 
 Cummins, Newman: FAB-MAP: Probabilistic Localization and Mapping in the Space of Appearance, International
 Journal of Robotics Research 27(6), 2008.  The local features are SIFT's: OpenCV's wheels do not contain the
 paper's SURF.  A place is known by one frame, no motion is assumed, and the new place is the paper's mean
-field: the sampled one would draw from the training frames, which may show these very places.
+field approximation: sampling would draw from the training frames, which may show the very same places.
 
 The words depend on each other by a tree: Chow, Liu: Approximating Discrete Probability Distributions with Dependence
 Trees, IEEE Transactions on Information Theory 14(3), 1968.
@@ -39,7 +39,7 @@ Reals = NDArray[np.float64]
 V = 4000
 LONGEST_SIDE = 640
 P_Z_GIVEN_E, P_Z_GIVEN_NOT_E = 0.39, 0.0
-"""The detector: how often a word is observed where the thing that makes it is, and where it is not."""
+"""The detector: the probability that a word is observed where its cause is present, and where it is absent."""
 
 CONSTANTS: Constants = {
     "V": V,
@@ -138,7 +138,7 @@ def local_features(pixels: Pixels) -> Array:
 
 
 def existence(observed: Observations, marginals: Reals) -> Reals:
-    """p(e_q = 1 | L): that what makes word q is at a place where it was, or was not, observed once.
+    """p(e_q = 1 | L): the probability that the cause of word q is at a place where q was, or was not, observed once.
 
     Its prior is the word's marginal, as in OpenFABMAP (Glover et al., ICRA 2012).
 
@@ -179,7 +179,7 @@ def log_likelihoods(observed: Observations, places: Observations, tree: Tree) ->
         float64 [R + 1].
     """
     without, with_it = observed_given(observed, tree)
-    # Only two values are possible a word: that of places where it was observed, and that of the others.
+    # Each word has only two possible values: one for places where it was observed, one for the others.
     word = np.ones_like(observed)
     if_observed, if_not, average = (
         np.log(there * with_it + (1 - there) * without)
@@ -202,10 +202,10 @@ def log_odds(likelihoods: Reals) -> Reals:
     """
     best = int(np.argmax(likelihoods))
     scaled = np.exp(likelihoods - likelihoods[best])
-    # What all others have together: each but the best one has the best among them, so this loses nothing...
+    # The sum of all others.  For each place but the best one it contains the best one, so no digits are lost ...
     with np.errstate(divide="ignore"):
         others = likelihoods[best] + np.log(scaled.sum() - scaled)
-    # ... and the best one's would be lost to rounding.
+    # ... and for the best one it is computed apart, because rounding would destroy it.
     others[best] = np.logaddexp.reduce(np.delete(likelihoods, best))
     return np.asarray((likelihoods - others)[:-1])
 
@@ -252,7 +252,7 @@ class FabMap:
         Raises:
             InvalidModel: none has a local feature.
         """
-        # Whole numbers: bytes keep them, in a quarter of the room.
+        # The values are whole numbers, so bytes hold them in a quarter of the memory.
         features = [local_features(pixels).astype(np.uint8) for pixels in frames]
         self.centers = train_words(features, V, seed)
         self.tree = chow_liu(np.stack([self.observe(found.astype(np.float32)) for found in features]))

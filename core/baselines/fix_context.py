@@ -115,7 +115,7 @@ def load_fix_context(path: Path) -> tuple[ShallowNetwork, FixedContext, NetVladL
 
 
 def _arrays(layer: CaffeLayer | None, what: str, *shapes: tuple[int | None, ...]) -> list[Tensor]:
-    """The arrays of a layer, of just these shapes; the oldest files put sides of length 1 before them."""
+    """The arrays of a layer, checked against these shapes; the oldest files put dimensions of length 1 before them."""
     arrays = [] if layer is None else layer.arrays()
     if len(arrays) != len(shapes):
         raise InvalidModel(f"{what} has {len(arrays)} arrays of weights, not {len(shapes)}.")

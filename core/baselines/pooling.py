@@ -220,7 +220,7 @@ class MapsSystem(ABC):
 
     @abstractmethod
     def keep(self, maps: list[Array]) -> dict[str, Array]:
-        """What is kept of a frame, by name, from the maps of each layer."""
+        """The arrays that describe a frame, by name, from the maps of each layer."""
 
     @abstractmethod
     def index(self, references: Sequence[Description]) -> Index: ...

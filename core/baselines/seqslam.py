@@ -2,7 +2,7 @@
 
 Milford, Wyeth: SeqSLAM: Visual Route-based Navigation for Sunny Summer Days and Stormy Winter Nights, ICRA
 2012.  Constants and the form of the score are those of OpenSeqSLAM (Sünderhauf, 2013).  As there, the
-sequence of a query has it in the middle: half of it lies ahead, which a robot under way would have to wait for.
+sequence of a query has the query in the middle: half of it lies ahead, which a moving robot would have to wait for.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def path_costs(matrix: Array) -> Array:
     """
     queries, references = matrix.shape
     half, cells = D_S // 2, np.arange(references)
-    # Velocities that differ by 1 / d_s are the ones whose paths differ.
+    # Paths differ only where velocities differ by at least 1 / d_s.
     velocities = np.arange(round(V_MIN * D_S), round(V_MAX * D_S) + 1) / D_S
     least = np.full(matrix.shape, np.inf, np.float32)
     for velocity in velocities:
@@ -125,7 +125,7 @@ def path_costs(matrix: Array) -> Array:
 def distinctness(costs: Array) -> Array:
     """Least cost more than R_window / 2 references from a query's best one, over each cost; over 1 is distinct.
 
-    OpenSeqSLAM's measure of a match, upside down, given for every reference: within a row it keeps the order.
+    This is the inverse of OpenSeqSLAM's measure of a match, for every reference; it keeps the order within a row.
 
     Args:
         costs: float32 [Q, R], not negative.
@@ -134,7 +134,7 @@ def distinctness(costs: Array) -> Array:
         float32 [Q, R].
     """
     far = np.abs(np.arange(costs.shape[1]) - costs.argmin(axis=1)[:, None]) > R_WINDOW // 2
-    # On a short traverse nothing may be that far: then the worst cost of all stands in.
+    # On a short traverse nothing may be that far away; then the worst cost is used.
     rival = np.where(far, costs, np.inf).min(axis=1, keepdims=True)
     rival = np.where(np.isfinite(rival), rival, costs.max(axis=1, keepdims=True))
     least = np.float32(1e-6)  # a path may cost nothing

@@ -30,7 +30,7 @@ Constants = Mapping[str, str | int | float | bool | tuple[int | float | str, ...
 
 @dataclass(frozen=True)
 class About:
-    """What ``placerec evaluate --list`` says of a system.
+    """What a system is, as ``placerec evaluate --list`` shows it.
 
     name: the name that selects it on the command line, such as ``seqslam``.
     paper: authors, title, venue and year.
@@ -47,7 +47,7 @@ class About:
 
 @dataclass(frozen=True)
 class Description:
-    """What a system keeps of one frame.
+    """A system's description of one frame.
 
     arrays: by name; a system is free to choose them.  Their bytes are the memory of a place.
     milliseconds: of the stages that made it, such as ``forward``, ``regions``, ``vlad``.
@@ -145,7 +145,7 @@ class VectorSystem(ABC):
 
 @dataclass(frozen=True)
 class Resources:
-    """What a system may be built from.
+    """What systems are built from.
 
     models: the installed encoders and networks.
     weights: the file that the user gave for this system.  Where ``About.weights`` asks for a file, the registry

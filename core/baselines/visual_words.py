@@ -1,7 +1,7 @@
 """Large vocabularies of visual words, learned in a run from the training frames (FAB-MAP, Cross-Region-BoW).
 
-``core.method.vocabulary`` makes the few words of an encoder as well as it can; with thousands of words from a
-few ten thousand features that would take many minutes and gain nothing.
+``core.method.vocabulary`` trains the few words of an encoder with great care; for thousands of words from a few ten
+thousand features that would take many minutes and gain nothing.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from core.errors import InvalidModel
 
 ITERATIONS = 10
 POINTS_PER_WORD = 32
-"""Features for each word that k-means looks at; chosen at random where there are more."""
+"""At most so many features per word are clustered; of more, a random choice is taken."""
 
 BLOCK = 4096
 """Features assigned at a time, so that memory stays bounded."""
 
 
 def train_words(frames: Sequence[NDArray[np.generic]], count: int, seed: int) -> Array:
-    """At most ``count`` words by k-means over the features of all frames; as many as features where those are fewer.
+    """``count`` words by k-means over the features of all frames; if there are fewer features, each is a word.
 
     Args:
         frames: of each frame its features, real numbers [T_i, K].

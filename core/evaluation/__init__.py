@@ -1,4 +1,4 @@
-"""How well systems recognize one traverse by another: the thesis's protocol, its data sets, its comparison."""
+"""How well systems recognize one traverse by another: the thesis's protocol, data sets, and report."""
 
 from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
 from core.evaluation.protocol.figures import (

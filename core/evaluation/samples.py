@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -62,7 +62,7 @@ def sample_descriptors(
 
 
 def one_sequence(_index: int) -> PlaceFields:
-    """The fields of a place of which nothing is known but that all are of one traverse."""
+    """The fields of a place without pose or metadata; all places are of one traverse."""
     return PlaceFields(sequence="benchmark")
 
 
@@ -74,9 +74,29 @@ def fill_map(
     precision: NewPrecision = "half",
     fields: Callable[[int], PlaceFields] = one_sequence,
 ) -> None:
-    """Write a map of sample descriptors through the storage; ``fields`` gives the fields of each place.
+    """Write a map of sample descriptors; ``fields`` gives the fields of each place.
 
     Place i of the first 60 shows the sample frame i.
+
+    Raises:
+        StorageFailure: the directory cannot be written.
+    """
+    write_map(data_dir, map_id, encoder, sample_descriptors(encoder, places), precision, fields)
+
+
+def write_map(
+    data_dir: Path,
+    map_id: str,
+    encoder: Encoder,
+    described: Iterable[tuple[NDArray[np.float32], NDArray[np.int8]]],
+    precision: NewPrecision = "half",
+    fields: Callable[[int], PlaceFields] = one_sequence,
+) -> None:
+    """Write a map through the storage, its places called p00000, p00001, … in their order.
+
+    Args:
+        described: of each place its descriptor, float32 [D], and local descriptors, int8 [C, L].
+        fields: gives the fields of each place.
 
     Raises:
         StorageFailure: the directory cannot be written.
@@ -85,7 +105,7 @@ def fill_map(
     settings = MapSettings(keep="none")
     made = atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape, precision=precision)
     batch: list[Enrolment] = []
-    for index, (descriptor, local) in enumerate(sample_descriptors(encoder, places)):
+    for index, (descriptor, local) in enumerate(described):
         batch.append(_enrolment(index, descriptor, local, fields(index)))
         if len(batch) == BATCH:
             made.enrol(batch)

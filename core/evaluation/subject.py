@@ -1,4 +1,4 @@
-"""A system under evaluation: trained if it learns, its descriptions made once for all that is measured."""
+"""A system under evaluation: trained if it learns, and its descriptions, computed once for all measurements."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ class Subject:
 
     @property
     def trained_on(self) -> str | None:
-        """In words; None for a system that does not learn."""
+        """What the system was trained on, in words; None for a system that does not learn."""
         return self.training.source if self._learns else None
 
     @property
     def about(self) -> About:
-        """Of the system; the configuration of one that learns says from what."""
+        """The system's description; the configuration of one that learns names its training images."""
         about = self.system.about
         if not self._learns:
             return about
@@ -114,12 +114,12 @@ class Subject:
 
     @cached_property
     def references(self) -> Described:
-        """Of the kept references."""
+        """The descriptions of the kept references."""
         return self.describe(self.pair.kept_references)
 
     @cached_property
     def queries(self) -> Described:
-        """Of the queries as they are."""
+        """The descriptions of the undisturbed queries."""
         return self.describe(self.pair.queries)
 
     def describe(self, paths: Sequence[Path], change: Change | None = None) -> Described:
@@ -137,7 +137,7 @@ class Subject:
         return Described(descriptions, times)
 
     def score(self, index: Index, queries: Sequence[Description]) -> Scored:
-        """Scores of the queries, each asked by itself and timed unless the system needs them all together.
+        """Scores of the queries, each scored and timed alone unless the system is sequential.
 
         Raises:
             InvalidModel: the system gives scores that are not finite, or of another shape.

@@ -39,7 +39,7 @@ class Dataset:
 
     references, queries: names that the folder of a traverse goes by; the first that is there is taken.
     rule: what is true where no ``ground_truth.csv`` lies beside the traverses; None where one must.
-    truth: the rule in words.
+    truth: the rule, in words.
     sizes: those of the thesis; None where it has none.
     """
 

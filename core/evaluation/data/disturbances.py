@@ -1,4 +1,4 @@
-"""Ways to make a frame harder to recognize, in steps: the camera stands aside, it is dark, a truck is in the way.
+"""Disturbances that make a frame harder to recognize, in steps: the camera moved, it is dark, a truck is in the way.
 
 Each takes a frame (H x W x 3 uint8 BGR), a level and a generator, and returns a frame of the same
 size; level 0 of each changes nothing.  One generator seed gives one disturbance: noise at a higher
@@ -18,7 +18,7 @@ from core.frames.preprocessing import Pixels
 Apply = Callable[[Pixels, float, np.random.Generator], Pixels]
 
 GREY = 128
-"""What an occluding box is filled with."""
+"""Grey value of an occluding box."""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class Comparison:
     truth: of each query, indices into ``references``, kept or not.
     runs: best AUC-PR first.
     regions: gives the regions of interest of an image, by the best run whose system has some; None without one.
-    regions_of: identity of that run; its matches alone are shown with regions.
+    regions_of: identity of that run; only its matches are shown with regions.
     notes: sentences about the data that a reader must know, such as how references were chosen.
     """
 

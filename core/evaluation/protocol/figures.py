@@ -38,13 +38,15 @@ NO_POSITIVES = "no query has a kept true reference."
 class Evaluation(BaseModel):
     """The figures of one encoder on one pair of traverses.
 
-    Null is what the data cannot tell: AUC-ROC without negatives or without positives, recall
+    A figure is null where it is not defined: AUC-ROC without negatives or without positives, recall
     without a query that has a true reference, the time of a stage that the encoder lacks.
     """
 
     encoder: str
     auc_pr: float
-    one_class: OneClass | None = Field(description="In words, where AUC-PR tells nothing: one class of matches only.")
+    one_class: OneClass | None = Field(
+        description="Set where AUC-PR is meaningless because all matches are of one class."
+    )
     auc_roc: float | None
     recall_at: dict[str, float | None]
     recall_at_full_precision: float | None
@@ -66,11 +68,11 @@ class Evaluation(BaseModel):
         default=None, description="That of always stating the share of right ones."
     )
     trust: Trust | None = Field(default=None, description="Whether the system knows when it is right.")
-    notes: dict[str, str] = Field(description="Why a figure cannot be told, by its name.")
+    notes: dict[str, str] = Field(description="By the name of a figure, why it is null or meaningless.")
 
 
 def one_class(matched: ArrayLike) -> OneClass | None:
-    """The word for matches that are all right, or all wrong: their AUC-PR tells nothing."""
+    """Which class matches have if they have only one, so that AUC-PR is meaningless; else None."""
     if np.all(matched):
         return "all right"
     return None if np.any(matched) else "none right"

@@ -1,4 +1,4 @@
-"""What became of each query: its best match, whether that is right, where the first right one stands."""
+"""The outcome of each query: its best match, whether that is right, and the rank of the first right one."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from core.frames.traverses import Truth
 
 Scores = NDArray[np.floating[Any]]
-"""float32 as systems give them, or float64 as others have saved them."""
+"""float32 from systems, or float64 from saved files."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one query.
+    """The outcome of one query.
 
     retrieved: index of its best match, in the full list of references.
-    rank: place of its best true reference in the ranking, from 1; None for a true negative.
+    rank: rank of its best true reference, from 1; None for a true negative.
     """
 
     retrieved: int

@@ -123,7 +123,7 @@ class TraverseOptions:
 
 
 def name_pair(reference: Path, query: Path) -> str:
-    """What two traverses are called: ``nordland, winter against summer`` if both lie in one folder, else without it."""
+    """The name of a pair: ``nordland, winter against summer`` if both lie in one folder, else without the folder."""
     known, asked = reference.resolve(), query.resolve()
     traverses = f"{asked.name} against {known.name}"
     same = known.parent == asked.parent and known.parent.name

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 from dataclasses import dataclass, replace
@@ -9,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from core.errors import StorageFailure
+from core.errors import StorageFailure, StorageFull
 from core.evaluation import Comparison, ScalePoint, SeverityCurve
 from core.evaluation.report import write_report
+from core.evaluation.report.page import script, stylesheet, write_files
+from core.evaluation.report.theme import DARK, LIGHT
 from core.frames.traverses import tolerance_truth
 from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_images
 
@@ -268,3 +271,66 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 def test_no_run_no_report(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one run"):
         write_report(tmp_path / "report", replace(make_comparison(tmp_path), runs=[]))
+
+
+# How it looks
+
+
+def test_every_colour_that_is_used_is_defined_for_both_themes() -> None:
+    rules = stylesheet()
+    used = set(re.findall(r"var\((--[\w-]+)\)", rules)) - {"--size"}  # set on each bar
+    light, dark = (set(re.findall(r"(--[\w-]+):", part)) for part in rules.split("@media", 1)[:2])
+    assert used <= light | dark
+    assert rules.count(LIGHT.paper) >= 1
+    assert rules.index("prefers-color-scheme: dark") < rules.index(DARK.paper)
+    for name in ("paper", "ink", "muted", "rule", "tp", "fp", "tn", "fn", "tint", *(f"hue-{i}" for i in range(8))):
+        assert rules.count(f"--{name}:") == 2, name
+
+
+def test_neither_can_end_its_element() -> None:
+    assert "</" not in stylesheet()
+    assert "</" not in script()
+    assert script().startswith('"use strict"')
+
+
+# Its files
+
+
+def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        "index.html": b"new",
+        "notes.txt": b"mine",
+        "pr.png": b"png",
+    }
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "sentence"),
+    [(errno.ENOSPC, StorageFull, "The disk is full"), (errno.EACCES, StorageFailure, "cannot be written")],
+)
+def test_failed_write_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, error: type[Exception], sentence: str
+) -> None:
+    (tmp_path / "index.html").write_text("old")
+    write = Path.write_bytes
+
+    def fail(path: Path, data: bytes) -> int:
+        if data == b"new":
+            write(path, data[:1])
+            raise OSError(number, os.strerror(number))
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(error, match=sentence):
+        write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"index.html": "old"}
+
+
+def test_failed_rename_leaves_no_temporary_file(tmp_path: Path) -> None:
+    (tmp_path / "index.html").mkdir()
+    with pytest.raises(StorageFailure):
+        write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["index.html", "pr.png"]

@@ -1,10 +1,10 @@
-"""A robot's queries while others hold as many half-sent requests open as the service lets them.
+"""A robot's queries while others hold as many half-sent requests open as the service allows.
 
-    python -m benchmarks.siege --addresses 3 --connections 600 --seconds 12
+    python -m benchmarks.slow_connections --addresses 3 --connections 600 --seconds 12
 
-Each address of this machine opens its connections, sends the half of a head over each, a byte more now and then, and
-after six seconds begins anew. The robot sends a frame when it has the answer to the last, over a new connection each
-time, as one has to who was turned away before. Memory and descriptors are the service's own.
+Each address of this machine opens its connections, sends half of a head over each, one byte more now and then, and
+starts again after six seconds.  The robot sends a frame when it has the answer to the last, over a new connection each
+time, as after a refusal.  Memory and descriptors are those of the service.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from benchmarks.report import report
 
 HALF = b"GET /v1/maps HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
 COLUMNS = ("", "answered", "refused", "failed", "median", "memory", "descriptors")
-ANEW_SECONDS, BETWEEN_BYTES = 6.0, 0.5
+AGAIN_SECONDS, BETWEEN_BYTES = 6.0, 0.5
 
 
-def besiege(address: str, port: int, connections: int, over: threading.Event) -> None:
+def hold_open(address: str, port: int, connections: int, over: threading.Event) -> None:
     """Hold half-sent requests open until it is over."""
     while not over.is_set():
         held = []
@@ -39,19 +39,19 @@ def besiege(address: str, port: int, connections: int, over: threading.Event) ->
             one.connect_ex(("127.0.0.1", port))
             held.append(one)
         began, sent = time.monotonic(), HALF
-        while time.monotonic() - began < ANEW_SECONDS and not over.wait(BETWEEN_BYTES):
+        while time.monotonic() - began < AGAIN_SECONDS and not over.wait(BETWEEN_BYTES):
             for one in held:
                 try:
                     one.send(sent)
                 except OSError:
-                    continue  # closed by the service, which is what it is for
+                    continue  # the service closes slow connections on purpose
             sent = b"x"
         for one in held:
             one.close()
 
 
 def robot(url: str, frames: list[bytes], seconds: float) -> dict[str, Any]:
-    """What one robot sees: answers, refusals, failures, and the median time of an answer in milliseconds."""
+    """How one robot is served: answers, refusals, failures, and the median time of an answer in milliseconds."""
     times: list[float] = []
     refused, failed = 0, 0
     until = time.monotonic() + seconds
@@ -70,38 +70,38 @@ def robot(url: str, frames: list[bytes], seconds: float) -> dict[str, Any]:
 
 
 def main(
-    addresses: Annotated[int, typer.Option(min=1, max=200, help="From which the siege comes.")] = 3,
-    connections: Annotated[int, typer.Option(min=1, help="Of each of them.")] = 600,
-    seconds: Annotated[float, typer.Option(help="Of the siege.")] = 12.0,
+    addresses: Annotated[int, typer.Option(min=1, max=200, help="Addresses that open connections.")] = 3,
+    connections: Annotated[int, typer.Option(min=1, help="Connections of each address.")] = 600,
+    seconds: Annotated[float, typer.Option(help="How long they are held open.")] = 12.0,
 ) -> None:
-    """Measure a robot without and within a siege."""
+    """Measure a robot before and while the connections are held open."""
     frames, content = camera_frames(16)
     with tempfile.TemporaryDirectory() as folder, service(Path(folder), log=Path(folder) / "log") as process:
         url = str(process.client.base_url).rstrip("/")
         port = process.client.base_url.port or 80
-        robot(url, frames, 2)  # whatever is slow the first time
+        robot(url, frames, 2)  # a warm-up
         found: dict[str, Any] = {"before": robot(url, frames, seconds)}
         found["before"] |= {"memory": process.memory(), "descriptors": process.open_files()}
         over = threading.Event()
-        besiegers = [
-            threading.Thread(target=besiege, args=(f"127.0.0.{10 + number}", port, connections, over))
+        holders = [
+            threading.Thread(target=hold_open, args=(f"127.0.0.{10 + number}", port, connections, over))
             for number in range(addresses)
         ]
-        for besieger in besiegers:
-            besieger.start()
+        for holder in holders:
+            holder.start()
         time.sleep(2)
         within = found["within"] = robot(url, frames, seconds)
         within |= {"memory": process.memory(), "descriptors": process.open_files()}
         over.set()
-        for besieger in besiegers:
-            besieger.join()
+        for holder in holders:
+            holder.join()
         time.sleep(1)
         found["after"] = {"memory": process.memory(), "descriptors": process.open_files()}
         metrics = process.client.get("/metrics").text.splitlines()
         found["ended"] = [line for line in metrics if line.startswith("placerec_connections_ended_total")]
     rows = [(name, *(found[name].get(column, "") for column in COLUMNS[1:])) for name in ("before", "within", "after")]
     title = f"One robot, {content}, and {addresses} x {connections} connections with half a request"
-    report("siege", title, [*COLUMNS[:4], "median ms", "memory MB", "descriptors"], rows, found)
+    report("slow_connections", title, [*COLUMNS[:4], "median ms", "memory MB", "descriptors"], rows, found)
 
 
 if __name__ == "__main__":
