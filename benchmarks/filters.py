@@ -2,7 +2,7 @@
 
     python -m benchmarks.filters [--places 100000] [--rounds 15] [--keep FOLDER]
 
-The map is written through the storage, of descriptors mixed from those of real pictures (``benchmarks.process``), and
+The map is written through the storage, of descriptors mixed from those of sample frames, and
 every place has a pose, a heading, a time, a sequence and metadata.  Measured is all that a query takes after its
 encoding (what may be found, search, second stage, verdict, look-up), for every kind of filter in turn, so that all see
 the same machine; told are medians, and that of the ratio to the same query unfiltered.  ``--keep`` is where the map
@@ -22,13 +22,13 @@ import numpy as np
 import typer
 
 from benchmarks.opening import built
-from benchmarks.process import descriptors, fill_map, median
+from benchmarks.process import median
 from benchmarks.report import report, verdict
-from core.evaluation.timing import sample_picture
+from core.evaluation.samples import fill_map, sample_descriptors, sample_frame
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.localization import locate
+from core.recognition.recognition import locate
 from core.recognition.selection import EVERYTHING, Selection
 from core.storage import Atlas, Map
 from service.queries.filters import FilterParameters
@@ -77,9 +77,9 @@ def selections(places: int) -> dict[str, Selection | None]:
 
 
 def queries(encoder: Encoder, count: int) -> list[Encoding]:
-    """Of mixed pictures that are in no map."""
-    template = encoder.encode(sample_picture(0))
-    made = list(descriptors(encoder, 61 + count, seed=99))[-count:]
+    """Encodings of mixed frames that are in no map."""
+    template = encoder.encode(sample_frame(0))
+    made = list(sample_descriptors(encoder, 61 + count, seed=99))[-count:]
     return [Encoding(descriptor, local, template.regions, template.milliseconds) for descriptor, local in made]
 
 

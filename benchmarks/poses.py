@@ -16,27 +16,18 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from benchmarks.frames import encode_folder
 from benchmarks.report import report
-from core.frames.images import decode
-from core.frames.traverses import find_images
-from core.judgement.examination import examine
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import log_odds_per_score
-from core.judgement.verdict import METRIC, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
+from core.places import METRIC, Neighborhood, Whereabouts
+from core.recognition.stages import examine
 
 REACH = 15
 NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
-BATCH = 8
-
-
-def encode(encoder: Encoder, folder: Path) -> list[Encoding]:
-    """The frames of a folder in order."""
-    frames = [decode(path.read_bytes()) for path in find_images(folder)]
-    return [
-        one for start in range(0, len(frames), BATCH) for one in encoder.encode_batch(frames[start : start + BATCH])
-    ]
 
 
 def true_references(path: Path) -> dict[int, list[int]]:
@@ -76,7 +67,7 @@ def answered(encoder: Encoder, query: Encoding, places: list[Encoding]) -> tuple
 def main(folder: Annotated[Path, typer.Argument()]) -> None:
     """Measure, print a table and write JSON."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    queries, places = (encode(encoder, folder / name) for name in ("query", "ref"))
+    queries, places = (encode_folder(encoder, folder / name) for name in ("query", "ref"))
     errors: dict[str, list[float]] = {"best match": [], "estimate": []}
     spreads: list[float] = []
     for index, references in true_references(folder / "ground_truth.csv").items():

@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
 from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, evidence, place_graph
-from core.evaluation.timing import jpeg, medians, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
+from core.evaluation.timing import medians
 from core.frames.images import decode
-from core.judgement.examination import examine
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.recognition.stages import examine
 from core.storage import MapSettings
 from training.ground_truth import corrected_truth
 from training.photographs import find_photographs, read
@@ -136,7 +137,7 @@ def costs(encoder: Encoder, places: int, rounds: int) -> dict[str, float]:
         "odometry, lag 5": (RunOptions(lag=5), Step(odometry=Odometry(2.0, variance=0.04))),
         "path": (FILTERS["path"], Step()),
     }
-    data = jpeg(sample_picture(7))
+    data = jpeg(sample_frame(7))
     runs: dict[str, Any] = {"encode": lambda: encoder.encode(decode(data))}
     for name, (options, step) in steps.items():
         run, turns = Run(options, graph), iter(range(len(scores)))

@@ -28,17 +28,6 @@ COLUMNS = ("", "answered", "refused", "failed", "median", "memory", "descriptors
 ANEW_SECONDS, BETWEEN_BYTES = 6.0, 0.5
 
 
-def resident(pid: int) -> float:
-    """Resident memory of a process, in MB (10^6 bytes)."""
-    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return int(next(line.split()[1] for line in lines if line.startswith("VmRSS:"))) * 1024 / 1e6
-
-
-def descriptors(pid: int) -> int:
-    """Open files of a process."""
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
-
-
 def besiege(address: str, port: int, connections: int, over: threading.Event) -> None:
     """Hold half-sent requests open until it is over."""
     while not over.is_set():
@@ -86,13 +75,13 @@ def main(
     seconds: Annotated[float, typer.Option(help="Of the siege.")] = 12.0,
 ) -> None:
     """Measure a robot without and within a siege."""
-    frames, pictures = camera_frames(16)
+    frames, content = camera_frames(16)
     with tempfile.TemporaryDirectory() as folder, service(Path(folder), log=Path(folder) / "log") as process:
         url = str(process.client.base_url).rstrip("/")
         port = process.client.base_url.port or 80
         robot(url, frames, 2)  # whatever is slow the first time
         found: dict[str, Any] = {"before": robot(url, frames, seconds)}
-        found["before"] |= {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        found["before"] |= {"memory": process.memory(), "descriptors": process.open_files()}
         over = threading.Event()
         besiegers = [
             threading.Thread(target=besiege, args=(f"127.0.0.{10 + number}", port, connections, over))
@@ -102,16 +91,16 @@ def main(
             besieger.start()
         time.sleep(2)
         within = found["within"] = robot(url, frames, seconds)
-        within |= {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        within |= {"memory": process.memory(), "descriptors": process.open_files()}
         over.set()
         for besieger in besiegers:
             besieger.join()
         time.sleep(1)
-        found["after"] = {"memory": resident(process.pid), "descriptors": descriptors(process.pid)}
+        found["after"] = {"memory": process.memory(), "descriptors": process.open_files()}
         metrics = process.client.get("/metrics").text.splitlines()
         found["ended"] = [line for line in metrics if line.startswith("placerec_connections_ended_total")]
     rows = [(name, *(found[name].get(column, "") for column in COLUMNS[1:])) for name in ("before", "within", "after")]
-    title = f"One robot, {pictures}, and {addresses} x {connections} connections with half a request"
+    title = f"One robot, {content}, and {addresses} x {connections} connections with half a request"
     report("siege", title, [*COLUMNS[:4], "median ms", "memory MB", "descriptors"], rows, found)
 
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from rich.progress import track
 from safetensors.torch import load_file
 
-from core.evaluation import auc_pr
 from core.frames.preprocessing import Pixels
+from core.judgement.curves import auc_pr
 from core.method.encoder import Encoder, EncoderDefinition
 from core.method.features import FeatureExtractor
 from core.method.presets import PRESETS

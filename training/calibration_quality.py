@@ -19,13 +19,15 @@ import typer
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible
-from core.judgement.examination import examine
-from core.judgement.map_calibration import Held, Target, held_figures, recalibrate
-from core.judgement.trials import Trial, Trials, area_under_roc, gathered
-from core.judgement.verdict import Whereabouts, judge
+from core.judgement.calibration import Held, Target, fit_map_calibration, held_figures
+from core.judgement.curves import auc_roc
+from core.judgement.trials import Trial, Trials, gathered
+from core.judgement.verdict import judge
 from core.method.agreement import Cells
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import Whereabouts
+from core.recognition.stages import examine
 from training.default_calibration import NEIGHBORHOOD
 from training.validation import Encodings, describe, load_traverses, with_corrected_truth
 
@@ -95,8 +97,8 @@ def main(
         shown = describe(loaded, task.queries), describe(loaded, task.references)
         for name, trials in zip(truths, half_trials(loaded, *shown, list(truths.values())), strict=True):
             made: dict[str, Any] = {
-                "auc_roc": area_under_roc(trials.decision, trials.known),
-                "auc_roc_right": area_under_roc(trials.decision, trials.right),
+                "auc_roc": auc_roc(trials.decision, trials.known),
+                "auc_roc_right": auc_roc(trials.decision, trials.right),
             }
             calibration = loaded.calibration
             made["default"] = figures(
@@ -104,7 +106,7 @@ def main(
             )
             for wanted in PRECISIONS:
                 try:
-                    found = recalibrate(trials, calibration, Target(rule="precision", value=wanted), name)
+                    found = fit_map_calibration(trials, calibration, Target(rule="precision", value=wanted), name)
                     made[f"precision {wanted}"] = figures(found.measurement.cross_validated)
                 except CalibrationImpossible as error:
                     made[f"precision {wanted}"] = str(error)

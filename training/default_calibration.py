@@ -19,15 +19,16 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from core.evaluation import auc_roc
-from core.judgement.encoder_calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
+from core.judgement.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
+from core.judgement.curves import auc_roc
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import reliability
 from core.judgement.trials import Trial, Trials, gathered, joined
-from core.judgement.verdict import Calibration, Neighborhood, Whereabouts, judge
+from core.judgement.verdict import Calibration, judge
 from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load_encoder, save_calibration
 from core.method.encoder import Encoder
 from core.method.presets import NETWORK, PRESETS
+from core.places import Neighborhood, Whereabouts
 from training.validation import (
     DISTRACTORS,
     CameraTask,

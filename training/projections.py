@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from core.frames.preprocessing import prepare
 from core.method.agreement import AgreementDefinition
+from core.method.equations import unit_length
 from core.method.projection import Projection, fit_projection
-from core.method.regions import unit_length
 from core.networks.network import ShallowNetwork
 from training.distillation import SIDE
 from training.photographs import AugmentedCrops, split_photographs

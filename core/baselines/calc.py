@@ -6,19 +6,14 @@ the third convolution describes a frame: 4 x 14 x 19 = 1064 values.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.maps import unit
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Constants, Resources, VectorSystem, unit
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
 from core.networks.caffemodel import CaffeLayer, read_caffemodel
@@ -49,7 +44,7 @@ ABOUT = About(
 )
 
 
-def grey_input(pixels: Pixels) -> NDArray[np.float32]:
+def grey_input(pixels: Pixels) -> Array:
     """The frame as the authors show it: brightness equalized, grey, 120 x 160, from 0 to 1.
 
     Args:
@@ -94,30 +89,20 @@ def _fill(module: nn.Conv2d, source: CaffeLayer | None, what: str) -> None:
             target.copy_(torch.from_numpy(array.reshape(target.shape)))
 
 
-class Calc:
+class Calc(VectorSystem):
     """One vector a frame, of unit length; scores are cosines."""
 
-    about, sequential = ABOUT, False
-
-    def __init__(self, network: nn.Sequential) -> None:
+    def __init__(self, about: About, network: nn.Sequential) -> None:
         from core.networks.identity import tensors_digest
 
+        super().__init__(about, weights=tensors_digest(network.state_dict()))
         self.network = network
-        self.identity = system_identity(ABOUT, weights=tensors_digest(network.state_dict()))
 
     @torch.inference_mode()
-    def describe(self, pixels: Pixels) -> Description:
-        began = time.perf_counter()
+    def vector(self, pixels: Pixels) -> Array:
         maps: Tensor = self.network(torch.from_numpy(grey_input(pixels))[None, None])
-        vector = unit(maps.reshape(-1).numpy())
-        return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
-
-    def index(self, references: Sequence[Description]) -> Index:
-        return InnerProducts(stack(references))
+        return unit(maps.reshape(-1).numpy())
 
 
-def build(ingredients: Ingredients) -> Calc:
-    return Calc(load_calc(ingredients.file()))
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)
+def build(about: About, resources: Resources) -> Calc:
+    return Calc(about, load_calc(resources.file()))

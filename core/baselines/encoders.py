@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Description, Index, InnerProducts, stack
 from core.frames.preprocessing import Pixels
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderSummary
     from core.method.encoder import Encoder
+
+Box = tuple[float, float, float, float]
+"""A region of a frame: left, top, right, bottom, as fractions of its width and height."""
 
 _CAMAL = (
     "Khaliq, Ehsan, Milford, McDonald-Maier: CAMAL: Context-Aware Multi-layer Attention framework "
@@ -73,6 +76,21 @@ class EncoderSystem:
             arrays["local"] = encoding.local
         return Description(arrays, encoding.milliseconds)
 
+    def region_boxes(self, pixels: Pixels) -> list[Box]:
+        """The boxes of a frame's regions, highest energy first; none for a blank frame.
+
+        A frame is resized whole, so the cells of a layer are spread evenly over it; what a cell sees is wider.
+        """
+        by_layer = self.encoder.layer_grids()
+        grids = np.array([by_layer[layer] for layer in self.encoder.definition.layers], np.float64)  # rows, columns
+        regions = self.encoder.encode(pixels).regions
+        cells = grids[regions.layers]  # T x 2
+        tops_lefts, bottoms_rights = regions.boxes[:, :2] / cells, regions.boxes[:, 2:] / cells
+        boxes = np.concatenate([tops_lefts[:, ::-1], bottoms_rights[:, ::-1]], axis=1)[
+            np.argsort(-regions.energies, kind="stable")
+        ]
+        return [(left, top, right, bottom) for left, top, right, bottom in boxes.tolist()]
+
     def index(self, references: Sequence[Description]) -> Index:
         first = InnerProducts(stack(references), finish=self.encoder.scores_from_inner_products)
         if not self.encoder.candidates:
@@ -88,8 +106,8 @@ class TwoStages:
     local: NDArray[np.int8]
     encoder: Encoder
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
-        ranked = self.first.compare(queries)
+    def score(self, queries: Sequence[Description]) -> Array:
+        ranked = self.first.score(queries)
         return self.encoder.with_agreement(ranked, local_of(queries), self.local)
 
 

@@ -1,4 +1,4 @@
-"""SeqSLAM: tiny pictures compared in sequences, along paths of nearly constant velocity.
+"""SeqSLAM: tiny patch-normalized frames matched in sequences, along paths of nearly constant velocity.
 
 Milford, Wyeth: SeqSLAM: Visual Route-based Navigation for Sunny Summer Days and Stormy Winter Nights, ICRA
 2012.  Constants and the form of the score are those of OpenSeqSLAM (Sünderhauf, 2013).  As there, the
@@ -14,11 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.system import About, Description, Index, stack
+from core.baselines.system import About, Array, Constants, Description, Index, Resources, stack, system_identity
 from core.frames.preprocessing import Pixels
-
-Array = NDArray[np.float32]
 
 R_X, R_Y = 64, 32
 P = 8
@@ -145,18 +142,18 @@ def distinctness(costs: Array) -> Array:
 
 
 class Sequences:
-    """References in order of their traverse."""
+    """References in the order of their traverse."""
 
     def __init__(self, references: Sequence[Description]) -> None:
-        self._pictures = stack(references, "picture")
+        self._patches = stack(references, "patches")
 
-    def compare(self, queries: Sequence[Description]) -> Array:
-        matrix = enhance_contrast(differences(stack(queries, "picture"), self._pictures))
+    def score(self, queries: Sequence[Description]) -> Array:
+        matrix = enhance_contrast(differences(stack(queries, "patches"), self._patches))
         return distinctness(path_costs(matrix))
 
 
 class SeqSlam:
-    """Downsampled, patch-normalized pictures, compared as one sequence."""
+    """Downsampled, patch-normalized frames, scored as one sequence."""
 
     about, sequential = ABOUT, True
 
@@ -166,16 +163,13 @@ class SeqSlam:
     def describe(self, pixels: Pixels) -> Description:
         began = time.perf_counter()
         grey = cv2.resize(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), (R_X, R_Y), interpolation=cv2.INTER_AREA)
-        picture = patch_normalize(np.asarray(grey, np.uint8)).reshape(-1)
-        return Description({"picture": picture}, {"forward": 1e3 * (time.perf_counter() - began)})
+        patches = patch_normalize(np.asarray(grey, np.uint8)).reshape(-1)
+        return Description({"patches": patches}, {"forward": 1e3 * (time.perf_counter() - began)})
 
     def index(self, references: Sequence[Description]) -> Index:
         return Sequences(references)
 
 
-def build(ingredients: Ingredients) -> SeqSlam:
-    ingredients.none(ABOUT)
+def build(about: About, resources: Resources) -> SeqSlam:
+    resources.refuse_weights(about)
     return SeqSlam()
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)

@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import FEWEST_PLACES, TOP_PLACES, Calibration, Neighborhood, Whereabouts, filled_up
+from core.judgement.verdict import FEWEST_PLACES, TOP_PLACES, Calibration, filled_up
+from core.places import Neighborhood, Whereabouts
 
 LISTED = 100
 """Places that speak for themselves where there is no second stage; every index returns so many."""

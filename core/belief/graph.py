@@ -6,17 +6,14 @@ ordinal, so that "k frames on" is "k entries on".  Where places have poses, each
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
-from core.places import EARTH_RADIUS
+from core.kernels.belief import same_place
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 
 NEAREST = 24
 """A place is joined to so many of the nearest, at most; fewer in maps of over FULLY_JOINED places."""
@@ -90,7 +87,7 @@ class PlaceGraph:
         with the map.
         """
         where = self.whereabouts
-        found: NDArray[np.int64] = _same_place(
+        found: NDArray[np.int64] = same_place(
             place,
             int(self.first[place]),
             int(self.last[place]),
@@ -102,30 +99,6 @@ class PlaceGraph:
             self.neighborhood.frames,
         )
         return found
-
-
-@cast(Callable[[Callable[..., Any]], Callable[..., Any]], numba.njit(cache=True, nogil=True))
-def _same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
-    """As ``Whereabouts.near`` has it, among the places joined and those beside it in its sequence; ascending."""
-    low, high = max(first, place - frames), min(last, place + frames + 1)
-    found = np.empty(len(joined) + high - low, np.int64)
-    count = 0
-    for number in range(len(found)):
-        beside = number >= len(joined)
-        other = low + number - len(joined) if beside else joined[number]
-        if other == place and not beside:
-            continue
-        if kind[other] == kind[place] and kind[place] != NO_POSE:
-            if beside and other != place and np.any(joined == other):
-                continue
-            distance = np.sqrt(np.sum((position[other] - position[place]) ** 2))
-            same = distance <= radius or other == place
-        else:
-            same = beside and abs(ordinal[other] - ordinal[place]) <= frames
-        if same:
-            found[count] = other
-            count += 1
-    return np.sort(found[:count])
 
 
 def place_graph(

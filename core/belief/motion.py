@@ -1,24 +1,30 @@
 """How a robot gets from place to place between two frames.
 
-Three models, each a transition matrix that is never written out: along the sequence (nothing is known but the order
-of the frames), within reach (a speed limit and the time between frames), by odometry (how far, which way, how
-sure).  The last two need poses; places without one always go along their sequence.
+There are three models, each a transition matrix over the places: along the sequences (only the order of the frames is
+known), within reach (a speed limit and the time between frames are known), and by odometry (how far, which way and how
+surely).  The last two need poses; places without one always go along their sequence.  A matrix is not written out to
+be applied: compiled loops (``core.kernels.belief``) go through the joined places alone.  ``matrix()`` of each model
+gives it in plain NumPy.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.belief.graph import PlaceGraph
-from core.kernels.belief_moves import along_sequence, by_odometry, within_reach
+from core.kernels.belief import FITS, MISFIT, along_sequence, by_odometry, within_reach
 from core.places import EARTH_RADIUS
 
 Masses = NDArray[np.float32]
+Matrix = NDArray[np.float64]
+
+HALF_TURN = math.pi * EARTH_RADIUS
+"""Half of the Earth's girth, metres."""
 
 FARTHEST_STEPS = 16
 """A motion of more reaches than this is as good as a jump: it leaves no belief in any place."""
@@ -120,9 +126,151 @@ class Pending:
     reach: float = 0.0
 
 
-Move = Callable[[Masses, float, bool, float, Masses], tuple[float, float]]
-"""As the loops of ``moves.py`` are called: masses, the most not worth moving, whether to turn the matrix over, the
-value of being out of the map, and where to put the result."""
+class Move(Protocol):
+    """One step's transition matrix, which is never written out to be applied."""
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        """Multiply masses by the matrix with a compiled loop, into ``moved``, which holds zeros.
+
+        Args:
+            masses: float32 [n].
+            least: masses up to this are not moved; the first result is their sum.
+            back: whether to multiply by the transposed matrix instead.
+            outside: with ``back``, the value of having left the map.
+
+        Returns:
+            The mass that was not moved, and the mass that has left the map.
+        """
+
+    def matrix(self) -> Matrix:
+        """The matrix T in plain NumPy: T_ij is the share of place i's mass that goes to place j, float64 [n, n].
+
+        What a row lacks of 1 leaves the map.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class AlongSequences:
+    """Along the sequences by the offsets and probabilities of a :meth:`Stride.kernel`.
+
+    Places that are not ``moving``, bool [n], keep their mass.
+    """
+
+    graph: PlaceGraph
+    kernel: tuple[NDArray[np.int64], NDArray[np.float64]]
+    moving: NDArray[np.bool_]
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        moved[~self.moving] = masses[~self.moving]
+        graph = self.graph
+        found: tuple[float, float] = along_sequence(
+            masses, self.moving, graph.first, graph.last, *self.kernel, least, back, moved
+        )
+        return found
+
+    def matrix(self) -> Matrix:
+        places = np.arange(len(self.graph))
+        weights = np.zeros((len(places), len(places)))
+        for offset, weight in zip(*self.kernel, strict=True):
+            target = places + offset
+            inside = (self.graph.first <= target) & (target < self.graph.last)
+            weights[places[inside], target[inside]] = weight
+        stays = ~self.moving | ~weights.any(axis=1)  # at rest, or in a sequence that is shorter than the stride
+        weights[stays] = np.eye(len(places))[stays]
+        return weights / weights.sum(axis=1, keepdims=True)
+
+
+def displacements(graph: PlaceGraph) -> NDArray[np.float64]:
+    """Metres from place i to place j along the three coordinates, float64 [n, n, 3]; on the Earth the shorter way."""
+    apart = graph.coordinates[np.newaxis] - graph.coordinates[:, np.newaxis]
+    if graph.geographic:
+        east = apart[..., 0]
+        apart[..., 0] = np.where(np.abs(east) > HALF_TURN, east - np.copysign(2 * HALF_TURN, east), east)
+    apart[..., 0] *= graph.shrink[:, np.newaxis]
+    return apart
+
+
+def _pose_matrix(graph: PlaceGraph, fits: NDArray[np.float64]) -> Matrix:
+    """T_ij = w_ij / max(Σ_j w_ij, FITS), with the weight w_ij of the motion from place i to a joined place j.
+
+    If even all joined places together fit worse than FITS, the robot was probably not at place i, or is where the map
+    has no place: the motion is an observation, too.  Places without a pose keep their mass.
+    """
+    places = np.arange(len(graph))
+    joined = np.zeros((len(graph), len(graph)), np.bool_)
+    joined[np.repeat(places, np.diff(graph.starts)), graph.targets] = True
+    weights = np.where(joined, fits, 0.0)
+    matrix = weights / np.maximum(weights.sum(axis=1, keepdims=True), FITS)
+    matrix[places[~graph.posed], places[~graph.posed]] = 1
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class WithinReach:
+    """To the joined places within ``reach`` metres alike, and a little to those just beyond it.
+
+    A place b · ``softness`` metres beyond the reach has the weight exp(-b²/2); from b = 4 on it has none.
+    """
+
+    graph: PlaceGraph
+    reach: float
+    softness: float
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        graph = self.graph
+        moved[~graph.posed] = masses[~graph.posed]
+        edges = (graph.starts, graph.targets, graph.coordinates, graph.shrink, _half_turn(graph))
+        found: tuple[float, float] = within_reach(
+            masses, *edges, self.reach, self.softness, least, back, outside, moved
+        )
+        return found
+
+    def matrix(self) -> Matrix:
+        beyond = (np.linalg.norm(displacements(self.graph), axis=2) - self.reach) / self.softness
+        return _pose_matrix(self.graph, np.where(beyond < 4, np.exp(-0.5 * np.maximum(beyond, 0) ** 2), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ByOdometry:
+    """To the joined places by how well each fits a motion.
+
+    A place that the motion misses by d metres and, where both headings are known, by a turn of φ radians, has the
+    weight exp(-m) with the misfit m = (precision · d² + turn_precision · φ²) / 2; from m = MISFIT on it has none.
+    """
+
+    graph: PlaceGraph
+    odometry: Odometry
+    precision: float
+    turn_precision: float
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        graph, odometry = self.graph, self.odometry
+        moved[~graph.posed] = masses[~graph.posed]
+        edges = (graph.starts, graph.targets, graph.coordinates, graph.shrink, _half_turn(graph))
+        motion = (odometry.forward, odometry.left, odometry.turn, self.precision, self.turn_precision)
+        found: tuple[float, float] = by_odometry(masses, *edges, graph.heading, motion, least, back, outside, moved)
+        return found
+
+    def matrix(self) -> Matrix:
+        odometry, heading = self.odometry, self.graph.heading
+        known = ~np.isnan(heading)
+        cos, sin = np.cos(heading), np.sin(heading)
+        ahead = np.stack([odometry.forward * cos - odometry.left * sin, odometry.forward * sin + odometry.left * cos])
+        apart = displacements(self.graph)
+        directed = np.square(apart[..., 0] - ahead[0][:, np.newaxis]) + np.square(
+            apart[..., 1] - ahead[1][:, np.newaxis]
+        )
+        undirected = np.square(np.hypot(apart[..., 0], apart[..., 1]) - odometry.distance)
+        missed = np.where(known[:, np.newaxis], directed, undirected) + np.square(apart[..., 2])
+        turned = heading[np.newaxis] - heading[:, np.newaxis] - odometry.turn
+        turned = np.nan_to_num(turned - 2 * np.pi * np.floor((turned + np.pi) / (2 * np.pi)))  # in [-π, π)
+        misfit = 0.5 * self.precision * missed + 0.5 * self.turn_precision * np.square(turned)
+        return _pose_matrix(self.graph, np.where(misfit < MISFIT, np.exp(-misfit), 0.0))
+
+
+def _half_turn(graph: PlaceGraph) -> float:
+    """Half of the way round along the first coordinate, in metres; infinite where it does not lead round."""
+    return HALF_TURN if graph.geographic else math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,30 +320,20 @@ def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) 
         return Transition((), jumps=True)
     told = graph.posed.any() and (step.odometry is not None or step.reach is not None)
     along = ~graph.posed if told else np.ones(len(graph), np.bool_)
-    offsets, weights = stride.kernel()
-
-    def go_along(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-        moved[~along] = p[~along]
-        found: tuple[float, float] = along_sequence(
-            p, along, graph.first, graph.last, offsets, weights, least, back, moved
-        )
-        return found
-
     if along.any():
-        moves += [go_along] * step.frames
+        moves += [AlongSequences(graph, stride.kernel(), along)] * step.frames
     if told:
-        further = _by_pose(graph, step, pending, along)
+        further = _by_pose(graph, step, pending)
         if further is None:
             return Transition((), jumps=True)
         moves += further
     return Transition(tuple(moves))
 
 
-def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.bool_]) -> list[Move] | None:
+def _by_pose(graph: PlaceGraph, step: Step, pending: Pending) -> list[Move] | None:
     """The moves of places with poses; None for a motion farther than the graph can follow."""
     shows = 0.5 * graph.spacing
-    half_turn = math.pi * EARTH_RADIUS if graph.geographic else math.inf
-    geometry = (graph.starts, graph.targets, graph.coordinates, graph.shrink)
+    move: Move
     if step.odometry is not None:
         whole = pending.odometry.then(step.odometry)
         pending.reach = 0.0
@@ -206,16 +344,7 @@ def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.
         count = max(1, math.ceil(whole.distance / graph.reach)) if graph.reach else 1
         part = whole.part(min(count, FARTHEST_STEPS))
         precision = 1 / max(part.variance + shows**2 + (DRIFT * part.distance) ** 2, 1e-6)
-        turn_precision = 1 / (part.turn_variance + HEADING_SPREAD**2)
-        motion = (part.forward, part.left, part.turn, precision, turn_precision)
-
-        def go(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-            moved[along] = p[along]
-            found: tuple[float, float] = by_odometry(
-                p, *geometry, half_turn, graph.heading, motion, least, back, outside, moved
-            )
-            return found
-
+        move = ByOdometry(graph, part, precision, 1 / (part.turn_variance + HEADING_SPREAD**2))
     else:
         assert step.reach is not None
         whole_reach = pending.reach + step.reach
@@ -225,13 +354,5 @@ def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.
             return []
         pending.reach = 0.0
         count = max(1, math.ceil(whole_reach / graph.reach)) if graph.reach else 1
-        reach, softness = whole_reach / min(count, FARTHEST_STEPS), max(shows, 1e-3)
-
-        def go(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-            moved[along] = p[along]
-            found: tuple[float, float] = within_reach(
-                p, *geometry, half_turn, reach, softness, least, back, outside, moved
-            )
-            return found
-
-    return None if count > FARTHEST_STEPS else [go] * count
+        move = WithinReach(graph, whole_reach / min(count, FARTHEST_STEPS), max(shows, 1e-3))
+    return None if count > FARTHEST_STEPS else [move] * count

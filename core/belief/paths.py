@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,18 +20,10 @@ from core.belief.evidence import NOTHING, Evidence
 from core.belief.filter import Belief, uninformed
 from core.belief.graph import PlaceGraph
 from core.belief.motion import Stride
+from core.kernels.belief import add_along
 
 PACES = tuple(round(0.5 + 0.1 * step, 1) for step in range(11))
 """Velocities of the paths, as multiples of the usual advance."""
-
-
-@numba.njit(cache=True, nogil=True)
-def _add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
-    """Add each place's gain to the end of the path that was at that place ``shift`` frames of the sequence before."""
-    for k in range(len(places)):
-        place = places[k]
-        if place >= 0 and first[place] <= place + shift < last[place]:
-            totals[place + shift] += gains[k]
 
 
 class PathSearch:
@@ -78,7 +69,7 @@ class PathSearch:
         for path in sorted(shifts):
             totals = np.zeros(n, np.float32)
             for shift, (places, gains) in zip(path, placed, strict=True):
-                _add_along(places, gains, shift, graph.first, graph.last, totals)
+                add_along(places, gains, shift, graph.first, graph.last, totals)
             np.maximum(best, totals, out=best)
         unknown = sum(seen.unknown for seen in self._seen)
         return _normalised(best, unknown)

@@ -6,12 +6,12 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.frames.masks import Mask
+from core.kernels.pixels import largest_deviation, normalize
 
 Pixels = NDArray[np.uint8]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -56,7 +56,7 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
     if out is None:
         out = np.empty((height, width, 3), np.float32)
     mean, scale = _of_a_row(definition.mean, width), _of_a_row(definition.scale, width)
-    _scaled(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
+    normalize(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
     return out
 
 
@@ -64,15 +64,6 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
 def _of_a_row(values: tuple[float, float, float], width: int) -> NDArray[np.float32]:
     """What each channel has, for a row of pixels; float32 [3 W]."""
     return np.tile(np.array(values, np.float32), width)
-
-
-@numba.njit(cache=True, nogil=True)
-def _scaled(pixels, mean, scale, out):  # type: ignore[no-untyped-def]
-    """(pixels - mean) * scale, whole rows at a time: uint8 [H, W, 3], float32 [3 W] twice, to float32 [H, 3 W]."""
-    rows = pixels.reshape(out.shape)
-    for y in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            out[y, i] = (np.float32(rows[y, i]) - mean[i]) * scale[i]
 
 
 def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
@@ -85,19 +76,4 @@ def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
     stride = max(1, min(pixels.shape[:2]) // 64)
     sampled = np.ascontiguousarray(pixels[::stride, ::stride])
     counted = sampled.reshape(-1, 3) if mask is None else sampled[~mask.covered(*sampled.shape[:2])]
-    return float(_deviation(counted)) if len(counted) else 0.0
-
-
-@numba.njit(cache=True, nogil=True)
-def _deviation(values):  # type: ignore[no-untyped-def]
-    """The largest standard deviation of a column; uint8 [n, 3]."""
-    largest = 0.0
-    for channel in range(3):
-        total, squares = 0, 0  # exact
-        for i in range(len(values)):
-            value = int(values[i, channel])
-            total += value
-            squares += value * value
-        mean = total / len(values)
-        largest = max(largest, squares / len(values) - mean * mean)
-    return np.sqrt(largest)
+    return float(largest_deviation(counted)) if len(counted) else 0.0

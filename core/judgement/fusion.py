@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from core.judgement.priors import decision_slope, log_odds, log_odds_per_score
 from core.judgement.probability import FARTHEST
-from core.judgement.verdict import Calibration, Judgement, Neighborhood, Verdict, Whereabouts, leading, standing_out
+from core.judgement.verdict import Calibration, Judgement, Verdict, leading, standing_out
+from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, NO_POSE, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
 

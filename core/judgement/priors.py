@@ -19,8 +19,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_TIME, Calibration, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.judgement.verdict import Calibration
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_TIME, Pose, Whereabouts
 
 Flags = NDArray[np.bool_]
 Values = NDArray[np.float64]

@@ -92,13 +92,3 @@ def joined(parts: Sequence[Trials], same_frames: bool = False) -> Trials:
     names = ("decision", "margin", "known", "right")
     decision, margin, known, right = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     return Trials(decision, margin, known, right, np.concatenate(shifted))
-
-
-def area_under_roc(values: Values, positive: Flags) -> float | None:
-    """The chance that a positive outranks a negative (Mann and Whitney, 1947); ties count half, None with one kind."""
-    if positive.all() or not positive.any():
-        return None
-    _, group, sizes = np.unique(values, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(sizes) - (sizes - 1) / 2)[group]
-    count = int(positive.sum())
-    return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(values) - count)))

@@ -15,22 +15,18 @@ the margin under which an answer is ambiguous, so that half of it is left where 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.probability import Curve
+from core.places import Neighborhood, Whereabouts
 
 Verdict = Literal["recognized", "ambiguous", "unknown"]
-
-NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
-
-NO_TIME = -(1 << 63)
-"""Stands for the timestamp of a place that has none; microseconds otherwise."""
 
 FEWEST_PLACES = 16
 """Maps with fewer places that are no match are filled up to this with imagined ones."""
@@ -73,73 +69,6 @@ def completed(own: Calibration | None, default: Calibration, second_stage: bool)
     if own.curve is not None or not second_stage or own.decision == default.decision:
         return own
     return own.model_copy(update={"curve": default.curve, "decision": default.decision})
-
-
-@dataclass(frozen=True)
-class Neighborhood:
-    """What counts as the same place: within ``radius`` metres, or ``frames`` frames of a sequence."""
-
-    radius: float
-    frames: int
-
-
-@dataclass(frozen=True)
-class Whereabouts:
-    """Where n places are, one row each.
-
-    kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
-    position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
-    sequence: int32 [n], a code for the sequence's name; places without one share the code -1.
-    ordinal: int64 [n], order of enrolment within the sequence.
-    heading: float32 [n], degrees in [0, 360), counted as the pose's kind counts; NaN where it is not known.
-    timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
-
-    Heading and timestamp may be left out: nobody knows any.
-    """
-
-    kind: NDArray[np.int8]
-    position: NDArray[np.float64]
-    sequence: NDArray[np.int32]
-    ordinal: NDArray[np.int64]
-    heading: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
-    timestamp: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-
-    def __post_init__(self) -> None:
-        if len(self.heading) < len(self.kind):
-            object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
-        if len(self.timestamp) < len(self.kind):
-            object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def take(self, rows: ArrayLike) -> Whereabouts:
-        """The places ``rows`` (integers or a mask) in that order."""
-        chosen = np.asarray(rows)
-        return Whereabouts(
-            self.kind[chosen],
-            self.position[chosen],
-            self.sequence[chosen],
-            self.ordinal[chosen],
-            self.heading[chosen],
-            self.timestamp[chosen],
-        )
-
-    def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
-        """Which of the places are the same place as ``row``, itself included; bool [n].
-
-        Two poses of one kind are compared by distance; otherwise the places must be of one
-        sequence, at most so many frames apart.
-        """
-        near = self.sequence == self.sequence[row]
-        near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
-        kind = self.kind[row]
-        if kind != NO_POSE:
-            x, y, z = (self.position - self.position[row]).T
-            distance = np.sqrt(x * x + y * y + z * z)
-            near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
-        near[row] = True
-        return near
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from core.method.projection import finish_row, squared_length
+from core.kernels.projections import finish_row, squared_length
 
 FEW = 16
 """Cells of a box that are summed as they are; the rounding of so few is far under that of a feature's length."""

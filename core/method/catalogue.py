@@ -8,7 +8,6 @@ packaged ones.
 from __future__ import annotations
 
 import json
-import os
 import re
 import threading
 from collections.abc import Mapping
@@ -21,6 +20,7 @@ from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from core.disk.files import replacing
 from core.errors import InvalidModel, UnknownEncoder
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
@@ -127,10 +127,11 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 def _write(path: Path, tensors: Mapping[str, NDArray[Any]], header: _Header) -> None:
     """The file of an encoder, whole or not at all."""
-    partial = path.with_name(path.name + ".tmp")
-    save_file(dict(tensors), partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
-    partial.chmod(0o644)
-    os.replace(partial, path)
+    with replacing(path) as temporary:
+        save_file(
+            dict(tensors), temporary, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))}
+        )
+        temporary.chmod(0o644)
 
 
 def _read_header(path: Path) -> _Header:

@@ -17,12 +17,11 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
-from core.method.cells import ScatteredCells
+from core.method.agreement import AgreementDefinition, Cells, ScatteredCells, agreement, local_descriptors
+from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
-from core.method.matching import scores
 from core.method.regions import Regions
-from core.method.vlad import Normalization, Words, aggregate
+from core.method.vlad import Words, aggregate, scores
 from core.method.vocabulary import Vocabulary
 from core.networks.forward import Device, Precision, has_bfloat16
 from core.networks.identity import json_digest, tensors_digest

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from core.method.agreement import Cells, Correspondences, correspondences
 from core.method.encoder import Encoder
+from core.method.equations import assign, power, residuals, unit_length
 from core.method.regions import Regions
-from core.method.vlad import assign, normalize, power, residuals
 
 Array = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -84,7 +84,7 @@ def _cells(encoder: Encoder, a: Cells, b: Cells) -> Correspondences:
     if stage is None or not a.any() or not b.any():
         none = np.empty(0, np.int64)
         return Correspondences(none, none, np.empty(0, np.float32))
-    return correspondences(a, b, encoder.grid[1], stage)
+    return correspondences(a, b, encoder.grid[1], stage.reach)
 
 
 def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
@@ -101,8 +101,8 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
     whole = power(sums, definition.gamma)
     products = np.einsum("tk,tk->t", without, against[words])
     if definition.normalization == "intra":
-        reduced = np.einsum("tk,tk->t", normalize(without, "intra"), against[words])
-        parts = np.einsum("vk,vk->v", normalize(whole, "intra"), against)[words]
+        reduced = np.einsum("tk,tk->t", unit_length(without), against[words])
+        parts = np.einsum("vk,vk->v", unit_length(whole), against)[words]
     else:
         # The other words' parts stay, but the norm of the whole is another.
         by_word, squares = np.einsum("vk,vk->v", whole, against), np.einsum("vk,vk->v", whole, whole)
@@ -117,7 +117,7 @@ def _answers(encoder: Encoder, a: Regions | None, b: Regions | None) -> Indices:
     """Regions of one word that are each other's nearest by cosine, best first; int64 [n, 2]."""
     if a is None or b is None or not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    cosines = normalize(a.features, "intra") @ normalize(b.features, "intra").T  # T_a x T_b
+    cosines = unit_length(a.features) @ unit_length(b.features).T  # T_a x T_b
     apart = assign(a.features, encoder.centers)[:, None] != assign(b.features, encoder.centers)[None, :]
     cosines[apart] = -np.inf
     there, back = cosines.argmax(axis=1), cosines.argmax(axis=0)

@@ -15,8 +15,9 @@ from torch import Tensor
 from core.errors import InvalidModel
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels, contrast, prepare
+from core.method.equations import unit_length
 from core.method.projection import Projection
-from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums, unit_length
+from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
 from core.networks.backbone import Backbone
 from core.networks.forward import CudaPass, Device, Precision, fused_pass
 from core.networks.identity import json_digest, tensors_digest

@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from core.kernels.products import ConstantMatrix
+from core.kernels.projections import finish_rows
+from core.method.equations import unit_length
 
 Array = NDArray[np.float32]
 
@@ -34,8 +35,20 @@ class Projection:
     matrix: Array
 
     def __call__(self, features: Array, values: int) -> Array:
-        """Unit-length projections of n features, float32 [n, K] to [n, values]; zero stays zero."""
-        return self.finish(self.products(features), features, values)
+        """Project features f to unit-length p ∝ (f/|f| - m) W; a zero row stays zero.
+
+        The encoder computes the same from products that it already has (:meth:`finish`).
+
+        Args:
+            features: float32 [n, K].
+            values: how many columns of W to use.
+
+        Returns:
+            float32 [n, values].
+        """
+        projected = unit_length((unit_length(features) - self.mean) @ self.matrix[:, :values])
+        projected[~features.any(axis=1)] = 0
+        return projected
 
     def products(self, features: Array) -> Array:
         """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
@@ -60,38 +73,8 @@ class Projection:
             features: float32 [n, K].
         """
         projected = np.empty((len(features), values), np.float32)
-        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
+        finish_rows(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
         return projected
-
-
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def squared_length(feature):  # type: ignore[no-untyped-def]
-    """|f|²; float32 [K]."""
-    square = np.float32(0)
-    for k in range(len(feature)):
-        square += feature[k] * feature[k]
-    return square
-
-
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def finish_row(products, square, shift, projected):  # type: ignore[no-untyped-def]
-    """One row of :meth:`Projection.finish`; float32 [d], |f|² and float32 [d] to float32 [values]."""
-    inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
-    square = np.float32(0)
-    for d in range(len(projected)):
-        value = products[d] * inverse - shift[d]
-        projected[d] = value
-        square += value * value
-    again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
-    for d in range(len(projected)):
-        projected[d] *= again
-
-
-@numba.njit(cache=True, nogil=True)
-def _finish(products, features, shift, projected):  # type: ignore[no-untyped-def]
-    """Row by row, as :meth:`Projection.finish`, into ``projected``, float32 [n, values]."""
-    for i in range(len(features)):
-        finish_row(products[i], squared_length(features[i]), shift, projected[i])
 
 
 def fit_projection(clear: Array, changed: Array, values: int) -> Projection:

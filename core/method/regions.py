@@ -172,9 +172,3 @@ def projected_box_sums(
     """
     tables = _workspace.room(layer.shape).table, _workspace.room(products.shape).table
     projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, *tables, shift, out)
-
-
-def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Each row of float32 [T, K] divided by its length; a zero row stays zero."""
-    lengths = np.sqrt(np.einsum("tk,tk->t", features, features))[:, None]
-    return np.divide(features, lengths, out=np.zeros_like(features), where=lengths > 0)

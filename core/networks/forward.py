@@ -12,12 +12,12 @@ import copy
 from collections.abc import Callable
 from typing import Literal
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from core.errors import InvalidModel
+from core.kernels.pooling import max_pool
 from core.networks.convolution import LAST, FusedConvolution
 from core.networks.network import Convolution, Pooling, Relu, ShallowNetwork
 from core.networks.winograd import fast_convolution
@@ -87,34 +87,8 @@ class MaxPooling:
         maps = x.permute(0, 2, 3, 1).contiguous().numpy()
         count, height, width, channels = maps.shape
         pooled = np.empty((count, self._size(height), self._size(width), channels), np.float32)
-        _max_pooled(maps, self._kernel, self._stride, pooled)
+        max_pool(maps, self._kernel, self._stride, pooled)
         return torch.from_numpy(pooled).permute(0, 3, 1, 2)
-
-
-@numba.njit(cache=True, nogil=True)
-def _max_pooled(maps, kernel, stride, pooled):  # type: ignore[no-untyped-def]
-    """Maxima over windows that are cut off at the lower and right edge; float32 [B, X, Y, K] both."""
-    count, height, width, channels = maps.shape
-    for b in range(count):
-        for y in range(pooled.shape[1]):
-            top, bottom = y * stride, min(height, y * stride + kernel)
-            for x in range(pooled.shape[2]):
-                left, right = x * stride, min(width, x * stride + kernel)
-                row = pooled[b, y, x]
-                if bottom - top == 3 and right - left == 3:  # CaffeNet's windows, all at once
-                    for k in range(channels):
-                        upper = max(max(maps[b, top, left, k], maps[b, top, left + 1, k]), maps[b, top, left + 2, k])
-                        v = top + 1
-                        middle = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
-                        v = top + 2
-                        lower = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
-                        row[k] = max(max(upper, middle), lower)
-                else:
-                    row[:] = maps[b, top, left]
-                    for v in range(top, bottom):
-                        for u in range(left, right):
-                            for k in range(channels):
-                                row[k] = max(row[k], maps[b, v, u, k])
 
 
 def fused_pass(network: ShallowNetwork, precision: Precision = "float32") -> FusedPass | None:

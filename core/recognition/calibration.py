@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
-from core.judgement.map_calibration import Recalibration, Target, recalibrate
+from core.judgement.calibration import FittedCalibration, Target, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered
-from core.judgement.verdict import NO_POSE, Calibration, Neighborhood, judge
+from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import neighborhood_of, second_stage
+from core.places import NO_POSE, Neighborhood
+from core.recognition.stages import agree, neighborhood_of
 from core.storage import Map, Ranking, Snapshot
 
 Item = TypeVar("Item")
@@ -182,7 +183,7 @@ def calibrated(
     target: Target,
     source: str,
     advance: Advance = lambda _done, _total: None,
-) -> Recalibration:
+) -> FittedCalibration:
     """A calibration of a map by what it answers to questions; nothing is stored.
 
     Raises:
@@ -190,10 +191,10 @@ def calibrated(
         StorageFailure: the map's files cannot be read.
     """
     base = encoder.calibration.model_copy(update={"decision": "leading"})
-    return recalibrate(ask(map_, encoder, snapshot, questions, base, advance), base, target, source)
+    return fit_map_calibration(ask(map_, encoder, snapshot, questions, base, advance), base, target, source)
 
 
-def warnings_on(found: Recalibration, method: str) -> list[str]:
+def warnings_on(found: FittedCalibration, method: str) -> list[str]:
     """What the owner of a map should know of its calibration."""
     told = [FROM_ITSELF] if method == "map" else []
     if found.measurement.frames < FEW_FRAMES:
@@ -233,9 +234,9 @@ def _trial(
     remaining: Ranking = ranking[0][kept], ranking[1][kept]
     if not len(remaining[0]):
         return []
-    scored = second_stage(map_, encoder, snapshot, question.local, remaining)
-    judgement = judge(scored.ordered, scored.whereabouts, base, neighborhood_of(map_), scored.examined)
-    return [Trial(judgement, known, known and bool(question.true[scored.rows[0]]), number)]
+    candidates = agree(map_, encoder, snapshot, question.local, remaining)
+    judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
+    return [Trial(judgement, known, known and bool(question.true[candidates.rows[0]]), number)]
 
 
 def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:

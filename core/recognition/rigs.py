@@ -12,23 +12,15 @@ from core.judgement.fusion import Fused, View, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import log_odds_per_score
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import (
-    ATTEMPTS,
-    Located,
-    Scored,
-    calibration_of,
-    locate,
-    neighborhood_of,
-    search,
-    second_stage,
-)
+from core.recognition.recognition import ATTEMPTS, Answer, locate
 from core.recognition.selection import EVERYTHING, Selection
+from core.recognition.stages import Candidates, agree, calibration_of, neighborhood_of, search
 from core.storage import Map
 
 
 def locate_rig(
     map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
-) -> Located:
+) -> Answer:
     """Search one snapshot of a map for the frames of a rig and judge them as one.
 
     Args:
@@ -51,13 +43,13 @@ def locate_rig(
 
 def _attempt(
     map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None, settle: bool
-) -> Located | None:
+) -> Answer | None:
     """None if a place was deleted since the snapshot, unless it is to settle for the others."""
     snapshot = map_.snapshot()
     choice = selection.choice(map_, snapshot) if selection else EVERYTHING
     rankings = search(snapshot, np.stack([encoding.descriptor for encoding in encodings]), choice)
     found = [
-        second_stage(map_, encoder, snapshot, encoding.local, ranking, choice)
+        agree(map_, encoder, snapshot, encoding.local, ranking, choice)
         for encoding, ranking in zip(encodings, rankings, strict=True)
     ]
     if not len(found[0].rows):
@@ -74,12 +66,12 @@ def _attempt(
     matches = [(float(fused.scores[position]), place) for position in kept if (place := places[position]) is not None]
     pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
     steepness = log_odds_per_score(calibration, encoder.candidates > 0)
-    scored = _scored(fused, found[0], steepness)
+    candidates = _candidates_of_rig(fused, found[0], steepness)
     weights = None if choice.weights is None else np.exp(fused.weights[kept]).tolist()
-    return Located(judgement, matches, weights, calibration, 0.0, pose, encodings[0], scored)
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, encodings[0], candidates)
 
 
-def _scored(fused: Fused, one: Scored, steepness: float) -> Scored:
+def _candidates_of_rig(fused: Fused, one: Candidates, steepness: float) -> Candidates:
     """The ranking of a rig as that of a query: in the order of what would give one camera the same log odds."""
     return replace(
         one,

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import NO_POSE, NO_TIME, Whereabouts
+from core.places import NO_POSE, NO_TIME, Whereabouts
 
 Measure = Literal["distance", "time", "similarity"]
 

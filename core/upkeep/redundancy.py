@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.judgement.verdict import NO_POSE, Neighborhood, Whereabouts
+from core.places import NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 
 MOST_NEIGHBOURS = 32

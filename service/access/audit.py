@@ -1,7 +1,7 @@
-"""The audit trail: a line for each change of a map, with the name of the key behind it.
+"""The audit trail: a line for each change of a map, with the name of the key that made it.
 
 The lines go to the logger ``placerec.audit``, whatever level the other logs have, and to a file of their own if one is
-set.  No line holds a key, a frame, or metadata.
+configured.  No line contains a key, a frame, or metadata.
 """
 
 from __future__ import annotations
@@ -11,85 +11,113 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass
 from logging.handlers import WatchedFileHandler
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import StorageFailure
-from service.access.principals import ASKER, Asker, Principal
+from service.access.roles import Principal
 from service.telemetry.requests import JsonLines
-
-if TYPE_CHECKING:
-    from service.jobs.records import Job
 
 LOGGER = "placerec.audit"
 REPEAT_SECONDS = 60.0
-"""A refusal that repeats is told so often, with how often it came."""
+"""A repeated refusal is logged once in this time, with the number of repetitions."""
 
 MOST_REFUSALS = 1024
-"""Refusals that are told apart."""
+"""Most kinds of refusals that are counted apart."""
 
 PARTS = {"map": "map", "place": "place", "sequence": "sequence", "camera": "camera", "job": "job"}
-"""Names in a path that say what was changed."""
+"""Parameters of a path that tell what was changed."""
 
 log = logging.getLogger(LOGGER)
 
 
+@dataclass(frozen=True)
+class Asker:
+    """Who asked for a change, and with which request; a job keeps it, so that its end can be logged with it."""
+
+    principal: str
+    key: str | None = None
+    operation: str | None = None
+    request_id: str | None = None
+    trace_id: str | None = None
+    client: str | None = None
+
+
+ASKER: ContextVar[Asker] = ContextVar("asker", default=Asker("owner"))  # noqa: B039 - frozen
+"""Who asked for what is being done now; threads that a request starts inherit it."""
+
+
 def asker_of(principal: Principal, operation: str, state: Mapping[str, Any], client: str | None) -> Asker:
-    """Who asks for a change.
+    """Who sends a request.
 
     Args:
-        state: of the request; its ids are in it.
+        state: the state of the request, which holds its ids.
         client: the address that it came from.
     """
     return Asker(principal.name, principal.key_id, operation, state.get("request_id"), state.get("trace_id"), client)
 
 
-def told(asker: Asker) -> dict[str, Any]:
-    """What a line says of who asked; what is not known is left out."""
+def asker_fields(asker: Asker) -> dict[str, Any]:
+    """The fields of a line that tell who asked; unknown ones are left out."""
     return {name: value for name, value in asdict(asker).items() if value is not None}
 
 
 def note_change(asker: Asker, path: Mapping[str, str], noted: Mapping[str, Any], status: int) -> None:
-    """Tell of a request to change a map, when it has been answered.
+    """Log a request that changes a map, once it has been answered.
 
     Args:
-        path: the parts of its path.
-        noted: what its operation noted of it, such as the map's id or a count; ``"change": None`` says that
-            nothing was changed.
-        status: 0 if there was no answer, which leaves open whether the change was made.
+        path: the parameters of its path.
+        noted: what its operation noted, such as the map's id or a count; ``"change": None`` says that nothing was
+            changed.
+        status: the status of the answer; 0 if there was none, which leaves open whether the change was made.
     """
     if noted.get("change", "") is None and status < 400:
         return
     named = {name: path[name] for name in PARTS if name in path}
-    log.info("change", extra={**named, **noted, **told(asker), "status": status})
+    log.info("change", extra={**named, **noted, **asker_fields(asker), "status": status})
 
 
-def note_job(job: Job, event: str) -> None:
-    """Tell that a job begins to change a map, or how it has ended."""
-    line: dict[str, Any] = {"job": job.id, "kind": job.kind, "map": job.map_id, "attempt": job.attempt}
+def note_job(
+    event: str,
+    job: Mapping[str, Any],
+    arguments: Mapping[str, Any],
+    problem: Mapping[str, Any] | None,
+    asker: Mapping[str, Any],
+) -> None:
+    """Log that a job begins to change a map, or how it has ended.
+
+    Args:
+        event: "running", or the state in which the job has ended.
+        job: the fields that tell which job it is, such as its id and its map.
+        arguments: what the job was asked to do; the line names other maps and ``dry_run`` if they are among them.
+        problem: the problem object of a job that has failed.
+        asker: who asked for the job, as :func:`now_asking` gave it.
+    """
+    line = dict(job)
     for name in ("from", "to"):
-        if isinstance(job.arguments.get(name), str):
-            line[name] = job.arguments[name]
-    if isinstance(job.arguments.get("dry_run"), bool):
-        line["dry_run"] = job.arguments["dry_run"]
-    if job.problem is not None:
-        line["problem"] = job.problem.get("type")
-    log.info("job %s", event, extra={**line, **dict(job.asker)})
+        if isinstance(arguments.get(name), str):
+            line[name] = arguments[name]
+    if isinstance(arguments.get("dry_run"), bool):
+        line["dry_run"] = arguments["dry_run"]
+    if problem is not None:
+        line["problem"] = problem.get("type")
+    log.info("job %s", event, extra={**line, **dict(asker)})
 
 
 def now_asking() -> dict[str, Any]:
-    """Who asks for what is being done now, for a job to keep."""
-    return told(ASKER.get())
+    """Who asked for what is being done now, for a job to keep."""
+    return asker_fields(ASKER.get())
 
 
 @contextmanager
-def kept_in(path: Path | None) -> Iterator[None]:
-    """Append the trail to a file, too, one JSON object a line; one that is moved away is made anew.
+def audit_file(path: Path | None) -> Iterator[None]:
+    """Also append the trail to a file, one JSON object a line; if the file is moved away, a new one is created.
 
     Raises:
-        StorageFailure: it cannot be opened.
+        StorageFailure: the file cannot be opened.
     """
     if path is None:
         yield
@@ -109,13 +137,13 @@ def kept_in(path: Path | None) -> Iterator[None]:
 
 
 class Refusals:
-    """Lines about requests that were not let in; one that repeats is told now and then, so that nobody fills a disk."""
+    """Logs requests that were refused; repeated ones only now and then, so that they do not fill the disk."""
 
     def __init__(self) -> None:
         self._told: OrderedDict[tuple[str | None, ...], tuple[float, int]] = OrderedDict()
 
     def note(self, asker: Asker, path: Mapping[str, str], status: int, problem: str) -> None:
-        """Tell that a request was refused."""
+        """Note that a request was refused."""
         kind = (asker.client, asker.key, asker.operation, problem)
         now = time.monotonic()
         told_at, silent = self._told.get(kind, (-REPEAT_SECONDS, 0))
@@ -128,4 +156,4 @@ class Refusals:
             self._told.popitem(last=False)
         named = {name: path[name] for name in PARTS if name in path}
         repeated = {"before": silent} if silent else {}
-        log.info("refused", extra={**named, **told(asker), "status": status, "problem": problem, **repeated})
+        log.info("refused", extra={**named, **asker_fields(asker), "status": status, "problem": problem, **repeated})

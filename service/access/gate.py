@@ -1,7 +1,7 @@
-"""Who is let in: looked at before any byte of a body is read, for every path, and for WebSockets' handshakes.
+"""Access control: requests and WebSocket handshakes are let in or refused before any byte of a body is read.
 
-Whatever ``service.access.roles`` does not say is open needs a key as soon as one was ever created: unknown paths too,
-so that a caller without a key learns nothing of what is here.
+As soon as a key was ever created, everything needs a key that ``service.access.roles`` does not declare open.  That
+includes unknown paths, so that a caller without a key learns nothing about what exists.
 """
 
 from __future__ import annotations
@@ -19,19 +19,16 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import Refusals, asker_of, note_change
+from service.access.audit import ASKER, Asker, Refusals, asker_of, note_change
 from service.access.keyring import Keyring
-from service.access.principals import ANONYMOUS, ASKER, NOBODY, OWNER, Asker, Principal
 from service.access.rates import Rates, network_of
-from service.access.roles import FORGOTTEN, OPERATIONS, Rule, covers
+from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
 from service.access.web_origins import check_host, check_page
 from service.errors.faults import Fault, KeyRefused, MapForbidden, RoleTooLow
 from service.errors.problems import KINDS, problem_response
 from service.settings import PREFIX, Settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
-
-__all__ = ["ANONYMOUS", "NOBODY", "OWNER", "Access", "Gate", "Principal", "Way", "ways_of"]
 
 WEBSOCKET = "WEBSOCKET"
 
@@ -40,7 +37,7 @@ log = logging.getLogger("placerec.access")
 
 @dataclass(frozen=True)
 class Way:
-    """One way in: a method on a pattern of paths, and what it needs."""
+    """One method of one route, and the rule that applies to it."""
 
     method: str
     path: str
@@ -50,10 +47,10 @@ class Way:
 
 
 def ways_of(routes: Iterable[BaseRoute]) -> list[Way]:
-    """Every way into an application, in the order in which its routes are tried.
+    """Every method of every route of an application, in the order in which the routes are tried.
 
     Raises:
-        TypeError: there is a route of a kind that is not known here, and so could not be guarded.
+        TypeError: a route is of a kind that is not known here, so it could not be guarded.
     """
     found = []
     for route in iter_route_contexts(list(routes)):
@@ -64,18 +61,20 @@ def ways_of(routes: Iterable[BaseRoute]) -> list[Way]:
         else:
             raise TypeError(f"access to {route.original_route!r} is not guarded")
         operation = route.name or ""
-        rule = OPERATIONS.get(operation, FORGOTTEN)
+        rule = OPERATIONS.get(operation, UNLISTED)
         found += [Way(method, route.path_format or "", route.path_regex, operation, rule) for method in methods]
     return found
 
 
 @dataclass(frozen=True)
 class Gate:
-    """What a service asks of those who come.
+    """Decides who a caller is, and how many requests it may send.
 
-    keyring: None: the caller opened the data directory itself, and is its owner.
-    loopback: the service listens on this machine only; without keys, requests addressed to other names than its own
-        are then refused.
+    Args:
+        keyring: the keys; None if the caller opened the data directory itself, and so is its owner.
+        rates: the limits on requests a second.
+        loopback: whether the service listens only on this machine; while there are no keys, requests to other host
+            names are then refused.
     """
 
     keyring: Keyring | None
@@ -86,8 +85,9 @@ class Gate:
         """Who sends a request.
 
         Raises:
-            KeyNeeded, KeyRefused, KeysUnreadable, RateExceeded: it is not let in by its key.
-            ForeignPage: without keys: a web page of elsewhere sends it.
+            KeyNeeded, KeyRefused, KeysUnreadable: the request has no valid key.
+            RateExceeded: too many wrong keys came from its address.
+            ForeignPage: there are no keys, and the request comes from a web page of another site.
         """
         if self.keyring is None:
             return OWNER
@@ -105,10 +105,10 @@ class Gate:
             raise
 
     async def turn(self, scope: Scope) -> None:
-        """Wait until the next message of a WebSocket may be taken: each counts as a request.
+        """Wait until the rate allows the next message of a WebSocket; each message counts as a request.
 
         Raises:
-            As for :meth:`identify`: the key was revoked, or has expired, since the handshake.
+            Fault: as for :meth:`identify`, if the key was revoked or has expired since the handshake.
         """
         self.identify(scope)
         while wait := self.rates.wait(caller_of(scope)):
@@ -116,9 +116,9 @@ class Gate:
 
 
 class Access:
-    """ASGI layer that lets requests in or answers them; it comes before the layers that read bodies.
+    """ASGI middleware that lets requests in or refuses them; it comes before the layers that read bodies.
 
-    Sets ``principal`` in the request's state.
+    It sets ``principal`` in the request's state.
     """
 
     def __init__(self, app: ASGIApp, gate: Gate, ways: list[Way], metrics: Metrics) -> None:
@@ -144,7 +144,7 @@ class Access:
             await self._refuse(scope, receive, send, error, way, path)
             return
         asker = asker_of(state["principal"], way.operation if way else "unknown", state, address_of(scope))
-        ASKER.set(asker)  # for jobs, too, that change nothing
+        ASKER.set(asker)  # also for requests that change nothing: they may start jobs
         if way is not None and way.rule.changes:
             await self._change(scope, receive, send, asker, path)
         else:
@@ -165,7 +165,7 @@ class Access:
     def _admit(self, scope: Scope, way: Way | None, path: Mapping[str, str]) -> None:
         state = scope["state"]
         if way is not None and way.rule.role == "open":
-            with suppress(Fault):  # then it learns what everybody may
+            with suppress(Fault):  # without a valid key it sees what everybody may see
                 state["principal"] = self.gate.identify(scope)
             return
         principal = state["principal"] = self.gate.identify(scope)
@@ -173,19 +173,21 @@ class Access:
             return
         self.gate.rates.admit(caller_of(scope))
         if way is None:
-            return  # to be told that there is no such path, or no such method
+            return  # the router answers that there is no such path or method
         rule = way.rule
         if not covers(principal.role, rule.role):
-            raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this needs {rule.role}.")
+            raise RoleTooLow(
+                f"The key {principal.name!r} has the role {principal.role}; this operation needs {rule.role}."
+            )
         if principal.maps is None:
             return
         if rule.maps == "all":
-            raise MapForbidden(f"The key {principal.name!r} is limited to some maps, and this tells of all.")
+            raise MapForbidden(f"The key {principal.name!r} is limited to certain maps, but this shows all maps.")
         if "map" in path:
             principal.require(path["map"])
 
     async def _change(self, scope: Scope, receive: Receive, send: Send, asker: Asker, path: Mapping[str, str]) -> None:
-        """Pass on a request that changes a map, and tell of it when it is answered."""
+        """Pass on a request that changes a map, and write it to the audit trail once it is answered."""
         state = scope["state"]
         status = 0
 
@@ -193,14 +195,14 @@ class Access:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                if status == 202:  # a job will do it
+                if status == 202:  # a job will make the change
                     location = dict(message["headers"]).get(b"location", b"")
                     state.setdefault("noted", {})["job"] = location.rpartition(b"/")[2].decode("latin-1")
             await send(message)
 
         try:
             await self.app(scope, receive, sending)
-        except asyncio.CancelledError:  # the service stops, and says so
+        except asyncio.CancelledError:  # the service is stopping
             status = status or 503
             raise
         except BaseException:
@@ -214,7 +216,7 @@ class Access:
     ) -> None:
         state = scope["state"]
         kind = KINDS[type(error)]
-        scope["route"] = way  # for the log and the counters
+        scope["route"] = way  # for the log and the metrics
         asker = asker_of(state["principal"], way.operation if way else "unknown", state, address_of(scope))
         self._refusals.note(asker, path, kind.status, kind.slug)
         if scope["type"] == "websocket":
@@ -225,15 +227,15 @@ class Access:
         await problem_response(Request(scope), error)(scope, receive, send)
 
 
-def tell_exposure(gate: Gate, settings: Settings) -> None:
-    """Say at the start, where no key is asked for, who may do everything.
+def warn_if_exposed(gate: Gate, settings: Settings) -> None:
+    """Warn at the start if there are no keys, so that everybody who reaches the service may do everything.
 
     Raises:
-        SettingsError: other machines could, and nobody said that they may.
+        SettingsError: other machines can reach the service, and the settings do not allow anonymous use.
     """
     if gate.keyring is None or gate.keyring.demanded:
         return
-    settings.check_exposure()  # again, now that the keys were read
+    settings.check_exposure()  # again, because the keys have been read since
     who = "every process and every user of this machine" if gate.loopback else "EVERY MACHINE that reaches it"
     log.warning(
         "there are no keys: %s may do everything; create one with 'placerec keys create'",
@@ -245,12 +247,12 @@ def tell_exposure(gate: Gate, settings: Settings) -> None:
 
 
 def address_of(scope: Scope) -> str | None:
-    """The address that a request comes from; None where the server does not say."""
+    """The address that a request comes from; None if the server does not know it."""
     client = scope.get("client")
     return str(client[0]) if client else None
 
 
 def caller_of(scope: Scope) -> str:
-    """Whose requests are counted together: those of one key; without keys, of one address."""
+    """The name under which requests are counted: the key's id or, without a key, the address."""
     principal: Principal = scope["state"]["principal"]
     return principal.key_id or network_of(address_of(scope))

@@ -1,12 +1,12 @@
-"""The keys as a running service knows them: in memory, looked at anew when their file changes.
+"""The keys in the memory of a running service, which are read again whenever their file changes.
 
-No request reads the file.  A thread looks four times a second whether it has changed, so that a key that was created
-or revoked beside the service counts within a second.  When the file cannot be read, what was known holds for some
-seconds, since another process may just be writing; then nobody is let in.
+No request reads the file.  A thread checks four times a second whether it has changed, so that a key that a command
+creates or revokes counts within a second.  If the file cannot be read, the known keys hold for some seconds more,
+since another process may just be writing; after that nobody is let in.
 
-Whether a key has expired is told by two clocks.  The system's may be set back, which would make an expired key valid
-again; so a key also ages by the monotonic clock, from the latest moment that the file proves of it (its creation or
-its last use).  A clock that jumps can thus end keys early, for as long as it is wrong, but not prolong their use.
+Two clocks decide whether a key has expired.  The system clock may be set back, which would make an expired key valid
+again; so a key also ages by the monotonic clock, from the latest moment that the file proves for it (its creation or
+its last use).  A wrong system clock can therefore end a key early, while it is wrong, but never prolong it.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from service.access.keys import Key, KeyStore, digest_of, read_keys
-from service.access.principals import TOKEN, Principal
+from service.access.roles import TOKEN, Principal
 from service.errors.faults import KeyNeeded, KeyRefused, KeysUnreadable
 
 LOOK_SECONDS = 0.25
 USE_SECONDS = 60.0
-"""Last uses are written down so often."""
+"""How often the last uses are written to the file."""
 
 GRACE_SECONDS = 5.0
-"""So long what was known holds while the file cannot be read."""
+"""How long the known keys hold while the file cannot be read."""
 
 STUCK_SECONDS = 30.0
-"""So long the thread may take over one look."""
+"""How long the thread may take to check the file."""
 
-NOBODY = bytes(32)
-"""What an unknown key is compared with."""
+NO_DIGEST = bytes(32)
+"""The digest that an unknown key is compared with."""
 
 log = logging.getLogger("placerec.access")
 
@@ -46,8 +46,11 @@ log = logging.getLogger("placerec.access")
 class Held:
     """A key in memory.
 
-    expires: seconds since the epoch; None: never.
-    deadline: the same of the monotonic clock.
+    Args:
+        key: as it is stored.
+        principal: its holder.
+        expires: seconds since the epoch; None if it never expires.
+        deadline: the same moment by the monotonic clock.
     """
 
     key: Key
@@ -58,7 +61,7 @@ class Held:
 
 @dataclass(frozen=True)
 class _File:
-    """The file as it was read last: its connection, what the system says of it, SQLite's count of changes."""
+    """The file as it was last read: its connection, its attributes in the file system, SQLite's count of changes."""
 
     connection: sqlite3.Connection
     traits: tuple[int, ...]
@@ -67,10 +70,12 @@ class _File:
 
 @dataclass
 class _Known:
-    """What holds now; replaced as a whole.
+    """What is known of the keys; it is replaced as a whole.
 
-    demanded: keys are needed.
-    broken: why nobody can be let in.
+    Args:
+        demanded: whether a request needs a key.
+        broken: why nobody can be let in; None if the keys are known.
+        held: the keys by their ids.
     """
 
     demanded: bool = False
@@ -79,10 +84,10 @@ class _Known:
 
 
 class Keyring:
-    """The keys of a service; from any thread.
+    """The keys of a service.  It may be used from any thread.
 
     Args:
-        store: the file.
+        store: the file of the keys.
         wall, monotonic: the clocks, in seconds.
     """
 
@@ -107,10 +112,10 @@ class Keyring:
         return self._known.demanded
 
     def start(self) -> None:
-        """Read the file, and look at it again and again.
+        """Read the file, and start the thread that watches it.
 
         Raises:
-            KeysUnreadable: it is there, and cannot be read.
+            KeysUnreadable: the file exists but cannot be read.
         """
         self._read()
         self._thread = threading.Thread(target=self._watch, name="keys", daemon=True)
@@ -124,7 +129,7 @@ class Keyring:
         self.close()
 
     def close(self) -> None:
-        """Write down the last uses, and let the file go."""
+        """Stop the thread, write the last uses to the file, and close it."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
@@ -133,30 +138,30 @@ class Keyring:
         self._forget_file()
 
     def principal(self, authorization: bytes | None) -> Principal:
-        """Who sends an ``Authorization`` header.
+        """The holder of the key in an ``Authorization`` header.
 
         Raises:
-            KeyNeeded: there is none, or it is not of the form ``Bearer placerec_…``.
-            KeyRefused: its key is unknown, expired or revoked.
-            KeysUnreadable: nobody can tell.
+            KeyNeeded: there is no header, or it does not have the form ``Bearer placerec_…``.
+            KeyRefused: the key is unknown, expired or revoked.
+            KeysUnreadable: the keys are not known, because their file cannot be read.
         """
         known = self._known
         if known.broken is not None:
-            raise KeysUnreadable(f"{known.broken} Nobody is let in until it can be read.")
+            raise KeysUnreadable(f"{known.broken} Nobody is let in until the keys can be read.")
         if self._thread is not None and self._monotonic() - self._looked_at > STUCK_SECONDS:
-            raise KeysUnreadable("The disk does not answer, so nobody can tell which keys are in force.")
+            raise KeysUnreadable("The disk does not respond, so it is unknown which keys are in force.")
         if authorization is None:
             raise KeyNeeded("The request carries no key: send it as 'Authorization: Bearer placerec_…'.")
         scheme, _, token = authorization.strip().partition(b" ")
         token = token.strip()
         found = TOKEN.fullmatch(token.decode("latin-1"))
         if scheme.lower() != b"bearer" or found is None:
-            raise KeyNeeded("The key is sent as 'Authorization: Bearer placerec_…', whole and unchanged.")
+            raise KeyNeeded("Send the whole key in the header 'Authorization: Bearer placerec_…'.")
         held = known.held.get(found[1].encode())
-        # An unknown id costs what a known one does.
-        is_right = hmac.compare_digest(digest_of(token), NOBODY if held is None else held.key.digest)
+        # The comparison takes the same time for an unknown id.
+        is_right = hmac.compare_digest(digest_of(token), NO_DIGEST if held is None else held.key.digest)
         if held is None or not is_right:
-            raise KeyRefused("The key is not one of this service.")
+            raise KeyRefused("The service does not know this key.")
         if held.key.revoked_at is not None:
             raise KeyRefused(f"The key {held.key.name!r} was revoked.")
         now = self._wall()
@@ -174,7 +179,7 @@ class Keyring:
             self.look()
 
     def look(self) -> None:
-        """Read the file if it has changed, and write down now and then when keys were used."""
+        """Read the file if it has changed, and write the last uses to it from time to time."""
         self._looked_at = self._monotonic()
         try:
             if self._has_changed():
@@ -186,7 +191,7 @@ class Keyring:
             if self._monotonic() - self._written_at >= USE_SECONDS:
                 self._written_at = self._monotonic()
                 self._write_uses()
-        except Exception as error:  # whatever it is, the keys that hold now must not hold for ever
+        except Exception as error:  # whatever the error is, the known keys must not hold for ever
             self._forget_file()
             if self._known.broken is None and self._monotonic() - self._read_at >= GRACE_SECONDS:
                 log.error("nobody is let in: %s", error)
@@ -244,7 +249,7 @@ class Keyring:
 
     def _write_uses(self) -> None:
         before, self._used = self._used, {}
-        used = before.copy()  # at one go: a request may still be writing to it
+        used = before.copy()  # in one step, because a request may still write to it
         if not used:
             return
         try:
@@ -259,11 +264,11 @@ class Keyring:
 
 
 def _traits(status: os.stat_result) -> tuple[int, ...]:
-    """What differs when a file was replaced, or written to by other means than SQLite's."""
+    """Attributes that change when a file is replaced, or written to without SQLite."""
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_mode
 
 
 def _changes(connection: sqlite3.Connection) -> int:
-    """A number that differs when another connection has changed the file."""
+    """A number that changes when another connection changes the file."""
     (found,) = connection.execute("PRAGMA data_version").fetchone()
     return int(found)

@@ -1,4 +1,4 @@
-"""How many requests a second a caller may send: a token bucket each, in bounded memory."""
+"""Limits on requests a second: a token bucket for each caller, in bounded memory."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from functools import lru_cache
 from service.errors.faults import RateExceeded
 
 MOST_CALLERS = 4096
-"""Buckets that are kept; the one that was asked longest ago makes room for another."""
+"""Buckets that are kept; the least recently used one makes room for another."""
 
 FAILURES_PER_SECOND, FAILURE_BURST = 1.0, 10
-"""Wrong keys that one address may try."""
+"""How many wrong keys one address may try."""
 
 
 class Buckets:
-    """Token buckets by name.  A full one holds ``burst`` tokens and ``rate`` more come each second.
+    """Token buckets by name.  A bucket holds up to ``burst`` tokens, and ``rate`` tokens are added each second.
 
     Args:
         rate: tokens a second; 0 means that there is no limit.
@@ -33,11 +33,11 @@ class Buckets:
         return len(self._full_at)
 
     def take(self, name: str) -> float:
-        """Take a token; 0.0 if there was one, else the seconds until there will be, and none is taken."""
+        """Take a token and return 0.0; if there is none, return the seconds until there will be one."""
         if not self.rate:
             return 0.0
         now = self._clock()
-        # One number is a bucket's whole state: when it will be full again.
+        # The state of a bucket is one number: when it will be full again.
         full_at = max(self._full_at.get(name, now), now) + 1 / self.rate
         lacking = full_at - now - self.burst / self.rate
         if lacking > 1e-9:
@@ -53,7 +53,7 @@ class Rates:
     """The limits of one service.
 
     Args:
-        rate, burst: of each key, and of each address where there are no keys.
+        rate, burst: the limit of each key, or of each address while there are no keys.
     """
 
     def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
@@ -64,30 +64,33 @@ class Rates:
         """Count a request.
 
         Raises:
-            RateExceeded: one too many; it is not counted.
+            RateExceeded: the request exceeds the rate; it is not counted.
         """
         wait = self.wait(caller)
         if wait:
-            raise RateExceeded(f"More than {self._requests.rate:g} requests a second; wait a little.", wait)
+            raise RateExceeded(
+                f"More than {self._requests.rate:g} requests a second were sent. Wait before you send the next one.",
+                wait,
+            )
 
     def wait(self, caller: str) -> float:
-        """Count a request; 0.0 if it may go on, else seconds to wait before asking again."""
+        """Count a request and return 0.0, or return the seconds to wait until it can be counted."""
         return self._requests.take(caller)
 
     def admit_failure(self, address: str | None) -> None:
         """Count a wrong key.
 
         Raises:
-            RateExceeded: this address has sent too many; right keys from it are taken all the same.
+            RateExceeded: this address has sent too many; valid keys from it are still accepted.
         """
         wait = self._failures.take(network_of(address))
         if wait:
-            raise RateExceeded("Too many wrong keys came from this address; wait a little.", wait)
+            raise RateExceeded("Too many wrong keys were sent from this address. Wait before you try again.", wait)
 
 
 @lru_cache(MOST_CALLERS)
 def network_of(address: str | None) -> str:
-    """What counts as one caller: an IPv4 address, or the /64 that an IPv6 host has to itself."""
+    """The addresses that count as one caller: an IPv4 address, or the /64 network of an IPv6 address."""
     try:
         parsed = ipaddress.ip_address(address or "")
     except ValueError:

@@ -1,37 +1,93 @@
-"""Who may do what: one row for each operation.  A test fails for a route without a row, and for a row without a route.
+"""Who may do what: callers, their roles, and a rule for each operation.
 
-The roles are ordered: whoever may ``enrol`` may also ``query``, and ``admin`` may do everything.
+The roles are ordered: ``enrol`` includes ``query``, and ``admin`` includes everything.  A test fails for a route
+without a rule, and for a rule without a route.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
+from service.errors.faults import MapForbidden
+
 Role = Literal["open", "query", "enrol", "admin"]
-"""What an operation needs: nothing at all, or a key of this role or a higher one."""
-
-MapScope = Literal["none", "path", "named", "shown", "all"]
-"""How a key that is limited to maps is held to them.
-
-none: the operation has to do with no map.
-path: the map in the path has to be one of the key's; looked at before the body is read.
-named: besides the one in the path, each map that the request names has to be; the operation looks itself, by
-    :meth:`service.access.gate.Principal.require`.
-shown: only what is of the key's maps is there for it; the operation filters, by ``Principal.may_use``.
-all: it tells of all maps together, so only a key without such a limit will do.
-"""
+"""What an operation needs: no key at all ("open"), or a key of this role or a higher one."""
 
 LEVELS: dict[Role, int] = {"open": 0, "query": 1, "enrol": 2, "admin": 3}
+
+
+TOKEN = re.compile(r"placerec_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+"""The text of a key: its id, and a secret of 256 bits."""
+
+
+def covers(role: Role, needed: Role) -> bool:
+    """Whether a caller of one role may do what needs another."""
+    return LEVELS[role] >= LEVELS[needed]
+
+
+@dataclass(frozen=True)
+class Principal:
+    """A caller that was let in.
+
+    Args:
+        name: of its key; it appears in logs and in the audit trail.
+        key_id: None without a key.
+        role: what it may do.
+        maps: ids of the maps that it is limited to; None for all maps.
+    """
+
+    name: str
+    key_id: str | None
+    role: Role
+    maps: frozenset[str] | None
+
+    def may_use(self, *map_ids: str | None) -> bool:
+        """Whether it may use all of these maps; None, for what belongs to no map, needs a key for all maps."""
+        return self.maps is None or all(map_id in self.maps for map_id in map_ids)
+
+    def require(self, *map_ids: str) -> None:
+        """Refuse maps that it may not use, whether or not they exist.
+
+        Raises:
+            MapForbidden: it may not use at least one of them.
+        """
+        for map_id in map_ids:
+            if not self.may_use(map_id):
+                raise MapForbidden(f"The key {self.name!r} is limited to certain maps; {map_id[:80]!r} is not one.")
+
+
+ANONYMOUS = Principal("anonymous", None, "admin", None)
+"""A caller of a service that has no keys."""
+
+OWNER = Principal("owner", None, "admin", None)
+"""A caller that opened the data directory itself: a command without --url."""
+
+NOBODY = Principal("nobody", None, "open", frozenset())
+"""A caller without a valid key, who may use only what is open to all."""
+
+
+MapScope = Literal["none", "path", "named", "shown", "all"]
+"""How an operation treats a key that is limited to some maps.
+
+none: the operation involves no map.
+path: the map in the path has to be one of the key's; this is checked before the body is read.
+named: every map that the request names, in the path or elsewhere, has to be one of the key's; the operation checks
+    them with :meth:`Principal.require`.
+shown: the operation shows only what belongs to the key's maps; it filters with :meth:`Principal.may_use`.
+all: the operation shows all maps together, so it needs a key without a limit.
+"""
 
 
 @dataclass(frozen=True)
 class Rule:
     """What one operation needs.
 
-    role: the least role of a key.
-    maps: how a key that is limited to maps is held to them.
-    changes: the operation changes a map, or asks for a job that does: each call leaves a line in the audit trail.
+    Args:
+        role: the lowest role that may call it.
+        maps: how it treats a key that is limited to some maps.
+        changes: whether it changes a map, or starts a job that does; each call is then written to the audit trail.
     """
 
     role: Role
@@ -42,19 +98,19 @@ class Rule:
 OPERATIONS: dict[str, Rule] = {
     # The root
     "check_liveness": Rule("open", "none"),
-    "check_readiness": Rule("open", "shown"),  # which maps are damaged is told to those who may use them
+    "check_readiness": Rule("open", "shown"),  # it names damaged maps only to callers that may use them
     "read_version": Rule("open", "none"),
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
-    "read_metrics": Rule("query", "all"),  # its series name every map
+    "read_metrics": Rule("query", "all"),  # its series name all maps
     # Maps
     "list_maps": Rule("query", "shown"),
     "read_map": Rule("query", "path"),
     "create_map": Rule("admin", "named", changes=True),
     "edit_map": Rule("admin", "path", changes=True),
     "delete_map": Rule("admin", "path", changes=True),
-    "verify_map": Rule("admin", "path"),  # reads all that is stored, which takes the disk for long
-    # Places, traverses, cameras: what an enrolment run brings, replaces and takes back
+    "verify_map": Rule("admin", "path"),  # it reads all that is stored, which keeps the disk busy
+    # Places, traverses, cameras: what an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
@@ -71,59 +127,51 @@ OPERATIONS: dict[str, Rule] = {
     # Queries
     "query": Rule("query", "path"),
     "query_batch": Rule("query", "path"),
-    "query_maps": Rule("query", "named"),  # without names: of the key's maps
+    "query_maps": Rule("query", "named"),  # without names it asks the key's maps
     "query_or_enrol": Rule("enrol", "path", changes=True),
     "see_explanation": Rule("query", "path"),
-    # Sessions belong to their map: whoever may query it may use them, and they change nothing in it
+    # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
     "list_sessions": Rule("query", "path"),
     "read_session": Rule("query", "path"),
     "delete_session": Rule("query", "path"),
     "send_frame": Rule("query", "path"),
     "stream_frames": Rule("query", "path"),
-    # Upkeep: what changes how all robots are answered, or takes long
+    # Upkeep: it changes the answers to all robots, or takes long
     "calibrate_map": Rule("admin", "path", changes=True),
     "check_health": Rule("enrol", "path"),
-    "reencode_map": Rule("admin", "named", changes=True),  # the new map's id, too
+    "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),
-    "export_map": Rule("admin", "path"),  # all that a map holds, pictures too
+    "export_map": Rule("admin", "path"),  # it reads all of a map, with its pictures
     "import_map": Rule("admin", "named", changes=True),
     "rebuild_map": Rule("admin", "path", changes=True),
-    "merge_map": Rule("admin", "named", changes=True),  # the other map, too
-    # Jobs: those of the key's maps; a job over several needs all of them
+    "merge_map": Rule("admin", "named", changes=True),  # it names the other map, too
+    # Jobs: a job over several maps is shown to a key for all of them
     "list_jobs": Rule("query", "shown"),
     "read_job": Rule("query", "shown"),
     "follow_job": Rule("query", "shown"),
-    "cancel_job": Rule("enrol", "shown", changes=True),  # and the role that asking for the job needs
-    # Frames without a map, and what is installed
+    "cancel_job": Rule("enrol", "shown", changes=True),  # and the role that the operation behind the job needs
+    # Frames without a map, and the installed encoders
     "encode": Rule("query", "none"),
     "regions": Rule("query", "none"),
     "match": Rule("query", "none"),
     "list_encoders": Rule("query", "none"),
 }
-"""Operation ids are the names of the functions, WebSockets' too."""
+"""The rules by operation id, which is the name of the route's function."""
 
-ROLES: dict[str, Role] = {operation: rule.role for operation, rule in OPERATIONS.items()}
+UNLISTED = Rule("admin", "all", changes=True)
+"""The rule of a route that has none, which the tests do not let pass."""
 
-FORGOTTEN = Rule("admin", "all", changes=True)
-"""For a route without a row, which the tests do not let pass."""
-
-
-_TOLD: dict[MapScope, str] = {
-    "path": "; if it is limited to maps, this has to be one of them",
-    "named": "; if it is limited to maps, all that are named have to be among them",
-    "shown": "; if it is limited to maps, there is nothing else here for it",
-    "all": ", without a limit to maps",
+_LIMITS: dict[MapScope, str] = {
+    "path": "; a key that is limited to certain maps must include this one",
+    "named": "; a key that is limited to certain maps must include all that are named",
+    "shown": "; a key that is limited to certain maps sees only those",
+    "all": " that is not limited to certain maps",
     "none": "",
 }
 
 
 def needs(rule: Rule) -> str:
-    """What key an operation needs, as a sentence."""
+    """A sentence that tells which key an operation needs."""
     role = "any role" if rule.role == "query" else f"the role `{rule.role}`"
-    return f"Where keys are asked for: a key of {role}{_TOLD[rule.maps]}."
-
-
-def covers(role: Role, needed: Role) -> bool:
-    """Whether a key of one role may do what needs another."""
-    return LEVELS[role] >= LEVELS[needed]
+    return f"If the service has keys, this needs a key of {role}{_LIMITS[rule.maps]}."

@@ -1,8 +1,8 @@
-"""Web pages as callers, where there are no keys: a browser on this machine would send what any page asks it to.
+"""Protection against web pages while there are no keys: a browser on this machine sends what any page asks it to send.
 
-A page of elsewhere cannot read the answers, but a write needs none.  Browsers say where a request comes from; other
-clients send no such header and are not concerned.  A page can also have its own name lead to 127.0.0.1 (DNS
-rebinding), and then it is no page of elsewhere; but its requests are addressed to that name.
+A page of another site cannot read the answers, but it needs none to write.  Browsers say which page sends a request;
+other clients send no such header and are not affected.  A page can also point its own host name to 127.0.0.1 (DNS
+rebinding), so that its requests come from the same origin; but then they are addressed to that host name.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from service.errors.faults import ForeignPage
 Headers = list[tuple[bytes, bytes]]
 
 OWN_SITES = frozenset({b"same-origin", b"none"})
-"""``Sec-Fetch-Site`` of a page of ours, and of an address that somebody typed."""
+"""Values of ``Sec-Fetch-Site``: a page of this service, and an address that a person typed."""
 
 
 def check_page(headers: Headers) -> None:
-    """Refuse what a page of another origin sends.
+    """Refuse requests from pages of other origins.
 
     Raises:
-        ForeignPage: the browser says that it does.
+        ForeignPage: the headers say that the request comes from such a page.
     """
     host = origin = site = None
     for name, value in headers:
@@ -34,13 +34,17 @@ def check_page(headers: Headers) -> None:
         elif name == b"host":
             host = value
     if site is not None and site not in OWN_SITES:
-        raise ForeignPage("A page of another site sends this; without keys that is refused.")
+        raise ForeignPage(
+            "The request comes from a web page of another site, which is refused while the service has no keys."
+        )
     if origin is not None and _host_of(origin) != (host or b"").lower():
-        raise ForeignPage("A page of another origin sends this; without keys that is refused.")
+        raise ForeignPage(
+            "The request comes from a web page of another origin, which is refused while the service has no keys."
+        )
 
 
 def _host_of(origin: bytes) -> bytes | None:
-    """The host that an Origin header names, with its port; None where it is no origin."""
+    """The host and port of an Origin header; None if it is not an origin."""
     try:
         return urlsplit(origin.decode("latin-1")).netloc.lower().encode("latin-1")
     except ValueError:
@@ -48,7 +52,7 @@ def _host_of(origin: bytes) -> bytes | None:
 
 
 def check_host(headers: Headers) -> None:
-    """Refuse what is addressed to another name than this machine's own.
+    """Refuse requests that are addressed to another host name than this machine's own.
 
     Raises:
         ForeignPage: the Host header names another host, or there are two.
@@ -56,13 +60,14 @@ def check_host(headers: Headers) -> None:
     named = [value for name, value in headers if name == b"host"]
     if len(named) > 1 or (named and not is_loopback_host(named[0])):
         raise ForeignPage(
-            "Without keys the service answers to localhost and 127.0.0.1 only, not to other names; create a key."
+            "While the service has no keys, it answers only requests to localhost or 127.0.0.1. "
+            "Create a key to use it under another name."
         )
 
 
 @lru_cache(64)
 def is_loopback_host(host: bytes) -> bool:
-    """Whether a Host header names this machine to itself."""
+    """Whether a Host header is a loopback name or address."""
     try:
         name = urlsplit(f"//{host.decode('ascii')}").hostname or ""
     except ValueError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
+from typing import Any
 
 from anyio import to_thread
 from fastapi import FastAPI, Request
@@ -14,19 +15,32 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from service.access.audit import kept_in
-from service.access.gate import Access, Gate, tell_exposure, ways_of
+from service.access.audit import audit_file
+from service.access.gate import Access, Gate, warn_if_exposed, ways_of
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
+from service.app import routes as root
 from service.app.gauges import gauges
-from service.app.routers import ROUTERS
-from service.engine.engine import Engine
+from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
+from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
+from service.http.openapi import document
+from service.jobs import routes as jobs
+from service.maps import calibration_routes, camera_routes, transfer_routes
+from service.maps import routes as maps
+from service.maps.schemas import CalibrationOrder
+from service.places import routes as places
+from service.places.parameters import BatchItem
+from service.queries import loop_closure, several_routes
+from service.queries import routes as queries
+from service.sessions import routes as sessions
+from service.sessions import stream_routes
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
+from service.upkeep import routes as upkeep
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -58,10 +72,38 @@ TAGS = [
     {"name": "service", "description": "Health, counters, version."},
 ]
 
+ROUTERS = (
+    queries.router,  # routes are tried in turn, so the one that robots ask most comes first
+    root.router,
+    maps.router,
+    places.router,
+    places.traverses,
+    camera_routes.router,
+    calibration_routes.router,
+    loop_closure.router,
+    several_routes.router,
+    sessions.router,
+    stream_routes.router,
+    queries.explanations,
+    frames.router,
+    upkeep.router,
+    transfer_routes.router,
+    jobs.router,
+    root.encoders,
+)
+
 
 def _operation_id(route: APIRoute) -> str:
     """An operation is called as the function that does it."""
     return route.name
+
+
+class Application(FastAPI):
+    """FastAPI with an OpenAPI document that also says what every operation can answer."""
+
+    def openapi(self) -> dict[str, Any]:
+        """The document, with the models of bodies that routes read by hand."""
+        return document(self, (BatchItem, CalibrationOrder))
 
 
 class Published:
@@ -126,18 +168,18 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with kept_in(chosen.audit_file), keyring or nullcontext():
-            tell_exposure(gate, chosen)
-            engine = await to_thread.run_sync(Engine, chosen, metrics)
-            app.state.engine = engine
-            engine.start()
+        with audit_file(chosen.audit_file), keyring or nullcontext():
+            warn_if_exposed(gate, chosen)
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics)
+            runtime.publish(app.state)
+            runtime.start()
             try:
-                with gauges(engine, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                with gauges(runtime, app.state.upload_memory, to_thread.current_default_thread_limiter()):
                     yield
             finally:
-                await engine.close()
+                await runtime.close()
 
-    app = FastAPI(
+    app = Application(
         title="placerec",
         version=importlib.metadata.version("placerec"),
         summary=SUMMARY,

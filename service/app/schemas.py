@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel
 
 from core.method.catalogue import EncoderSummary
-from service.http.fields import Cursor
+from service.http.schemas import Cursor
 from service.maps.schemas import QuarantinedMap
 
 

@@ -22,7 +22,8 @@ import numpy as np
 import torch
 
 from core.errors import InvalidImage
-from core.frames.images import Limits, decode, read_header
+from core.frames.containers import read_header
+from core.frames.images import Limits, decode
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.method.encoder import FRAMES_A_PASS, Encoder, Encoding

@@ -20,7 +20,7 @@ from service.engine.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then
 from service.errors.faults import ClientGone, QueueFull
 from service.telemetry.metrics import Metrics
 
-__all__ = ["Encoded", "Inference", "Outcomes", "Patience", "Then"]
+__all__ = ["Encoded", "EncoderQueue", "Outcomes", "Patience", "Then"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
 """What became of some frames of many, each with its index."""
@@ -45,7 +45,7 @@ class Patience:
         return self.deadline - time.monotonic()
 
 
-class Inference:
+class EncoderQueue:
     """Loads encoders and encodes frames.
 
     Args:
@@ -79,7 +79,7 @@ class Inference:
         return self._waiting
 
     @contextmanager
-    def place_in_queue(self, frames: int = 1) -> Iterator[None]:
+    def place(self, frames: int = 1) -> Iterator[None]:
         """A place in the queue for one request, whose frames are encoded within.
 
         Args:
@@ -127,7 +127,7 @@ class Inference:
         mask: Mask | None = None,
         then: Then | None = None,
     ) -> Encoded:
-        """Decode and encode one frame when its turn comes; call it within ``place_in_queue``.
+        """Decode and encode one frame when its turn comes; call it within ``place``.
 
         Args:
             then: as :attr:`Turn.then`.
@@ -168,7 +168,7 @@ class Inference:
         patience: Patience,
         masks: Sequence[Mask | None] | None = None,
     ) -> AsyncGenerator[Outcomes]:
-        """Encode the frames of a bulk request, some ahead at a time; call it within ``place_in_queue``.
+        """Encode the frames of a bulk request, some ahead at a time; call it within ``place``.
 
         They share forward passes with one another and with what others ask for, and a robot's frame goes first.
         What is given up, for whatever reason, is taken out of the queue.

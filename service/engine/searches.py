@@ -1,4 +1,11 @@
-"""Searches that come together read a map together: each place is fetched from memory once for all of them."""
+"""When and where the frames of requests are searched for in a map.
+
+What a search does is said by :func:`core.recognition.recognition.locate`; here is only who does it when:
+
+* a frame of a small map is searched for in the thread that encoded it (:class:`SearchAhead`);
+* searches of one map that come together share a thread, so that each place is read from memory once for all of them;
+* a search with filters has a thread of its own.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +18,52 @@ from dataclasses import dataclass
 from anyio import to_thread
 
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import Located, locate
+from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
 from core.threads import cores
+from service.engine.microbatches import Encoded
 
 MOST_TOGETHER = 8
 """Queries of one search: from four on the map is read no faster for each, and whoever comes next waits for all."""
 
 CORES_A_SEARCH = 4
 """So many cores of the machine allow one more search of the same map at a time; each takes several for a large map."""
+
+
+MOST_AHEAD = 4000
+"""Places of a map that is searched in the encoder's thread, which takes some milliseconds."""
+
+
+@dataclass(frozen=True)
+class Recognized:
+    """A frame that was encoded and searched for; ``located`` is None for a frame without regions."""
+
+    encoded: Encoded
+    located: Answer | None
+
+
+@dataclass(frozen=True)
+class SearchAhead:
+    """The search for frames in a map, done in the encoder's thread; frames with equal searches share one."""
+
+    map_: Map
+    k: int
+
+    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Answer] | None]:
+        """What was found for each frame; None for a frame that is left to :meth:`Searches.recognize`."""
+        seen = [one for one in encoded if len(one.encoding.regions)]
+        if not seen or not self.map_.snapshot().holds:  # it would have to be read from the disk
+            return [None] * len(encoded)
+        found = iter(locate(self.map_, seen[0].encoder, [one.encoding for one in seen], self.k))
+        return [[next(found)] if len(one.encoding.regions) else None for one in encoded]
+
+
+def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
+    """The search to do in the encoder's thread, or None where other frames might wait long for it."""
+    if selection is not None or map_.count_places() > MOST_AHEAD:
+        return None
+    return SearchAhead(map_, k)
 
 
 @dataclass(frozen=True)
@@ -35,7 +78,7 @@ class _Purpose:
 @dataclass
 class _Waiting:
     encodings: Sequence[Encoding]
-    answer: asyncio.Future[list[Located]]
+    answer: asyncio.Future[list[Answer]]
 
 
 class Searches:
@@ -50,10 +93,27 @@ class Searches:
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_once = max(1, cores() // CORES_A_SEARCH)
 
+    async def recognize(
+        self, map_: Map, frames: Sequence[Encoded], k: int, selection: Selection | None = None
+    ) -> list[Recognized]:
+        """Search for frames that the map's encoder has encoded, unless they were searched for where they were encoded.
+
+        Raises:
+            StorageFailure: the map's files cannot be read.
+        """
+        seen = [frame for frame in frames if len(frame.encoding.regions)]
+        if len(seen) == 1 and seen[0].followed is not None:
+            located: list[Answer] = seen[0].followed
+        else:
+            encodings = [frame.encoding for frame in seen]
+            located = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+        remaining = iter(located)
+        return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]
+
     async def locate(
         self, map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
-    ) -> list[Located]:
-        """What :func:`core.recognition.localization.locate` gives, in a thread and together with what others ask for.
+    ) -> list[Answer]:
+        """What :func:`core.recognition.recognition.locate` gives, in a thread and together with what others ask for.
 
         Raises:
             StorageFailure: the map's files cannot be read.

@@ -1,1 +1,1 @@
-"""What the service refuses, and how it says so."""
+"""The errors of the service, and the problems with which it answers them."""

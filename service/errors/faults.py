@@ -1,6 +1,6 @@
-"""What the service itself refuses, besides the errors of the core; one class each.
+"""The errors of the service, besides those of the core; one class each.
 
-``service.errors.problems`` maps them, as it does the core's, to status codes and problem types.
+``service.errors.problems`` maps them, like the errors of the core, to status codes and problem types.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import ClassVar
 
 
 class Fault(Exception):
-    """Base of all classes below; the text is one plain sentence for the caller."""
+    """Base of all classes below; its text tells the caller in a sentence what is wrong and what to do."""
 
 
 class MalformedBody(Fault):
@@ -18,11 +18,11 @@ class MalformedBody(Fault):
 
 
 class InvalidRequest(Fault):
-    """Parameters, headers or the body's contents do not fit the contract.
+    """Parameters, headers or the contents of the body are not valid.
 
     Args:
-        detail: one sentence.
-        errors: ``{"location": …, "message": …}`` for each thing that is wrong.
+        detail: a sentence.
+        errors: ``{"location": …, "message": …}`` for each error.
     """
 
     def __init__(self, detail: str, errors: list[dict[str, str]] | None = None) -> None:
@@ -31,34 +31,34 @@ class InvalidRequest(Fault):
 
 
 class UnsupportedMediaType(Fault):
-    """The content type is not one that this resource takes, or the bytes are of another type than it says."""
+    """The resource does not support the content type, or the bytes are of another type."""
 
 
 class BodyTooLarge(Fault):
-    """More bytes than the limit for this resource; the rest was not read."""
+    """The body has more bytes than the limit of the resource; the rest was not read."""
 
 
 class QueueFull(Fault):
-    """So many requests wait for the encoder that one more would wait too long."""
+    """Too many requests wait for the encoder."""
 
 
 class MemoryFull(Fault):
-    """So many bytes of uploads are held that this one has to wait."""
+    """The uploads under way leave no memory for this one."""
 
 
 class DeadlineExceeded(Fault):
-    """The request's time was up before its frame was encoded; nothing was done."""
+    """The time of the request was up before its frame was encoded; nothing was done."""
 
 
 class ClientGone(Fault):
-    """The caller hung up before its turn came; nobody reads the answer."""
+    """The client closed the connection before its turn came; nobody reads the answer."""
 
 
 class NotReady(Fault):
     """A readiness check fails.
 
     Args:
-        checks: the outcome of each check, "ok" or what is wrong.
+        checks: the result of each check, "ok" or what is wrong.
     """
 
     def __init__(self, detail: str, checks: dict[str, str]) -> None:
@@ -67,59 +67,59 @@ class NotReady(Fault):
 
 
 class EncoderNotInstalled(Fault):
-    """The map is bound to an encoder that this installation lacks."""
+    """The encoder of the map is not installed."""
 
 
 class FrameNeeded(Fault):
-    """A place was to keep its frame, which was named by a digest, but holds another one or is not there."""
+    """The frame was named by its digest, but the place has another frame or does not exist."""
 
 
 class BatchOutOfOrder(Fault):
-    """A batch was to come after another one, which is not stored; nothing of it was."""
+    """The batch was to be stored after another one, which is not stored; nothing of it was stored."""
 
 
 class UnknownExplanation(Fault):
-    """There is no picture of an explanation under this name, or not any more."""
+    """The picture of an explanation does not exist, or is no longer kept."""
 
 
 class PlaceTaken(Fault):
-    """The id is that of a place with another frame, which is not to be replaced."""
+    """A place with this id has another frame, which is not to be replaced."""
 
 
 class UnknownJob(Fault):
-    """There is no job of this id, or it ended so long ago that it is forgotten."""
+    """The job does not exist, or ended so long ago that it is no longer kept."""
 
 
 class JobEnded(Fault):
-    """The job has ended, so there is nothing to cancel."""
+    """The job has ended, so it cannot be cancelled."""
 
 
 class JobQueueFull(Fault):
-    """So many jobs wait that one more is not taken."""
+    """Too many jobs wait."""
 
 
 class StagingFull(Fault):
-    """What waits on disk to be worked through takes so much room that this has to wait."""
+    """The frames that wait on disk to be enrolled leave no room for more."""
 
 
 class JobLost(Fault):
-    """The service ended before the job did, and a job of this kind cannot be taken up again."""
+    """The service stopped before the job ended, and a job of this kind cannot be resumed."""
 
 
 class ImagesMissing(Fault):
-    """The map does not keep the image of every place, so it cannot be encoded anew."""
+    """The map does not keep the image of every place, so it cannot be re-encoded."""
 
 
 class MergeConflict(Fault):
-    """The maps cannot be merged as they are: ids, sequences or cameras of the same name mean different things."""
+    """The maps cannot be merged: places, sequences or cameras of the same name differ."""
 
 
 class NothingToMeasure(Fault):
-    """The map holds no frames by which the recall could be measured."""
+    """The map has no frames with which the recall could be measured."""
 
 
 class TooManyWatchers(Fault):
-    """So many follow jobs already that one more is not served."""
+    """Too many clients follow jobs."""
 
 
 class UnknownSession(Fault):
@@ -127,23 +127,23 @@ class UnknownSession(Fault):
 
 
 class SessionExpired(Fault):
-    """The session is over: nothing came for too long, or its map is another one now."""
+    """The session has ended, because no frame came for too long or its map was replaced."""
 
 
 class TooManySessions(Fault):
-    """So many sessions are kept, or they hold so much memory, that one more has to wait for another to end."""
+    """Too many sessions are open, or they hold too much memory."""
 
 
 class FrameOutOfOrder(Fault):
-    """The frame is older than one that the session has taken in, or was taken in already."""
+    """The session has already taken in this frame or a later one."""
 
 
 class StreamTaken(Fault):
-    """Another connection streams into the session."""
+    """Another connection already streams into the session."""
 
 
 class KeyNeeded(Fault):
-    """The request carries no key, or none that can be read, and keys are demanded."""
+    """The service needs a key, and the request has none or a malformed one."""
 
     headers: ClassVar = {"WWW-Authenticate": 'Bearer realm="placerec"'}
 
@@ -163,18 +163,18 @@ class MapForbidden(Fault):
 
 
 class ForeignPage(Fault):
-    """Without keys: the request comes from a page of another site, or was addressed to another host's name."""
+    """While there are no keys: the request comes from a web page of another site, or is sent to another host name."""
 
 
 class KeysUnreadable(Fault):
-    """The file of the keys is damaged, gone or cannot be read, so nobody can be let in."""
+    """The file of the keys is damaged, missing or unreadable, so nobody is let in."""
 
 
 class RateExceeded(Fault):
     """The caller sends more requests a second than it may.
 
     Args:
-        seconds: after which the next one would be taken.
+        seconds: time until the next request is accepted.
     """
 
     def __init__(self, detail: str, seconds: float) -> None:
@@ -183,10 +183,10 @@ class RateExceeded(Fault):
 
 
 class MalformedHead(Fault):
-    """The head of the request is not HTTP, or asks for a WebSocket and not as one is asked for.
+    """The head of the request is not valid HTTP, or not a valid WebSocket handshake.
 
     Args:
-        headers: of the answer.
+        headers: headers of the answer.
     """
 
     def __init__(self, detail: str, headers: dict[str, str] | None = None) -> None:
@@ -195,7 +195,7 @@ class MalformedHead(Fault):
 
 
 class HeadTooSlow(Fault):
-    """The head of the request did not come in time."""
+    """The head of the request did not arrive in time."""
 
 
 class HeadTooLarge(Fault):
@@ -203,42 +203,42 @@ class HeadTooLarge(Fault):
 
 
 class UrlTooLong(Fault):
-    """Path and query string are longer than is read."""
+    """The path and the query string are longer than the limit."""
 
 
 class TooManyConnections(Fault):
-    """So many connections are open, of all callers or of this one's address, that one more is not served."""
+    """Too many connections are open, of all clients or from this client's address."""
 
 
 class TooManyMaps(Fault):
-    """There are as many maps as there may be."""
+    """The service already has the most maps that it may have."""
 
 
 class TooManyPlaces(Fault):
-    """The map holds as many places as it may."""
+    """The map already has the most places that it may have."""
 
 
 class TooManyExports(Fault):
-    """As many maps are being downloaded as moments of maps may be kept."""
+    """The most exports that may be kept are already being downloaded."""
 
 
 class TooManyImports(Fault):
-    """As many maps are being brought, or wait for a job, as may be."""
+    """The most imports are already under way or wait for a job."""
 
 
 class ExportGone(Fault):
-    """The moment of the map of which the caller has a part is not kept any more."""
+    """The export of which the caller has a part is no longer kept."""
 
 
 class DigestMismatch(Fault):
-    """The body is not the one of which the caller gives the digest."""
+    """The body does not match the digest that the caller gives."""
 
 
 class RangeNotSatisfiable(Fault):
-    """The range begins behind the end.
+    """The range begins after the end.
 
     Args:
-        size: bytes that there are.
+        size: number of bytes of the content.
     """
 
     def __init__(self, detail: str, size: int) -> None:
@@ -247,4 +247,4 @@ class RangeNotSatisfiable(Fault):
 
 
 class Stopping(Fault):
-    """The service was stopped before the request was done, and could not wait any longer."""
+    """The service stopped before the request was done."""

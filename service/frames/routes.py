@@ -11,20 +11,29 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.method.region_drawing import boxes, draw, layer_grids, strongest
-from service.engine.engine import in_thread
-from service.engine.queue import Encoded
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     QueueFull,
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.frames.schemas import Box, Descriptor, Layer, MatchScore, Region, RegionsView
+from service.frames.schemas import (
+    Box,
+    Descriptor,
+    EncoderParameters,
+    Layer,
+    MatchParameters,
+    MatchScore,
+    Region,
+    RegionsParameters,
+    RegionsView,
+)
 from service.http.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
-from service.http.negotiation import preferred
+from service.http.headers import preferred
 from service.http.openapi import BINARY, form_body, frame_body
-from service.http.parameters import EncoderParameters, MatchParameters, RegionsParameters
 from service.http.uploads import read_frame, read_pair
 from service.queries.explanations import as_drawn, drawing, explained
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",
@@ -54,11 +63,11 @@ async def encode(
     The bytes are little-endian; their encoder and the number of regions stand in the headers
     `X-Encoder` and `X-Regions`.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     identity = await in_thread(engine.resolve, options.joined(frame.fields).encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, patience)
     regions = len(encoded.encoding.regions)
     if regions == 0:
         raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
@@ -85,12 +94,12 @@ async def regions(
     options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
 ) -> Response:
     """The regions of interest of a frame: as JSON, or drawn (`?format=png`, or `Accept: image/png`)."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     options = options.joined(frame.fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, patience)
     found = encoded.encoding.regions
     layers = await in_thread(layer_grids, encoded.encoder)
     chosen = strongest(found, options.limit)
@@ -143,13 +152,13 @@ async def match(
 ) -> Response:
     """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
     itself reach where parts of it are plain."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     first, second, fields = await read_pair(request, engine.settings)
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        a = await in_thread(as_drawn, await engine.inference.encode(identity, first, patience))
-        b = await engine.inference.encode(identity, second, patience)
+    with engine.queue.place():
+        a = await in_thread(as_drawn, await engine.queue.encode(identity, first, patience))
+        b = await engine.queue.encode(identity, second, patience)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
     explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None

@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from service.http.fields import Milliseconds
-from service.queries.explanation_schemas import ExplanationView
+from service.http.schemas import Milliseconds, Parameters
+from service.queries.schemas import ExplanationView
 
 
 class Descriptor(BaseModel):
@@ -73,3 +73,31 @@ class MatchScore(BaseModel):
         default=None, description="With `explain`: why; a is the query, b the match."
     )
     milliseconds: Milliseconds
+
+
+class EncoderParameters(Parameters):
+    """Beside a frame that is encoded for no map."""
+
+    encoder: str | None = Field(
+        default=None, max_length=256, description="Name or identity; the default encoder if left out."
+    )
+
+
+class MatchParameters(EncoderParameters):
+    """How to compare two frames."""
+
+    explain: bool = Field(default=False, description="Say which words, regions and cells carried the score.")
+    format: Literal["json", "png"] | None = Field(
+        default=None,
+        description="png: both frames side by side, what answers each other joined by lines; if left out, the Accept "
+        "header decides, and json is the default.",
+    )
+
+
+class RegionsParameters(EncoderParameters):
+    """How to show regions."""
+
+    limit: int | None = Field(default=None, ge=1, le=10_000, description="Only so many, those of the highest energy.")
+    format: Literal["json", "png"] | None = Field(
+        default=None, description="json or png; if left out, the Accept header decides, and json is the default."
+    )

@@ -1,4 +1,4 @@
-"""The bytes of request bodies: limited, counted and timed as they arrive; JSON read strictly."""
+"""Request bodies: their bytes are limited, counted and timed as they arrive; JSON is read strictly."""
 
 from __future__ import annotations
 
@@ -6,23 +6,21 @@ import asyncio
 import json
 import math
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator
 from typing import Any
 
-from fastapi.routing import APIRoute
 from starlette.requests import Request
-from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors.faults import BodyTooLarge, ClientGone, DeadlineExceeded, InvalidRequest, MalformedBody, MemoryFull
 from service.settings import Settings
 
 PIECE_BYTES = 1 << 20
-"""Of a body that is written to disk as it arrives."""
+"""Size of the pieces in which a body is written to disk as it arrives."""
 
 
 class UploadMemory:
-    """How many bytes of bodies are held by all requests together."""
+    """Counts the bytes of bodies that all requests together hold in memory."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity, self.held = capacity, 0
@@ -31,7 +29,7 @@ class UploadMemory:
         """Count ``size`` bytes more.
 
         Raises:
-            MemoryFull: there is no room for them.
+            MemoryFull: they would exceed the capacity; none is counted.
         """
         self.check(size)
         self.held += size
@@ -39,18 +37,24 @@ class UploadMemory:
     def check(self, size: int) -> None:
         """Raise MemoryFull unless ``size`` bytes have room now."""
         if self.held + size > self.capacity:
-            raise MemoryFull("Too many uploads are under way; send the request again in a moment.")
+            raise MemoryFull("Too many uploads are under way. Send the request again in a moment.")
 
     def release(self, size: int) -> None:
-        """The bytes are no longer held."""
+        """Count ``size`` bytes fewer."""
         self.held -= size
 
 
 class Intake:
-    """The receiving side of one request; stands in for its ``receive``.
+    """The receiving side of one request, which replaces its ``receive``.
 
-    ``limit`` and ``deadline`` (``time.monotonic``) may be changed by the resource before it reads.  ``idle`` is how
-    many seconds may go by without a byte.
+    A route may change ``limit`` (bytes) and ``deadline`` (``time.monotonic``) before it reads the body.
+
+    Args:
+        scope, receive: of the ASGI request.
+        limit: most bytes of the body.
+        deadline: when the whole body must have arrived.
+        memory: counts the bytes that are held.
+        idle: most seconds without a byte.
     """
 
     def __init__(
@@ -65,7 +69,7 @@ class Intake:
         self.limit, self.deadline, self.idle = limit, deadline, idle
         self.size, self.complete = 0, False
         self.held = 0
-        """Bytes of it that count as held in memory."""
+        """Bytes of this body that count as held in memory."""
         self._is_held = True
         self._receive, self._memory = receive, memory
         lengths = [value for name, value in scope["headers"] if name == b"content-length"]
@@ -75,10 +79,10 @@ class Intake:
         """The next message.
 
         Raises:
-            BodyTooLarge: the body is, or says it is, longer than the limit; nothing over it is read.
-            MemoryFull: the uploads under way leave no room for it.
-            DeadlineExceeded: it did not arrive in time.
-            ClientGone: it ended before its end.
+            BodyTooLarge: the body is longer than the limit, or its Content-Length is.
+            MemoryFull: the uploads under way leave no room for the body.
+            DeadlineExceeded: the body did not arrive in time.
+            ClientGone: the connection was closed before the end of the body.
         """
         if self.complete:
             return await self._receive()
@@ -91,7 +95,7 @@ class Intake:
                 message = await self._receive()
         except TimeoutError:
             if self.idle < left:
-                raise DeadlineExceeded(f"Nothing of the body came for {self.idle:g} seconds.") from None
+                raise DeadlineExceeded(f"No byte of the body arrived for {self.idle:g} seconds.") from None
             raise DeadlineExceeded("The body did not arrive in time.") from None
         if message["type"] != "http.request":
             raise ClientGone("The connection was closed before the end of the body.")
@@ -105,26 +109,26 @@ class Intake:
         return message
 
     def pass_on(self, limit: int, seconds: float) -> None:
-        """Take a longer body, which the resource writes to disk as it comes and does not hold.
+        """Allow a longer body, which the route writes to disk as it arrives and does not hold in memory.
 
         Args:
-            limit: bytes.
-            seconds: from now on, within which all of it has to come; ``idle`` holds as well.
+            limit: most bytes.
+            seconds: from now until the whole body must have arrived; ``idle`` still applies.
         """
         self.limit, self.deadline, self._is_held = limit, time.monotonic() + seconds, False
 
     async def hung_up(self) -> None:
-        """Return when the caller has closed the connection; for when the body was read."""
+        """Return when the client has closed the connection; call it once the body was read."""
         while (await self())["type"] == "http.request":
             pass
 
     def _check(self, size: int) -> None:
         if size > self.limit:
-            raise BodyTooLarge(f"The body has more than the {self.limit} bytes that are taken here.")
+            raise BodyTooLarge(f"The body has more than {self.limit} bytes, the limit of this resource.")
 
 
 class BodyLimit:
-    """ASGI layer that puts an :class:`Intake` before each request, with the limits of a JSON body."""
+    """ASGI middleware that puts an :class:`Intake` before each request, with the limits of a JSON body."""
 
     def __init__(self, app: ASGIApp, settings: Settings, memory: UploadMemory) -> None:
         self.app, self.settings, self.memory = app, settings, memory
@@ -146,7 +150,7 @@ class BodyLimit:
 
 
 async def in_pieces(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
-    """Chunks of a body put together, each piece worth a thread's while; the last has the rest, or nothing."""
+    """Join the chunks of a body to pieces of at least ``PIECE_BYTES``; the last piece has the rest and may be empty."""
     gathered = bytearray()
     async for chunk in chunks:
         gathered += chunk
@@ -163,52 +167,31 @@ def intake_of(request: Request) -> Intake:
 
 
 def parse_json(data: bytes | str, what: str) -> Any:
-    """The value of a JSON text; numbers may still be infinite and strings may hold lone surrogates.
+    """Parse JSON; numbers may still be infinite and strings may contain lone surrogates.
 
     Raises:
-        MalformedBody: it is not JSON, or nested too deeply.
+        MalformedBody: the text is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(data)
     except RecursionError:
         raise MalformedBody(f"{what} is nested too deeply.") from None
     except ValueError as error:
-        raise MalformedBody(f"{what} is not JSON: {error}.") from error
+        raise MalformedBody(f"{what} is not valid JSON: {error}.") from error
 
 
 def json_size(value: Any, what: str) -> int:
     """The length in bytes of a value as JSON text.
 
     Raises:
-        InvalidRequest: it cannot be written as JSON in UTF-8: a number is not finite, a string holds
-            a lone surrogate.
+        InvalidRequest: the value cannot be written as JSON in UTF-8, because a number is not finite or a string
+            contains a lone surrogate.
     """
     try:
         return len(json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":")).encode())
     except RecursionError:
         raise InvalidRequest(f"{what} is nested too deeply.") from None
     except UnicodeEncodeError:
-        raise InvalidRequest(f"{what} holds half a character (a lone surrogate).") from None
+        raise InvalidRequest(f"{what} contains half a character (a lone surrogate).") from None
     except ValueError:
-        raise InvalidRequest(f"{what} holds a number that is not finite.") from None
-
-
-class StrictRequest(Request):
-    """A request whose JSON body holds only what JSON can hold."""
-
-    async def json(self) -> Any:
-        value = parse_json(await self.body(), "The body")
-        json_size(value, "The body")
-        return value
-
-
-class StrictRoute(APIRoute):
-    """A route that reads JSON bodies strictly."""
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handler = super().get_route_handler()
-
-        async def strict(request: Request) -> Response:
-            return await handler(StrictRequest(request.scope, request.receive))
-
-        return strict
+        raise InvalidRequest(f"{what} contains a number that is not finite.") from None

@@ -1,10 +1,9 @@
-"""All open connections: how many there may be, who has to go when there are too many, how long each step may take."""
+"""The register of open connections: how many there may be, and which one is closed when there are too many."""
 
 from __future__ import annotations
 
 import asyncio
 import fcntl
-import socket
 import struct
 import sys
 import termios
@@ -21,31 +20,32 @@ from service.settings import Settings
 from service.telemetry.metrics import Metrics
 
 LEAST_PROGRESS = 64 * 1024
-"""Bytes that a slow caller has to take within each ``write_timeout``."""
+"""Bytes that a slow client has to read within each ``write_timeout``."""
 
 MOST_SURPLUS = 64
-"""Connections over the limit that are told so; any further ones are closed without a word."""
+"""Connections over the limit that get an answer; further ones are closed without one."""
 
 
 class Connection(Protocol):
     """What the register knows of a connection."""
 
     def give_way(self) -> None:
-        """Close, for others want the place; called while no request is under way."""
+        """Close to make room for another connection; called only while no request is under way."""
 
 
 class Connections:
-    """The register of connections, used from the event loop alone.
+    """The register of connections.  It is used only from the event loop.
 
     Args:
         settings: the limits.
-        memory: where the bytes that arrive over WebSockets are counted.
+        memory: counts the bytes that arrive over WebSockets.
+        metrics: counts the connections.
     """
 
     def __init__(self, settings: Settings, memory: UploadMemory, metrics: Metrics) -> None:
         self.settings, self.memory = settings, memory
         self.draining = False
-        """Whether each answer is to be the last one of its connection."""
+        """Whether a connection is closed after its next answer."""
         self._open: dict[Connection, str] = {}
         self._of_address: Counter[str] = Counter()
         self._waiting: OrderedDict[Connection, None] = OrderedDict()
@@ -60,31 +60,31 @@ class Connections:
         metrics.registry.register(_Gauges(self))
 
     def __len__(self) -> int:
-        """Connections that are served."""
+        """The number of connections that are served."""
         return len(self._open)
 
     @property
     def waiting(self) -> int:
-        """Those without a request under way."""
+        """The number of connections without a request under way."""
         return len(self._waiting)
 
     @property
     def streams(self) -> int:
-        """WebSockets."""
+        """The number of open WebSockets."""
         return len(self._streams)
 
     def ended(self, reason: str) -> None:
-        """Count a connection that is ended; the reasons are words of ours, never a caller's."""
+        """Count a connection that the service ends; ``reason`` is one of a few fixed words."""
         self._ended.labels(reason).inc()
 
     def admit(self, connection: Connection, address: str) -> str | None:
-        """Take a new connection in, which waits for its first request.
+        """Register a new connection, which then waits for its first request.
 
-        Where there are too many, that which has waited longest for a request makes room: one whose caller is slow to
-        send, or has nothing to send.
+        If there are too many, the connection that has waited longest for a request is closed to make room.
 
         Returns:
-            None; or why it is not served: "surplus", or "flood" where not even that can be told.
+            None if the connection is served; "surplus" if it is to be refused with an answer; "flood" if it is to be
+            closed without one.
         """
         settings = self.settings
         most = settings.max_connections_per_address
@@ -112,20 +112,20 @@ class Connections:
         return False
 
     def wait(self, connection: Connection) -> None:
-        """The connection has no request under way any more."""
+        """Note that the connection has no request under way any more."""
         if connection in self._open:
             self._waiting[connection] = None
 
     def work(self, connection: Connection) -> None:
-        """The connection has a request under way."""
+        """Note that the connection has a request under way."""
         self._waiting.pop(connection, None)
 
     def stream(self, stream: object) -> None:
-        """A WebSocket was opened."""
+        """Note that a WebSocket was opened."""
         self._streams.add(stream)
 
     def leave(self, connection: Connection, stream: object = None) -> None:
-        """The connection is gone; more than once does nothing."""
+        """Forget a connection that is gone; calling it again does nothing."""
         self._surplus.discard(connection)
         self._streams.discard(stream)
         self._waiting.pop(connection, None)
@@ -153,22 +153,10 @@ class _Gauges(Collector):
         yield gauge
 
 
-def patient(listener: socket.socket, settings: Settings) -> None:
-    """Let the system end connections, of all that come over ``listener``, whose other end is gone without a word."""
-    seconds = max(1, round(settings.write_timeout))
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # what was written and is not taken
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 2000 * seconds)
-    if hasattr(socket, "TCP_KEEPIDLE"):  # nothing was written
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, max(1, seconds))
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, max(1, seconds // 3))
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-
-
 def untaken(transport: asyncio.Transport) -> int:
-    """Bytes that were written and that the other end has not taken: those that wait here, and in the system's buffer.
+    """The number of written bytes that the client has not acknowledged, in this process and in the system's buffer.
 
-    The latter goes down bit by bit where the former does in pieces of up to megabytes.
+    The system's buffer is included because it shrinks steadily, while ours shrinks in steps of up to megabytes.
     """
     size = transport.get_write_buffer_size()
     if sys.platform.startswith("linux"):

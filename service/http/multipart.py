@@ -1,4 +1,4 @@
-"""multipart/form-data, read as it arrives and held in memory, with a limit on each part and on their number."""
+"""A parser of multipart/form-data that reads a form as it arrives, with limits on its parts and on their number."""
 
 from __future__ import annotations
 
@@ -17,10 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Part:
-    """One part of a form.
-
-    ``data`` is empty where the part was ``oversized``: its bytes were not kept.
-    """
+    """One part of a form.  ``data`` is empty if the part was ``oversized``, because its bytes were not kept."""
 
     name: str = ""
     filename: str | None = None
@@ -37,22 +34,22 @@ class _OpenPart:
 
 
 class FormReader:
-    """Feeds on chunks, gives parts.
+    """Parses the chunks of a form into parts.
 
     Args:
-        content_type: value of the request's Content-Type header.
-        max_parts: most parts.
+        content_type: the value of the request's Content-Type header.
+        max_parts: most parts of the form.
         max_part_bytes: most bytes of one part.
 
     Raises:
-        MalformedBody: the header names no boundary.
+        MalformedBody: the header gives no boundary, or one that cannot be used.
     """
 
     def __init__(self, content_type: str, max_parts: int, max_part_bytes: int) -> None:
         _, options = parse_options_header(content_type)
         boundary = options.get(b"boundary")
         if not boundary:
-            raise MalformedBody("The multipart content type names no boundary.")
+            raise MalformedBody("The Content-Type gives no multipart boundary.")
         self.parts: list[Part] = []
         self._max_parts, self._max_part_bytes = max_parts, max_part_bytes
         self._part = _OpenPart()
@@ -73,22 +70,22 @@ class FormReader:
             raise MalformedBody(f"The multipart boundary cannot be used: {error}") from error
 
     def feed(self, chunk: bytes) -> None:
-        """Take the next bytes.
+        """Parse the next bytes.
 
         Raises:
-            MalformedBody: they are not multipart.
+            MalformedBody: the bytes are not those of a multipart form.
             BodyTooLarge: there are more parts than the limit.
         """
         try:
             self._parser.write(chunk)
         except FormParserError as error:
-            raise MalformedBody(f"The body is not the multipart form that it says it is: {error}.") from error
+            raise MalformedBody(f"The body is not a valid multipart form: {error}.") from error
 
     def close(self) -> list[Part]:
-        """All parts, once everything was fed.
+        """All parts; call it after the last chunk.
 
         Raises:
-            MalformedBody: the closing boundary is missing: the form was cut short.
+            MalformedBody: the closing boundary is missing, so the form was cut short.
         """
         if not self._ended:
             raise MalformedBody("The multipart form ends before its closing boundary.")
@@ -136,11 +133,11 @@ class FormReader:
 
 
 async def read_form(chunks: AsyncIterator[bytes], content_type: str, max_parts: int, max_part_bytes: int) -> list[Part]:
-    """The parts of a form, in their order.
+    """Read all parts of a form, in order.
 
     Raises:
-        MalformedBody: it is not multipart, or cut short.
-        BodyTooLarge: it has too many parts.
+        MalformedBody: the body is not a valid form, or was cut short.
+        BodyTooLarge: the form has too many parts.
     """
     reader = FormReader(content_type, max_parts, max_part_bytes)
     async for chunk in chunks:

@@ -1,10 +1,8 @@
-"""How bodies that are read by hand stand in the OpenAPI document, and what every operation can answer."""
+"""The OpenAPI document: bodies that routes parse themselves, common problems, required roles, and links."""
 
 from __future__ import annotations
 
-import json
-import sys
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Any
 
 from fastapi import FastAPI
@@ -12,27 +10,23 @@ from fastapi.openapi.utils import get_openapi
 from pydantic import BaseModel
 
 from core import errors
-from service.access.roles import FORGOTTEN, OPERATIONS, Rule, needs
+from service.access.roles import OPERATIONS, UNLISTED, Rule, needs
 from service.errors import faults
 from service.errors.problems import MEDIA_TYPE, Problem, document_problems, problem_examples
-from service.http.links import tell_links
-from service.http.parameters import BatchItem
 from service.http.uploads import FORM, FORMATS
-from service.maps.calibration_schemas import CalibrationOrder
-from service.settings import Settings
 
 BINARY = {"type": "string", "format": "binary"}
 NAMED = {"minLength": 1}
-"""Parts of a form have names."""
+"""Every part of a form has a name."""
 
 COMPONENT = "#/components/schemas/"
 REQUEST_ID = {
-    "description": "Taken from the request or made; it stands in the log.",
+    "description": "The id of the request: the one that it was sent with, or a new one. It is also in the log.",
     "schema": {"type": "string"},
 }
 
-# What all operations of a group can answer with, in one place: whoever adds a layer before all resources (keys, rates,
-# limits of the connection) names its problems here, once, and no route has to.  A route names only its own.
+# The problems that all operations of a group have in common.  Those of a layer before all resources (keys, rates, the
+# limits of a connection) are named here, so that a route names only its own.
 COMMON: tuple[type[Exception], ...] = (
     faults.MalformedHead,
     faults.HeadTooSlow,
@@ -44,7 +38,7 @@ COMMON: tuple[type[Exception], ...] = (
 """Problems of every operation."""
 
 COMMON_V1: tuple[type[Exception], ...] = (faults.InvalidRequest,)
-"""Of every operation under /v1: its parameters can be wrong at least."""
+"""Problems of every operation under /v1."""
 
 COMMON_OF_BODIES: tuple[type[Exception], ...] = (
     faults.MalformedBody,
@@ -52,7 +46,7 @@ COMMON_OF_BODIES: tuple[type[Exception], ...] = (
     faults.MemoryFull,
     faults.DeadlineExceeded,
 )
-"""Of every operation that takes a body."""
+"""Problems of every operation that takes a body."""
 
 COMMON_OF_MAPS: tuple[type[Exception], ...] = (
     errors.UnknownMap,
@@ -60,14 +54,14 @@ COMMON_OF_MAPS: tuple[type[Exception], ...] = (
     errors.StorageFailure,
     errors.MapQuarantined,
 )
-"""Of every operation on one map."""
+"""Problems of every operation on one map."""
 
 
 SECURITY_SCHEME = {
     "type": "http",
     "scheme": "bearer",
-    "description": "A key of this service, `placerec_…`. Asked for as soon as one was ever created; without keys, "
-    "requests from pages of elsewhere are refused.",
+    "description": "A key of this service, `placerec_…`. It is needed as soon as a key was ever created. Without "
+    "keys, requests from web pages of other sites are refused.",
 }
 
 
@@ -81,7 +75,7 @@ def _access_problems(rule: Rule) -> list[type[Exception]]:
 
 
 def _tell_access(operation: dict[str, Any], rule: Rule) -> None:
-    """Say what key an operation needs; without any keys it needs none."""
+    """Document what key an operation needs."""
     operation["x-role"] = rule.role
     operation["security"] = [] if rule.role == "open" else [{"key": []}, {}]
     if rule.role != "open":
@@ -102,12 +96,15 @@ def _form_fields(parameters: type[BaseModel]) -> dict[str, Any]:
 
 
 def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
-    """The body of an operation on one frame: raw, or a form with the parameters as fields."""
+    """The body of an operation on one frame: the raw frame, or a form with the parameters as fields."""
     form = {
         "type": "object",
         "propertyNames": NAMED,
         "required": ["image"],
-        "properties": {"image": {**BINARY, "description": "The frame; any name will do."}, **_form_fields(parameters)},
+        "properties": {
+            "image": {**BINARY, "description": "The frame; its part may have any name."},
+            **_form_fields(parameters),
+        },
     }
     content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
     content[FORM] = {"schema": form, "encoding": {"image": {"contentType": ", ".join(FORMATS)}}}
@@ -115,12 +112,12 @@ def frame_body(parameters: type[BaseModel]) -> dict[str, Any]:
 
 
 def frames_body(parameters: type[BaseModel]) -> dict[str, Any]:
-    """The body of an operation on the frames of one moment: a raw one, or a form of one part for each camera."""
+    """The body of an operation on the frames of one moment: a raw frame, or a form with one part for each camera."""
     form = {
         "type": "object",
         "propertyNames": NAMED,
         "properties": _form_fields(parameters),
-        "additionalProperties": {**BINARY, "description": "One camera's frame, under any name."},
+        "additionalProperties": {**BINARY, "description": "The frame of one camera, under any name."},
     }
     content: dict[str, Any] = {kind: {"schema": BINARY} for kind in FORMATS}
     content[FORM] = {"schema": form}
@@ -140,7 +137,7 @@ def form_body(description: str, properties: dict[str, Any], required: list[str])
 
 
 def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
-    """The body of an edit may also say that it is a merge patch."""
+    """The body of an edit, which may also have the content type of a merge patch."""
     schema = {"$ref": COMPONENT + changes.__name__}
     return {"requestBody": {"content": {"application/merge-patch+json": {"schema": schema}}}}
 
@@ -148,11 +145,11 @@ def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
 def _complete(path: str, operation: dict[str, Any]) -> None:
     responses = operation["responses"]
     invalid = responses.get("422", {}).get("content", {}).get("application/json")
-    if invalid is not None:  # the framework's own form of validation errors, which is never sent
+    if invalid is not None:  # the framework's own format of validation errors, which is never sent
         del responses["422"]["content"]["application/json"]
         if not responses["422"]["content"]:
             del responses["422"]
-    rule = OPERATIONS.get(operation["operationId"], FORGOTTEN)
+    rule = OPERATIONS.get(operation["operationId"], UNLISTED)
     _tell_access(operation, rule)
     document_problems(responses, _common_problems(path, operation, rule), str)
     tell_links(operation)
@@ -164,8 +161,12 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
 
 
-def document(app: FastAPI) -> dict[str, Any]:
-    """The application's OpenAPI document; made once."""
+def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
+    """The application's OpenAPI document; it is made once and kept.
+
+    Args:
+        models: models of bodies that routes parse themselves, which the framework therefore does not find.
+    """
     if app.openapi_schema is None:
         made = get_openapi(
             title=app.title,
@@ -176,7 +177,8 @@ def document(app: FastAPI) -> dict[str, Any]:
             routes=app.routes,
         )
         schemas = made["components"]["schemas"]
-        for model in (Problem, BatchItem, CalibrationOrder):
+        unseen: list[type[BaseModel]] = [Problem, *models]
+        for model in unseen:
             described = model.model_json_schema(ref_template=COMPONENT + "{model}")
             schemas.update(described.pop("$defs", {}))
             schemas[model.__name__] = described
@@ -192,13 +194,59 @@ def document(app: FastAPI) -> dict[str, Any]:
     return app.openapi_schema
 
 
-def write_document(path: Path) -> None:
-    """Write the document of an application with default settings."""
-    from service.app.application import create_app  # the application is made of routes, which need this module
+_MAP = {"map": "$request.path.map"}
+_MADE_MAP = {"map": "$response.body#/id"}
+_PLACE = _MAP | {"place": "$request.path.place"}
+_CAMERA = _MAP | {"camera": "$request.path.camera"}
+_SESSION = _MAP | {"session": "$response.body#/id"}
+_SAME_SESSION = _MAP | {"session": "$request.path.session"}
+_MADE_JOB = {"job": "$response.body#/id"}
+_JOB = {"job": "$request.path.job"}
 
-    made = document(create_app(Settings(host="127.0.0.1")))
-    path.write_text(json.dumps(made, indent=2, ensure_ascii=False) + "\n")
+LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
+    "create_map": {
+        "201": dict.fromkeys(
+            (
+                "read_map",
+                "edit_map",
+                "delete_map",
+                "verify_map",
+                "list_places",
+                "query",
+                "create_session",
+                "list_cameras",
+                "check_health",
+                "reencode_map",
+                "prune_map",
+                "calibrate_map",
+            ),
+            _MADE_MAP,
+        )
+    },
+    "delete_map": {"204": dict.fromkeys(("read_map", "list_places"), _MAP)},
+    "enrol_place": {
+        "201": dict.fromkeys(("read_place", "edit_place", "see_thumbnail", "forget_place"), _PLACE)
+        | dict.fromkeys(("query", "list_places", "list_sequences"), _MAP)
+    },
+    "forget_place": {"204": {"read_place": _PLACE}},
+    "put_camera": {"201": dict.fromkeys(("read_camera", "forget_camera"), _CAMERA)},
+    "forget_camera": {"204": {"read_camera": _CAMERA}},
+    "create_session": {"201": dict.fromkeys(("send_frame", "read_session", "delete_session"), _SESSION)},
+    "delete_session": {"204": {"read_session": _SAME_SESSION}},
+    "reencode_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
+    "prune_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
+    "merge_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
+    "cancel_job": {"200": {"read_job": _JOB}},
+}
+"""The links of the document: for an operation and a status, which operations can follow and with which parameters.
+
+The parameters are runtime expressions of OpenAPI.
+"""
 
 
-if __name__ == "__main__":
-    write_document(Path(sys.argv[1]))
+def tell_links(operation: dict[str, Any]) -> None:
+    """Add an operation's links to its OpenAPI ``responses``."""
+    for status, targets in LINKS.get(operation["operationId"], {}).items():
+        operation["responses"][status]["links"] = {
+            target: {"operationId": target, "parameters": parameters} for target, parameters in targets.items()
+        }

@@ -10,26 +10,27 @@ from typing import Any
 from starlette.requests import Request
 
 from core.errors import EmptyImage, ImageTooLarge
-from core.frames.images import read_header
+from core.frames.containers import read_header
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part, read_form
 from service.settings import Settings
 
 FORMATS = {"image/jpeg": "jpeg", "image/png": "png", "image/webp": "webp"}
-UNTOLD = (None, "application/octet-stream")
-"""What a form's part may say that knows no better; the bytes decide."""
+UNSPECIFIC = (None, "application/octet-stream")
+"""Content types of a part that do not say which format it has; its first bytes decide."""
 
 FORM = "multipart/form-data"
 FORM_ALLOWANCE = 256 * 1024
 """Bytes that a form may have besides its frames: boundaries, headers, fields."""
 
 FIELD_PARTS = 16
+"""Parts that a form may have besides its frames."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture as it was sent, not decoded yet, and the form fields beside it."""
+    """A frame as it was sent, not decoded yet, and the form fields that came with it."""
 
     data: bytes
     fields: Mapping[str, str]
@@ -41,29 +42,29 @@ def media_type(request: Request) -> str:
 
 
 def check_frame(data: bytes, content_type: str | None) -> None:
-    """See from the first bytes whether they can be a frame, of the type that was announced.
+    """Check from the first bytes that data can be a frame, and that it has the format of its content type.
 
-    Bytes of another format than the content type says are refused even when they could be decoded:
-    the sender is wrong about what it sends, and had better know.
+    Another format than the content type says is refused even if it could be decoded, because the sender is wrong
+    about what it sends.
 
     Raises:
-        InvalidImage: no bytes, or not those of a JPEG, PNG or WebP file.
-        UnsupportedMediaType: the content type is of no such file, or of another one.
+        InvalidImage: there are no bytes, or they are not those of a JPEG, PNG or WebP file.
+        UnsupportedMediaType: the content type is of no such file, or of another format.
     """
-    if content_type not in UNTOLD and content_type not in FORMATS:
-        raise UnsupportedMediaType(f"A frame is sent as {', '.join(FORMATS)}, not as {str(content_type)[:80]}.")
+    if content_type not in UNSPECIFIC and content_type not in FORMATS:
+        raise UnsupportedMediaType(f"Send a frame as {', '.join(FORMATS)}, not as {str(content_type)[:80]}.")
     if not data:
         raise EmptyImage("The frame has no bytes.")
     found = read_header(data).format
-    if content_type not in UNTOLD and FORMATS[content_type] != found:
-        raise UnsupportedMediaType(f"The frame is sent as {content_type}, but its bytes are those of a {found} file.")
+    if content_type not in UNSPECIFIC and FORMATS[content_type] != found:
+        raise UnsupportedMediaType(f"The content type is {content_type}, but the bytes are those of a {found} file.")
 
 
 def check_part(part: Part, settings: Settings) -> None:
-    """The same for a part of a form.
+    """Check a part of a form as :func:`check_frame` does.
 
     Raises:
-        ImageTooLarge: it has too many bytes.
+        ImageTooLarge: the part has too many bytes.
         InvalidImage, UnsupportedMediaType: as for ``check_frame``.
     """
     if part.oversized:
@@ -72,24 +73,23 @@ def check_part(part: Part, settings: Settings) -> None:
 
 
 async def read_frame(request: Request, settings: Settings) -> Frame:
-    """One frame: the raw body, or the one file part of a form, whose other parts are its fields.
+    """Read one frame: the raw body, or the one file part of a form, whose other parts are its fields.
 
     Raises:
-        UnsupportedMediaType: the request is neither.
-        BodyTooLarge, MalformedBody: the body breaks a limit or its own form.
-        InvalidRequest: a form without just one file part, or with a field given twice.
+        UnsupportedMediaType: the content type is neither of a frame nor of a form.
+        BodyTooLarge, MalformedBody: the body breaks a limit, or is not a valid form.
+        InvalidRequest: the form does not have exactly one file part, or a field is given twice.
         InvalidImage: the bytes are not those of a frame.
     """
     kind = media_type(request)
     if kind == FORM:
         files, fields = split_form(await _read_parts(request, settings, 1))
         if len(files) != 1:
-            raise InvalidRequest(f"The form has {len(files)} file parts; send one frame.")
+            raise InvalidRequest(f"The form has {len(files)} file parts. Send exactly one frame.")
         check_part(files[0], settings)
         return Frame(files[0].data, fields)
     if kind not in FORMATS:
-        named = kind[:80] or "anything unnamed"
-        raise UnsupportedMediaType(f"A frame is sent as {', '.join(FORMATS)} or in a {FORM}, not as {named}.")
+        raise UnsupportedMediaType(f"Send a frame as {', '.join(FORMATS)} or in a {FORM} body{instead_of(kind)}.")
     intake_of(request).limit = settings.max_image_bytes
     data = await request.body()
     check_frame(data, kind)
@@ -97,22 +97,22 @@ async def read_frame(request: Request, settings: Settings) -> Frame:
 
 
 async def read_pair(request: Request, settings: Settings) -> tuple[bytes, bytes, Mapping[str, str]]:
-    """The frames in the parts ``a`` and ``b`` of a form, and its fields; errors as for ``read_frame``."""
+    """Read the frames in the parts ``a`` and ``b`` of a form, and its fields; it raises what ``read_frame`` raises."""
     files, fields = split_form(await _read_form(request, settings, 2))
     found = {part.name: part for part in files}
     if len(files) != 2 or set(found) != {"a", "b"}:
-        raise InvalidRequest("The form needs two file parts, named a and b.")
+        raise InvalidRequest("The form needs exactly two file parts, named a and b.")
     for part in files:
         check_part(part, settings)
     return found["a"].data, found["b"].data, fields
 
 
 async def read_many(request: Request, settings: Settings) -> list[Part]:
-    """The parts of a form of many frames, unchecked: one that is bad shall fail alone.
+    """Read the parts of a form of many frames.  They are not checked here, so that a bad one fails alone.
 
     Raises:
-        UnsupportedMediaType: not a form.
-        BodyTooLarge, MalformedBody: the body breaks a limit or its own form.
+        UnsupportedMediaType: the body is not a form.
+        BodyTooLarge, MalformedBody: the body breaks a limit, or is not a valid form.
     """
     return await _read_form(request, settings, settings.max_batch_items)
 
@@ -120,8 +120,13 @@ async def read_many(request: Request, settings: Settings) -> list[Part]:
 async def _read_form(request: Request, settings: Settings, frames: int) -> list[Part]:
     kind = media_type(request)
     if kind != FORM:
-        raise UnsupportedMediaType(f"The frames are sent in a {FORM}, not as {kind[:80] or 'anything unnamed'}.")
+        raise UnsupportedMediaType(f"Send the frames in a {FORM} body{instead_of(kind)}.")
     return await _read_parts(request, settings, frames)
+
+
+def instead_of(kind: str) -> str:
+    """The end of a sentence that tells which content type is wanted: what the request has instead."""
+    return f", not as {kind[:80]}" if kind else "; the request has no Content-Type"
 
 
 async def _read_parts(request: Request, settings: Settings, frames: int) -> list[Part]:
@@ -131,17 +136,17 @@ async def _read_parts(request: Request, settings: Settings, frames: int) -> list
 
 
 def is_file(part: Part) -> bool:
-    """Whether a part is a frame rather than a field: it has a file name, or says it is neither text nor JSON."""
+    """Whether a part is a file rather than a field: it has a file name, or a content type other than text and JSON."""
     if part.filename is not None or part.content_type is None:
         return part.filename is not None
     return not part.content_type.startswith("text/") and part.content_type != "application/json"
 
 
 def split_form(parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
-    """File parts, and fields by name.
+    """Split a form into its file parts and its fields by name.
 
     Raises:
-        InvalidRequest: a field stands twice, is too large, or is not UTF-8.
+        InvalidRequest: a field is given twice, is too large, or is not UTF-8.
     """
     files: list[Part] = []
     fields: dict[str, str] = {}
@@ -149,7 +154,7 @@ def split_form(parts: Iterable[Part]) -> tuple[list[Part], dict[str, str]]:
         if is_file(part):
             files.append(part)
         elif part.name in fields:
-            raise InvalidRequest(f"The field {part.name[:80]!r} stands in the form twice.")
+            raise InvalidRequest(f"The form has the field {part.name[:80]!r} twice.")
         elif part.oversized or len(part.data) > FORM_ALLOWANCE:
             raise InvalidRequest(f"The field {part.name[:80]!r} is too large.")
         else:
@@ -165,28 +170,28 @@ def _text(part: Part) -> str:
 
 
 def json_part(parts: Iterable[Part], name: str) -> tuple[Any, list[Part]]:
-    """The value of the one JSON part ``name``, and the other parts.
+    """The parsed value of the JSON part ``name``, and the other parts.
 
     Raises:
-        InvalidRequest: there is none, or more than one.
-        MalformedBody: it is not JSON.
+        InvalidRequest: there is no such part, or more than one.
+        MalformedBody: the part is not JSON.
     """
     chosen = [part for part in parts if part.name == name]
     if len(chosen) != 1 or chosen[0].oversized:
-        raise InvalidRequest(f"The form needs one JSON part named {name!r}.")
+        raise InvalidRequest(f"The form needs exactly one JSON part named {name!r}.")
     return parse_json(chosen[0].data, f"The part {name!r}"), [part for part in parts if part.name != name]
 
 
 def parse_metadata(text: str) -> dict[str, Any]:
-    """Metadata given as JSON text in a parameter.
+    """Parse metadata that is given as JSON text in a parameter.
 
     Raises:
-        InvalidRequest: it is not a JSON object.
+        InvalidRequest: the text is not a JSON object.
     """
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
-        raise InvalidRequest("metadata: it is not JSON.") from None
+        raise InvalidRequest("metadata: the value is not valid JSON.") from None
     if not isinstance(value, dict):
-        raise InvalidRequest("metadata: it is not a JSON object.")
+        raise InvalidRequest("metadata: the value is not a JSON object.")
     return value

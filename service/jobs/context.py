@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
+from core.frames.masks import Mask
 from core.storage import Atlas, Map
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
+from service.errors.faults import ClientGone
 from service.jobs.records import Job
-
-if TYPE_CHECKING:
-    from service.jobs.jobs import Jobs
 
 Work = Callable[["JobContext"], Mapping[str, Any]]
 """What a job does; its result is an object of JSON."""
@@ -39,10 +42,21 @@ SLICE_SECONDS = 5.0
 """So long a job that can be taken up again works before it gives way to those that wait."""
 
 
+class Supervisor(Protocol):
+    """What a job reports to, and asks whether it is to stop: all jobs together (:class:`service.jobs.jobs.Jobs`)."""
+
+    stopping: bool
+
+    def get(self, job_id: str) -> Job: ...
+    def others_wait(self, job_id: str) -> bool: ...
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None: ...
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None: ...
+
+
 class JobContext:
     """What a job knows of itself while it runs, in the thread that runs it."""
 
-    def __init__(self, jobs: Jobs, job: Job) -> None:
+    def __init__(self, jobs: Supervisor, job: Job) -> None:
         self._jobs, self._written, self._noticed = jobs, time.monotonic(), 0.0
         self._began = time.monotonic()
         self.id, self.map_id, self.arguments = job.id, job.map_id, job.arguments
@@ -71,7 +85,7 @@ class JobContext:
         writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
         self._written = now if writing else self._written
         self._noticed = now if noticing else self._noticed
-        self._jobs._progress(self.id, writing, noticing, done=done, total=total, message=message[:500])
+        self._jobs.report(self.id, writing, noticing, done=done, total=total, message=message[:500])
 
     def remember(self, **notes: Any) -> None:
         """Write down, on disk when this returns, what the next attempt needs besides the arguments; JSON.
@@ -80,12 +94,17 @@ class JobContext:
             StorageFull, StorageFailure.
         """
         self.notes = {**self.notes, **notes}
-        self._jobs._note(self.id, self.notes)
+        self._jobs.note(self.id, self.notes)
 
     @property
     def cancelled(self) -> bool:
         """Somebody has asked the job to stop."""
         return self._jobs.get(self.id).cancelling
+
+    @property
+    def is_to_stop(self) -> bool:
+        """Whether the job was cancelled, or the service stops."""
+        return self._jobs.stopping or self.cancelled
 
     def check_cancelled(self) -> None:
         """Return unless the job is to stop.
@@ -121,3 +140,66 @@ class JobContext:
 def born(map_: Map) -> str:
     """What tells a map from later ones of the same id: when it was created."""
     return map_.record.created_at.isoformat()
+
+
+Result = TypeVar("Result")
+
+POLL_SECONDS = 0.2
+"""A job that is to stop gives its frames up within this time."""
+
+STANDING_BACK_SECONDS = 1.0
+"""While requests wait for the encoder a job holds its frames back, but not for longer: it is to end some day."""
+
+LONGEST_SECONDS = 3600.0
+
+
+def stand_back(engine: Engine, context: JobContext) -> None:
+    """Wait while requests wait for the encoder, up to a bound.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+    until = time.monotonic() + STANDING_BACK_SECONDS
+    context.check_cancelled()
+    while engine.queue.waiting and time.monotonic() < until:
+        context.pause(0.01)
+
+
+def run_behind(engine: Engine, context: JobContext, work: Callable[[Patience], Coroutine[Any, Any, Result]]) -> Result:
+    """Run a coroutine that waits for the encoder, behind the requests that wait for it; blocks the job's thread.
+
+    Args:
+        work: what to run, with the patience of the job: it ends when the job is to stop.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+
+    async def stopped() -> None:
+        while not context.is_to_stop:
+            await asyncio.sleep(POLL_SECONDS)
+
+    stand_back(engine, context)
+    patience = Patience(time.monotonic() + LONGEST_SECONDS, stopped)
+    try:
+        return asyncio.run_coroutine_threadsafe(work(patience), engine.loop).result()
+    except ClientGone:
+        context.check_cancelled()
+        raise
+
+
+def encode_behind(
+    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
+) -> list[Encoded | Exception]:
+    """What becomes of frames, in their order, without their pixels; blocks the job's thread.
+
+    They take no place in the queue, which is for requests, and join forward passes as bulk does.
+
+    Raises:
+        JobCancelled, JobInterrupted.
+    """
+
+    async def encode(patience: Patience) -> list[Encoded | Exception]:
+        return await engine.encode_all(identity, frames, patience, masks)
+
+    return run_behind(engine, context, encode)

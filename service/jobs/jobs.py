@@ -239,7 +239,7 @@ class Jobs:
     def _work(self) -> None:
         while (job := self._take()) is not None:
             if job.id not in self._gaveway:  # else that it began was told
-                note_job(job, "running")
+                _note(job, "running")
             try:
                 self._do(job)
             except Exception:  # a defect of ours: the job is told as failed, and the worker goes on
@@ -319,7 +319,7 @@ class Jobs:
 
     # Changes
 
-    def _progress(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
         if writing:
             self._change(job_id, **progress)
             return
@@ -330,7 +330,7 @@ class Jobs:
         if noticing:
             self._notify(job_id)
 
-    def _note(self, job_id: str, notes: Mapping[str, Any]) -> None:
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None:
         with self._changed:
             job = replace(self._jobs[job_id], notes=dict(notes))
             self._records.put(job)
@@ -344,7 +344,7 @@ class Jobs:
             for job in past:
                 del self._jobs[job.id]
             ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
-            note_job(ended, state)
+            _note(ended, state)
             self._works.pop(job_id, None)
             self._gaveway.pop(job_id, None)
             self._changed.notify_all()  # another one of the same map may run
@@ -376,3 +376,9 @@ class Jobs:
 
 def _problem(error: Exception) -> dict[str, Any]:
     return problem_of(error).model_dump(exclude_none=True)
+
+
+def _note(job: Job, event: str) -> None:
+    """Write a line of the audit trail about a job."""
+    line = {"job": job.id, "kind": job.kind, "map": job.map_id, "attempt": job.attempt}
+    note_job(event, line, job.arguments, job.problem, job.asker)

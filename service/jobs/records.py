@@ -13,11 +13,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from core.disk.files import Damage, disk_errors
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, TooNew
 from core.errors import DataDirectoryTooNew
-from core.storage.files.disk import Damage, refusals
 
 FILE = "jobs.sqlite"
-VERSION = 3
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
@@ -50,11 +50,15 @@ _TABLE = """CREATE TABLE jobs (
     asker TEXT NOT NULL DEFAULT '{}'
 ) STRICT"""
 
-_MIGRATIONS = {
-    1: "ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'",
-    2: "ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'",
-}
-"""From a version to the next one."""
+_SCHEMA = Schema(
+    application_id=0,
+    version=3,
+    create=[_TABLE],
+    migrations={
+        1: ["ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'"],
+        2: ["ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'"],
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Job:
     problem: why it failed, as a problem object.
     maps: the maps that it was asked for, by id, and when each was created: one of the same id that was created at
         another time is another map.
-    asker: who asked for it, as ``service.access.principals.Asker`` has it; for the audit trail.
+    asker: who asked for it, as ``service.access.audit.Asker`` has it; for the audit trail.
     """
 
     number: int
@@ -116,10 +120,10 @@ class JobRecords:
     """
 
     def __init__(self, directory: Path) -> None:
-        """Open the file of a data directory that this process holds.
+        """Open the file in a data directory that this process has locked.
 
-        One that is damaged is put aside: jobs are work to be done again, not what the maps hold.  What can still be
-        read of it is kept, as jobs that cannot go on.
+        A damaged file is put aside, because jobs can be submitted again and maps do not depend on them.  What can
+        still be read of it is kept as jobs that cannot go on.
 
         Raises:
             DataDirectoryTooNew: a later version of placerec wrote it.
@@ -128,19 +132,19 @@ class JobRecords:
         self._lock = threading.Lock()
         self.put_aside: str | None = None
         """Under which name the file was put aside because it was damaged, if it was."""
-        path = directory / FILE
-        with refusals(f"open {path}"):
+        readable = f"SELECT {', '.join(_NAMES)} FROM jobs"
+        file = SqliteFile(directory / FILE, _SCHEMA, {**DURABLE, "journal_size_limit": 1 << 20}, [readable])
+        with disk_errors(f"open {file.path}", FILE):
             try:
-                self._connection = _open(path)
+                self._connection = file.open()
+            except TooNew as error:
+                raise DataDirectoryTooNew(
+                    f"{file.path} was written by a later version of placerec (schema {error.version})."
+                ) from error
             except Damage as damage:
-                aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
-                log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, damage)
-                salvaged = _salvaged(path)
-                path.rename(aside)
-                for suffix in ("-wal", "-shm"):
-                    with suppress(FileNotFoundError):
-                        path.with_name(FILE + suffix).unlink()
-                self._connection, self.put_aside = _open(path), aside.name
+                salvaged = _salvaged(file.path)
+                self.put_aside = file.put_aside(damage).name
+                self._connection = file.open()
                 for job in salvaged:
                     with suppress(sqlite3.IntegrityError, sqlite3.ProgrammingError, ValueError, TypeError):
                         self.put(job)  # unless nothing that a job can be is left of it
@@ -152,7 +156,7 @@ class JobRecords:
 
     def read(self) -> list[Job]:
         """All jobs, the oldest first."""
-        with self._lock, refusals("read the jobs"), closing(self._connection.cursor()) as cursor:
+        with self._lock, disk_errors("read the jobs"), closing(self._connection.cursor()) as cursor:
             cursor.execute("SELECT * FROM jobs ORDER BY number")
             names = [column[0] for column in cursor.description]
             return [_readable(dict(zip(names, values, strict=True))) for values in cursor.fetchall()]
@@ -161,75 +165,28 @@ class JobRecords:
         """Write a job, new or changed."""
         columns = _columns(job)
         names, marks = ", ".join(columns), ", ".join("?" * len(columns))
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"INSERT OR REPLACE INTO jobs ({names}) VALUES ({marks})", tuple(columns.values()))
 
     def update(self, job: Job) -> None:
         """Write what changes of a job as it goes on: all but its arguments and notes, which may be long."""
         columns = {name: value for name, value in _columns(job).items() if name not in ("arguments", "notes")}
         assignments = ", ".join(f"{name} = ?" for name in columns)
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"UPDATE jobs SET {assignments} WHERE number = ?", (*columns.values(), job.number))
 
     def forget(self, numbers: list[int]) -> None:
         """Delete jobs."""
-        with self._lock, refusals("forget a job"):
+        with self._lock, disk_errors("forget a job"):
             self._connection.execute(
                 "DELETE FROM jobs WHERE number IN (SELECT value FROM json_each(?))", (json.dumps(numbers),)
             )
 
     def last_number(self) -> int:
         """The largest number that a job ever had; 0 if there was none."""
-        with self._lock, refusals("read the jobs"):
+        with self._lock, disk_errors("read the jobs"):
             found = self._connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'jobs'").fetchone()
         return 0 if found is None else int(found[0])
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    """A connection to the file, which is made if it is not there.
-
-    Raises:
-        Damage: it is no database, or not one of ours.
-    """
-    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA journal_size_limit = 1048576")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version > VERSION:
-            raise DataDirectoryTooNew(f"{path} was written by a later version of placerec (schema {version}).")
-        if version == 0:
-            if connection.execute("SELECT 1 FROM sqlite_schema").fetchone():
-                raise Damage("it holds tables that are not ours")
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_TABLE)
-            connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
-        for old in range(version or VERSION, VERSION):
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_MIGRATIONS[old])
-            connection.execute(f"PRAGMA user_version = {old + 1}")
-            connection.execute("COMMIT")
-        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
-            if line != "ok":
-                raise Damage(line)
-        connection.execute(f"SELECT {', '.join(_NAMES)} FROM jobs").fetchall()  # can all of it be read?
-        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
-        connection.execute("UPDATE jobs SET id = id WHERE false")
-    except sqlite3.DatabaseError as error:
-        connection.close()
-        told = str(error)
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
-            raise  # the disk refuses
-        raise Damage(str(error)) from error
-    except UnicodeDecodeError as error:
-        connection.close()
-        raise Damage("its text is damaged") from error
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def _columns(job: Job) -> dict[str, Any]:

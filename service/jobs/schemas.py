@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.places import Timestamp
 from service.errors.problems import Problem
-from service.http.fields import Cursor
+from service.http.schemas import Cursor
 from service.jobs.records import Job, JobState
 
 JOB_EXAMPLE: dict[str, Any] = {

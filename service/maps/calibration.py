@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
@@ -18,15 +18,11 @@ from core.recognition.calibration import (
     second_traverse,
     warnings_on,
 )
-from core.recognition.localization import calibration_of
+from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
-from service.jobs.background import stand_back
-from service.jobs.jobs import JobContext
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
-from service.places.own_frames import load_encoder
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.engine.engine import Engine
+from service.jobs.context import JobContext, stand_back
+from service.maps.schemas import CalibrationOrder, CalibrationReport
 
 KIND = "calibrate"
 
@@ -115,7 +111,7 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         if done % TOGETHER == 0:
             stand_back(engine, context)
 
-    report = measured(map_, load_encoder(engine, map_), order, [], advance)
+    report = measured(map_, engine.load_encoder(map_), order, [], advance)
     told = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=told)

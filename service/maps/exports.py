@@ -18,9 +18,9 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from core.storage import Map
-from core.storage.archives.playback import CHUNK_BYTES, Playback
+from core.storage.archives.virtual_archive import CHUNK_BYTES, VirtualArchive
 from service.errors.faults import NotReady, TooManyExports
-from service.http.ranges import Slice
+from service.http.headers import Slice
 
 if TYPE_CHECKING:
     from service.settings import Settings
@@ -42,7 +42,7 @@ class Export:
 
     map: Map
     state: object
-    playback: Playback
+    archive: VirtualArchive
     users: int = 0
     used: float = 0.0
     timer: asyncio.TimerHandle | None = None
@@ -80,7 +80,7 @@ class Exports:
             UnknownMap, MapQuarantined: it was deleted meanwhile, or is damaged.
             StorageFull, StorageFailure.
         """
-        state = map_.capturing.state()
+        state = map_.exporter.state()
         for kept in self._kept.values():
             if kept.map is map_ and kept.state is state and state is not None:
                 return kept
@@ -113,22 +113,22 @@ class Exports:
             if self._closing:
                 raise NotReady("The service is stopping.", {"service": "it is stopping"})
 
-        def work() -> tuple[object, Playback]:
+        def work() -> tuple[object, VirtualArchive]:
             map_.open()
-            state = map_.capturing.state()  # before: a change in between is then told as one
-            return state, map_.capturing.into(folder, advance)
+            state = map_.exporter.state()  # before: a change in between is then told as one
+            return state, map_.exporter.into(folder, advance)
 
-        state, playback = await to_thread.run_sync(work, limiter=self._one)
+        state, archive = await to_thread.run_sync(work, limiter=self._one)
         seconds = round(time.perf_counter() - began, 3)
-        map_id = playback.manifest.map.id
-        noted = {"map": map_id, "places": playback.manifest.places, "bytes": playback.size, "seconds": seconds}
+        map_id = archive.manifest.map.id
+        noted = {"map": map_id, "places": archive.manifest.places, "bytes": archive.size, "seconds": seconds}
         log.info("export taken", extra=noted)
-        same = self._kept.get((map_id, playback.tag))
+        same = self._kept.get((map_id, archive.tag))
         if same is not None:  # the map is again, or still, what it was
             same.map, same.state = map_, state
-            await to_thread.run_sync(playback.discard)
+            await to_thread.run_sync(archive.discard)
         else:
-            same = self._kept[map_id, playback.tag] = Export(map_, state, playback)
+            same = self._kept[map_id, archive.tag] = Export(map_, state, archive)
         self._touch(same)
         return same
 
@@ -163,10 +163,10 @@ class Exports:
     def _discard(self, export: Export) -> None:
         if export.timer is not None:
             export.timer.cancel()
-        key = (export.playback.manifest.map.id, export.playback.tag)
+        key = (export.archive.manifest.map.id, export.archive.tag)
         if self._kept.get(key) is export:
             del self._kept[key]
-            asyncio.get_running_loop().run_in_executor(None, export.playback.discard)
+            asyncio.get_running_loop().run_in_executor(None, export.archive.discard)
 
     async def chunks(self, export: Export, part: Slice) -> AsyncIterator[bytes]:
         """The bytes of a part of it, read as they are sent.
@@ -177,7 +177,7 @@ class Exports:
         position = part.start
         while position < part.stop:
             most = min(CHUNK_BYTES, part.stop - position)
-            chunk = await to_thread.run_sync(export.playback.read, position, most, limiter=self._reading)
+            chunk = await to_thread.run_sync(export.archive.read, position, most, limiter=self._reading)
             position += len(chunk)
             yield chunk
 

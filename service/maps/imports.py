@@ -20,26 +20,27 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from anyio import CapacityLimiter
 
+from core.disk.files import Damage, disk_errors, sync_folder, write_at
 from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
-from core.frames.images import Limits, read_header
+from core.frames.containers import read_header
+from core.frames.images import Limits
 from core.places import check_map_id
 from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tar_layout import BLOCK
-from core.storage.files.disk import Damage, refusals, sync_folder, write_at
+from service.engine.engine import Engine
 from service.errors.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
 from service.http.bodies import in_pieces
 from service.jobs.context import JobContext
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job
+from service.maps.limits import check_free
 from service.worker_threads import to_its_end
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "import"
 FOLDER = "imports"
@@ -89,17 +90,17 @@ def wanted_digests(headers: Mapping[str, str]) -> list[bytes]:
 class Imports:
     """What arrives, and what waits for jobs."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, jobs: Jobs) -> None:
+        self._engine, self._jobs = engine, jobs
         self._folder = engine.settings.data_dir / FOLDER
         self._held: set[str] = set()
         """The files that are there, or are arriving."""
         self._building = CapacityLimiter(1)  # each writes as fast as the disk takes it
-        engine.jobs.register(KIND, self.run, self._discard)
+        jobs.register(KIND, self.run, self._discard)
 
     def clean(self) -> None:
         """Remove all but what jobs wait for, as a crash left it; call it before the jobs start."""
-        waited_for = {job.arguments.get("file") for job in self._engine.jobs.all() if not job.ended}
+        waited_for = {job.arguments.get("file") for job in self._jobs.all() if not job.ended}
         if self._folder.is_dir():
             for path in self._folder.iterdir():
                 if path.name not in waited_for:
@@ -164,7 +165,7 @@ class Imports:
         if manifest.places > self._engine.settings.max_places:
             raise TooManyPlaces(f"The file has {manifest.places} places of at most {self._engine.settings.max_places}.")
         name = record.id if map_id is None else map_id
-        self._engine.upkeep.check_free(check_map_id(name))
+        check_free(self._engine, self._jobs, check_map_id(name))
         return name
 
     async def build(self, arrived: Arrived) -> None:
@@ -195,7 +196,7 @@ class Imports:
         advance: Callable[[int, int], None],
         before_listing: Callable[[Archive], None] = lambda _archive: None,
     ) -> None:
-        with refusals("read what was sent"):
+        with disk_errors("read what was sent"):
             archive = Archive(self._folder / name)
         with archive:
             self.check_encoder(archive.manifest)
@@ -246,7 +247,7 @@ class Imports:
         """
         arguments = {"to": arrived.map_id, "file": arrived.name, "manifest": arrived.tag, "bytes": arrived.size}
         try:
-            return self._engine.jobs.submit(KIND, arrived.map_id, arguments=arguments)
+            return self._jobs.submit(KIND, arrived.map_id, arguments=arguments)
         except BaseException:
             self._remove(arrived.name)
             raise
@@ -299,7 +300,7 @@ class _Arriving:
 
     def open(self) -> None:
         path, announced = self._path, self._announced
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             path.parent.mkdir(exist_ok=True)
             # As a file and as a map it is there twice for a moment.
             if shutil.disk_usage(path.parent).free < 2 * announced:
@@ -313,7 +314,7 @@ class _Arriving:
         return self._found
 
     def add(self, data: bytes) -> None:
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             write_at(self._file, data, self.size)
         self._hash.update(data)
         self.size += len(data)
@@ -333,7 +334,7 @@ class _Arriving:
             raise DigestMismatch("The body does not have the SHA-256 that its header says.")
         if self._found is None:
             raise InvalidArchive(f"The file ends after {self.size} bytes, within its manifest.")
-        with refusals("take in a map"):
+        with disk_errors("take in a map"):
             os.fsync(self._file)
             os.rename(self._path, there)
             sync_folder(there.parent)

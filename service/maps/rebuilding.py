@@ -4,16 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import MapQuarantined
-from core.storage.search.reindexing import rebuild as rebuild_index
-from service.jobs.background import stand_back
-from service.jobs.context import born
-from service.jobs.jobs import JobContext
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.engine.engine import Engine
+from service.jobs.context import JobContext, born, stand_back
 
 REBUILD, VERIFY = "rebuild", "verify"
 
@@ -32,7 +27,7 @@ def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     Raises:
         UnknownMap, MapQuarantined, StorageFailure: the map is searched as before.
     """
-    status = rebuild_index(context.map(engine.atlas), _telling(engine, context))
+    status = context.map(engine.atlas).rebuild_index(_telling(engine, context))
     return {"index": status.model_dump(mode="json")}
 
 

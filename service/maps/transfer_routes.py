@@ -23,19 +23,23 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.bodies import StrictRoute, intake_of
-from service.http.dependencies import EngineDep, MapId, PrincipalDep, entity_tag, single_values
+from service.http.bodies import intake_of
+from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, single_values
+from service.http.headers import check_match, entity_tag, is_known, named_tags, wanted_slice
 from service.http.openapi import BINARY
-from service.http.parameters import Parameters
-from service.http.ranges import check_match, is_known, named_tags, wanted_slice
+from service.http.route_classes import StrictRoute
+from service.http.schemas import Parameters
 from service.http.uploads import media_type
-from service.jobs.routes import router as jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps.exports import MEDIA_TYPE, ExportResponse
-from service.maps.imports import wanted_digests
+from service.maps.exports import MEDIA_TYPE, ExportResponse, Exports
+from service.maps.imports import Imports, wanted_digests
+from service.maps.limits import check_free
 from service.maps.routes import show_map
 from service.maps.schemas import MapView
 from service.worker_threads import in_thread, to_its_end
+
+ExportsDep = Annotated[Exports, Depends(FromState("exports"))]
 
 router = APIRouter(prefix="/v1/maps", tags=["transfer"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
@@ -77,36 +81,36 @@ class ImportParameters(Parameters):
         **problem_documentation(ExportGone, RangeNotSatisfiable, TooManyExports, errors.StorageFull),
     },
 )
-async def export_map(map_id: MapId, request: Request, engine: EngineDep) -> Response:
+async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports: ExportsDep) -> Response:
     """Download a map as one file: a tar of its settings, places, descriptors, pictures and cameras.
 
-    The file is that of one moment, whatever is enrolled or deleted while it is on its way; `docs/backup.md` tells
-    what it holds. A download that broke off goes on with `Range` and `If-Range` (or `If-Match`), as long as that
-    moment is kept. `If-None-Match` answers 304 for a map that holds what it held. The SHA-256 of every part stands
-    in the manifest, that of the manifest in the ETag.
+    The file is that of one moment, whatever is enrolled or deleted while it is on its way;
+    `docs/reference/exports.md` tells what it holds. A download that broke off goes on with `Range` and `If-Range`
+    (or `If-Match`), as long as that moment is kept. `If-None-Match` answers 304 for a map that holds what it held.
+    The SHA-256 of every part stands in the manifest, that of the manifest in the ETag.
     """
-    export = engine.exports.find(map_id, named_tags(request.headers))
+    export = exports.find(map_id, named_tags(request.headers))
     if export is None:
-        export = await engine.exports.take(await engine.map(map_id))
-    playback = export.playback
+        export = await exports.take(await engine.map(map_id))
+    archive = export.archive
     headers = {
-        "ETag": f'"{playback.tag}"',
+        "ETag": f'"{archive.tag}"',
         "Accept-Ranges": "bytes",
         "Cache-Control": "private, no-cache",
         "Content-Disposition": f'attachment; filename="{map_id}.tar"',
     }
-    check_match(request.headers, playback.tag)
-    if is_known(request.headers, playback.tag):
+    check_match(request.headers, archive.tag)
+    if is_known(request.headers, archive.tag):
         return Response(status_code=304, headers=headers)
     # A range is of what GET gives (RFC 9110, section 14.2).
     alone = request.state.method == "HEAD"
-    part = wanted_slice({**request.headers, **({"range": ""} if alone else {})}, playback.tag, playback.size)
+    part = wanted_slice({**request.headers, **({"range": ""} if alone else {})}, archive.tag, archive.size)
     headers["Content-Length"] = str(part.stop - part.start)
     if alone:
         return Response(None, headers={**headers, "Content-Type": MEDIA_TYPE})
     if part.is_whole:
-        return ExportResponse(engine.exports, export, part, 200, headers)
-    return ExportResponse(engine.exports, export, part, 206, {**headers, "Content-Range": part.content_range})
+        return ExportResponse(exports, export, part, 200, headers)
+    return ExportResponse(exports, export, part, 206, {**headers, "Content-Range": part.content_range})
 
 
 BODY: dict[str, Any] = {
@@ -156,6 +160,8 @@ async def import_map(
     request: Request,
     options: Annotated[ImportParameters, Query()],
     engine: EngineDep,
+    jobs: JobsDep,
+    imports: Annotated[Imports, Depends(FromState("imports"))],
     principal: PrincipalDep,
 ) -> Response:
     """Bring a map that was exported, here or elsewhere; it is listed when all of it was checked, or not at all.
@@ -168,11 +174,11 @@ async def import_map(
     if kind not in MEDIA_TYPES:
         raise UnsupportedMediaType(f"A map is sent as {' or '.join(MEDIA_TYPES)}, not as {kind[:80] or 'nothing'}.")
     if options.background:
-        engine.jobs.check_room()
+        jobs.check_room()
     settings = engine.settings
     if options.id is not None:
         principal.require(options.id)
-        await in_thread(engine.upkeep.check_free, options.id)
+        await in_thread(check_free, engine, jobs, options.id)
     length = request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else 0
     if announced > settings.max_import_bytes:
@@ -181,17 +187,18 @@ async def import_map(
 
     def accept(manifest: Any) -> str:
         principal.require(options.id or str(manifest.map.id))  # first: whether there is one is not told to everybody
-        return engine.imports.check(manifest, options.id, options.encoder)
+        return imports.check(manifest, options.id, options.encoder)
 
-    arrived = await engine.imports.receive(request.stream(), announced, wanted_digests(request.headers), accept)
+    arrived = await imports.receive(request.stream(), announced, wanted_digests(request.headers), accept)
     request.state.noted = {"map": arrived.map_id, "manifest": arrived.tag}
-    root = engine.settings.root_path
     if options.background:
-        job = await to_its_end(lambda: engine.imports.submit(arrived))
-        shown = JobView.of(job).model_dump(mode="json")
-        return JSONResponse(shown, 202, {"Location": f"{root}{jobs.prefix}/{job.id}"})
-    await engine.imports.build(arrived)
+        job = await to_its_end(lambda: imports.submit(arrived))
+        return accepted(job, settings)
+    await imports.build(arrived)
     map_ = await engine.map(arrived.map_id)
     view = await in_thread(show_map, engine, map_)
-    headers = {"ETag": entity_tag(map_.record.revision), "Location": f"{root}{router.prefix}/{arrived.map_id}"}
+    headers = {
+        "ETag": entity_tag(map_.record.revision),
+        "Location": f"{settings.root_path}{router.prefix}/{arrived.map_id}",
+    }
     return JSONResponse(view.model_dump(mode="json"), 201, headers)

@@ -28,7 +28,7 @@ class Stage(IntEnum):
     BEGUN, ENCODED, STORED = range(3)
 
 
-class Succession:
+class BatchOrder:
     """Which batches are under way, and which are stored. Used from the event loop alone."""
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class Succession:
 class Sequel:
     """One batch in line."""
 
-    def __init__(self, line: Succession, map_id: str, batch: str | None, after: str | None, patience: Patience) -> None:
+    def __init__(self, line: BatchOrder, map_id: str, batch: str | None, after: str | None, patience: Patience) -> None:
         self._line, self._patience = line, patience
         self._map_id, self._batch, self._after = map_id, batch, after
 

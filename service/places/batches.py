@@ -14,9 +14,10 @@ from core.storage import Map
 from service.errors.faults import Fault, FrameNeeded, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import Problem, request_problem
 from service.http.multipart import Part
-from service.http.parameters import BatchItem, validated
+from service.http.schemas import validated
 from service.http.uploads import check_part
 from service.places.enrolment import Candidate
+from service.places.parameters import BatchItem
 from service.settings import Settings
 
 OWN_ERRORS = (

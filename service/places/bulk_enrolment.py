@@ -8,28 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.requests import Request
 
 from core.storage import Map
+from service.engine.engine import Engine
 from service.engine.queue import Patience
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.background import run_behind
-from service.jobs.context import born
-from service.jobs.jobs import JobContext
+from service.jobs.context import JobContext, born, run_behind
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job
 from service.places.batches import candidate_of, check_batch, check_own, given_id
 from service.places.enrolment import Candidate, Enrolled, enrol
-from service.places.staging import StagedForm, StagedPart
+from service.places.staging import StagedForm, StagedPart, Staging
 from service.worker_threads import to_its_end
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "enrol"
 
@@ -45,7 +42,7 @@ NAMED = 200
 PART = "places"
 
 
-async def receive(engine: Engine, map_: Map, request: Request) -> Job:
+async def receive(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request) -> Job:
     """Write a form down as it arrives, and let a job for it wait; both are on disk when this returns.
 
     Raises:
@@ -54,7 +51,7 @@ async def receive(engine: Engine, map_: Map, request: Request) -> Job:
             did not come whole.
         StorageFull, StorageFailure: nothing of it is left.
     """
-    engine.jobs.check_room()
+    jobs.check_room()
     if (kind := media_type(request)) != FORM:
         raise UnsupportedMediaType(f"The frames are sent in a {FORM}, not as {kind[:80] or 'anything unnamed'}.")
     settings, length = engine.settings, request.headers.get("content-length", "")
@@ -64,25 +61,25 @@ async def receive(engine: Engine, map_: Map, request: Request) -> Job:
     intake_of(request).pass_on(settings.max_bulk_bytes, settings.bulk_timeout)
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
-    name = await engine.staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, map_, name))
+    name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name))
 
 
-def _submit(engine: Engine, map_: Map, name: str) -> Job:
+def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str) -> Job:
     """Let a job wait for a form, which is removed if there comes none."""
     try:
-        count = len(_entries(engine, engine.staging.open(name))[0])
+        count = len(_entries(engine, staging.open(name))[0])
         maps = {map_.record.id: born(map_)}
-        return engine.jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
+        return jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
     except BaseException:
-        engine.staging.remove(name)
+        staging.remove(name)
         raise
 
 
-def discard(engine: Engine, job: Job) -> None:
+def discard(staging: Staging, job: Job) -> None:
     """Remove the frames of a job that has ended."""
     if (name := job.arguments.get("form")) is not None:
-        engine.staging.remove(name)
+        staging.remove(name)
 
 
 def _entries(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, StagedPart]]:
@@ -101,14 +98,14 @@ def _entries(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, Sta
     return entries, {part.name: part for part in files}
 
 
-def enrol_staged(engine: Engine, context: JobContext) -> Mapping[str, Any]:
+def enrol_staged(engine: Engine, staging: Staging, context: JobContext) -> Mapping[str, Any]:
     """Do, or go on with, what the job says: enrol the frames of the form that waits for it.
 
     Raises:
         UnknownMap, MapQuarantined, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was enrolled
             until then stays.
     """
-    return _BulkEnrolment(engine, context).run()
+    return _BulkEnrolment(engine, staging, context).run()
 
 
 @dataclass
@@ -131,10 +128,10 @@ class _Told:
 class _BulkEnrolment:
     """One attempt."""
 
-    def __init__(self, engine: Engine, context: JobContext) -> None:
+    def __init__(self, engine: Engine, staging: Staging, context: JobContext) -> None:
         self.engine, self.context = engine, context
         self.map = context.map(engine.atlas)
-        self.form = engine.staging.open(context.arguments["form"])
+        self.form = staging.open(context.arguments["form"])
         self.entries, self.files = _entries(engine, self.form)
         self.first: dict[str, int] = {}
         """Where each id stands first."""

@@ -7,20 +7,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-from core.errors import NoRegions
-from core.frames.images import encode_thumbnail
 from core.frames.masks import Mask
 from core.places import Place, PlaceFields
+from core.recognition.recognition import describe, frame_digest
 from core.storage import Change, Enrolment, Map, SameFrame
-from service.engine.queue import AHEAD, Encoded, Patience
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
+from service.engine.queue import AHEAD, Patience
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import Sequel, Stage
 from service.worker_threads import in_thread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 
 @dataclass(frozen=True)
@@ -50,10 +47,28 @@ class Enrolled:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def frame_digest(candidate: Candidate) -> bytes:
-    """What tells whether a frame has been encoded already: its bytes and, if there is one, its mask."""
-    digest = candidate.sha256 or hashlib.sha256(candidate.data or b"").digest()
-    return digest if candidate.mask is None else hashlib.sha256(digest + candidate.mask.digest.encode()).digest()
+def digest_of(candidate: Candidate) -> bytes:
+    """By what its map knows the candidate's frame, so that a frame is not encoded twice."""
+    sha256 = candidate.sha256 or hashlib.sha256(candidate.data or b"").digest()
+    return frame_digest(sha256, candidate.mask)
+
+
+def describe_candidate(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
+    """What the map stores of a candidate whose frame was encoded.
+
+    Raises:
+        NoRegions: the frame is blank, or nearly so.
+    """
+    return describe(
+        map_,
+        candidate.id,
+        candidate.fields,
+        candidate.data,
+        digest,
+        encoded.pixels,
+        encoded.encoding,
+        engine.settings.thumbnail_side,
+    )
 
 
 def _raise(_index: int, error: Exception) -> None:
@@ -86,7 +101,7 @@ async def enrol(
         QueueFull, DeadlineExceeded, ClientGone, BatchOutOfOrder: nothing was stored.
         StorageFull, StorageFailure: nothing of the last commit was kept.
     """
-    digests = await in_thread(lambda: [frame_digest(candidate) for candidate in candidates])
+    digests = await in_thread(lambda: [digest_of(candidate) for candidate in candidates])
     stored: dict[int, Enrolled] = {}
     open_ = set(range(len(candidates)))
     known = await in_thread(lambda: {i for i in open_ if map_.digest(candidates[i].id) == digests[i]})
@@ -101,8 +116,8 @@ async def enrol(
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [candidates[i].mask for i in new]
-            with engine.inference.place_in_queue(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many_for(map_, bodies, patience, masks)) as outcomes:
+            with engine.queue.place(len(sent)) if queued else nullcontext():
+                async with aclosing(engine.encode_many(map_.record.encoder, bodies, patience, masks)) as outcomes:
                     async for some in outcomes:
                         frames = {new[index]: outcome for index, outcome in some}
                         # Thumbnails are made, and pixels let go, while the encoder is at the next frames.
@@ -139,28 +154,10 @@ def _prepare_all(
         try:
             if isinstance(outcome, Exception):
                 raise outcome
-            made[i] = prepare(engine, map_, candidates[i], digests[i], outcome), outcome.milliseconds
+            made[i] = describe_candidate(engine, map_, candidates[i], digests[i], outcome), outcome.milliseconds
         except Exception as error:
             made[i] = error
     return made
-
-
-def prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
-    """What to commit for one frame: descriptors, fields, and of the picture what the map keeps."""
-    encoding, keep = encoded.encoding, map_.record.keep
-    if len(encoding.regions) == 0:
-        raise NoRegions("The frame has no region of interest: it is blank, or nearly so.")
-    thumbnail = encode_thumbnail(encoded.pixels, engine.settings.thumbnail_side) if keep == "thumbnail" else None
-    return Enrolment(
-        id=candidate.id,
-        fields=candidate.fields,
-        descriptor=encoding.descriptor,
-        local=encoding.local,
-        regions=len(encoding.regions),
-        digest=digest,
-        thumbnail=thumbnail,
-        image=candidate.data if keep == "image" else None,
-    )
 
 
 def _commit(
@@ -180,7 +177,7 @@ def _commit(
     with engine.writing(map_.record.id):
         if enrolments:
             check_places(engine, map_, [enrolment.id for enrolment in enrolments.values()])
-        found = zip(items, map_.transfer.enrol(list(items.values())), strict=True)
+        found = zip(items, map_.enrol(list(items.values())), strict=True)
         done = {i: stored for i, stored in found if stored is not None}
     engine.metrics.commits.observe(time.perf_counter() - began)
     return done

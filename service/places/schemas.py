@@ -7,9 +7,9 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
 from core.places import Place, Pose, Sequence, Timestamp
-from core.storage import Change, Keep
+from core.storage import Change, Keep, SequenceSummary
 from service.errors.problems import Problem
-from service.http.fields import IDENTITY_EXAMPLE, Cursor, Milliseconds
+from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 
 PLACE_EXAMPLE: dict[str, Any] = {
     "id": "p7",
@@ -120,3 +120,17 @@ class BatchResults(BaseModel):
 
     items: list[BatchResult]
     encoder: str
+
+
+class SequencePage(BaseModel):
+    """Traverses in the order of their names."""
+
+    items: list[SequenceSummary]
+    next_cursor: Cursor
+
+
+class ForgottenSequence(BaseModel):
+    """A deleted traverse."""
+
+    name: str
+    places: int = Field(description="Places that were forgotten with it.")

@@ -19,8 +19,8 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from core.disk.files import disk_errors, sync_folder, write_at, write_file
 from core.errors import StorageFailure, StorageFull
-from core.storage.files.disk import refusals, sync_folder, write_at, write_file
 from service.errors.faults import StagingFull
 from service.http.bodies import in_pieces
 from service.http.multipart import FormReader, Part
@@ -86,7 +86,7 @@ class StagedForm:
         """
         self._path = folder / "form"
         try:
-            with refusals(f"read {folder}"):
+            with disk_errors(f"read {folder}"):
                 listed = json.loads((folder / "parts").read_bytes())
             self.parts = [StagedPart(**part) for part in listed]
         except (ValueError, TypeError) as error:
@@ -98,7 +98,7 @@ class StagedForm:
         Raises:
             StorageFailure: they are not those that came, or cannot be read.
         """
-        with refusals(f"read {self._path}"), self._path.open("rb") as file:
+        with disk_errors(f"read {self._path}"), self._path.open("rb") as file:
             file.seek(part.offset)
             data = file.read(part.size)
         if hashlib.sha256(data).hexdigest() != part.sha256:
@@ -137,7 +137,7 @@ class Staging:
         Raises:
             StorageFull, StorageFailure: the disk refuses.
         """
-        with refusals(f"remove {self._folder / name}"):
+        with disk_errors(f"remove {self._folder / name}"):
             if (self._folder / name).exists():
                 shutil.rmtree(self._folder / name)
         with self._lock:
@@ -221,14 +221,14 @@ class _Arriving:
         self.file = -1
 
     def open(self, expect_room: Callable[[], None]) -> None:
-        with refusals(f"write {self._folder}"):
+        with disk_errors(f"write {self._folder}"):
             self._folder.mkdir(parents=True)
             expect_room()
             self.file = os.open(self._folder / "form", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
     def finish(self, staged: Sequence[StagedPart]) -> int:
         """Sync it and give it its name; its size."""
-        with refusals(f"write {self._there}"):
+        with disk_errors(f"write {self._there}"):
             os.fsync(self.file)
             size = os.fstat(self.file).st_size
             write_file(self._folder / "parts", json.dumps([asdict(part) for part in staged]).encode())
@@ -251,5 +251,5 @@ class _Arriving:
 
 
 def _feed(writer: _Writer, data: bytes) -> None:
-    with refusals("write down what arrives"):
+    with disk_errors("write down what arrives"):
         writer.feed(data)

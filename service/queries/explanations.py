@@ -11,15 +11,17 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.method.encoder import Encoder
+from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
-from core.method.vlad import assign
 from core.places import Place
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
-from service.queries.explanation_schemas import (
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
+from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
+from service.queries.schemas import (
     CellPair,
     ExplainedRegion,
     ExplanationView,
@@ -27,8 +29,8 @@ from service.queries.explanation_schemas import (
     RegionPair,
     RelativeBox,
 )
-from service.queries.pictures import Line, Outline, scaled, side_by_side
-from service.upkeep.upkeep import key_of
+from service.queries.statistics import key_of
+from service.worker_threads import in_thread
 
 LISTED = 30
 """Regions of a frame that are told of."""
@@ -43,12 +45,12 @@ def as_drawn(encoded: Encoded) -> Encoded:
 
 
 async def explained_match(
-    engine: Engine, map_: Map, query: Encoded, place_id: str, patience: Patience
+    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, patience: Patience
 ) -> MatchExplanation | None:
     """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
 
     Raises:
-        As for ``Inference.encode``: the picture that is kept of the place is encoded again, for its regions.
+        As for ``EncoderQueue.encode``: the picture that is kept of the place is encoded again, for its regions.
     """
     found = await in_thread(_stored, map_, place_id)
     if found is None:
@@ -59,7 +61,7 @@ async def explained_match(
         mask = None
         with suppress(UnknownCamera):  # forgotten since; the place stays as it was enrolled
             mask = await camera_mask(map_, place.camera)
-        with engine.inference.place_in_queue():
+        with engine.queue.place():
             again = await engine.encode_for(map_, picture, patience, mask)
     match = replace(stored, regions=None if again is None else again.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
@@ -67,7 +69,7 @@ async def explained_match(
     path = None
     if again is not None:
         drawn = await in_thread(drawing, told, query.pixels, again.pixels)
-        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(key_of(map_), drawn)}"
+        path = f"/v1/maps/{map_.record.id}/explanations/{pictures.keep(key_of(map_), drawn)}"
     return MatchExplanation(**told.__dict__, place=place_id, match_picture=place.picture, picture=path)
 
 

@@ -15,7 +15,8 @@ from core.recognition.selection import TRUST, Knowledge, Recent, Selection
 from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
-from service.http.parameters import PlaceDescription, validated
+from service.http.schemas import validated
+from service.places.parameters import PlaceDescription
 
 MOST_NAMES = 100
 """Sequences, and keys of metadata, that one query may name."""

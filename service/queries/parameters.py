@@ -9,7 +9,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from core.places import Camera, check_map_id
 from core.recognition.selection import Selection
 from service.errors.faults import InvalidRequest
-from service.http.parameters import EncoderAssertion, Matches
+from service.http.schemas import EncoderAssertion, Matches
 from service.queries.filters import FilterParameters, parsed_json
 
 MOST_MAPS = 100

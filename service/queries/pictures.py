@@ -15,7 +15,7 @@ import numpy as np
 from core.frames.images import encode_png
 from core.frames.preprocessing import Pixels
 from service.errors.faults import UnknownExplanation
-from service.upkeep.statistics import MapKey
+from service.queries.statistics import MapKey
 
 HEIGHT = 360
 """Of each frame in the drawing, pixels."""
@@ -97,8 +97,8 @@ def _colour(share: float) -> tuple[int, int, int]:
     return blue, green, red
 
 
-class Pictures:
-    """The pictures of the last explanations, in memory; from any thread."""
+class ExplanationPictures:
+    """The pictures of the last explanations, in memory; thread-safe."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()

@@ -12,13 +12,15 @@ from core.frames.masks import Mask
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import log_odds_per_score
 from core.judgement.verdict import Verdict
-from core.recognition.localization import Located
+from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import Patience
 from service.errors.faults import EncoderNotInstalled
+from service.worker_threads import in_thread
 
 OWN_ERRORS = (
     errors.UnknownMap,
@@ -50,7 +52,7 @@ class MapReport:
 
     map_id: str
     map_: Map | None = None
-    located: Located | None = None
+    located: Answer | None = None
     error: Exception | None = None
     frames: tuple[Encoded | Exception, ...] = ()
 
@@ -82,7 +84,7 @@ async def ask_maps(
     selection: Selection | None,
     patience: Patience,
 ) -> list[MapReport]:
-    """What each map says of the frames, in the order of the ids; call it within ``inference.place_in_queue``.
+    """What each map says of the frames, in the order of the ids; call it within ``queue.place``.
 
     Raises:
         QueueFull, DeadlineExceeded, ClientGone: of the request as a whole.
@@ -135,8 +137,8 @@ async def _encode(
             continue
         keys = list(wanted[identity])
         try:
-            outcomes = await engine.encode_all_for(
-                map_, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
+            outcomes = await engine.encode_all(
+                identity, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
         except OWN_ERRORS as error:
@@ -190,6 +192,6 @@ def match_log_odds(report: MapReport) -> list[float]:
     the match scores less, with what is known of it."""
     located = report.located
     assert located is not None
-    ordered = located.scored.ordered[: len(located.matches)].astype(np.float64)
-    steepness = log_odds_per_score(located.calibration, bool(located.scored.examined.any()))
+    ordered = located.candidates.ordered[: len(located.matches)].astype(np.float64)
+    steepness = log_odds_per_score(located.calibration, bool(located.candidates.examined.any()))
     return (report.log_odds - steepness * (ordered[0] - ordered)).tolist() if len(ordered) else []

@@ -10,8 +10,8 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
-from service.engine.engine import Engine, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     InvalidRequest,
     QueueFull,
@@ -31,10 +31,12 @@ from service.http.openapi import frames_body
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import item_problem
 from service.places.schemas import PlaceView
-from service.queries.answers import answer_of, blank_answer, estimated_pose
+from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
 from service.queries.parameters import SeveralParameters
+from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
 from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
-from service.queries.several_schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
+from service.queries.statistics import QueryStatistics
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",
@@ -52,6 +54,7 @@ async def query_maps(
     options: Annotated[SeveralParameters, Query()],
     request: Request,
     engine: EngineDep,
+    statistics: StatisticsDep,
     principal: PrincipalDep,
     patience: PatienceDep,
 ) -> SeveralAnswer:
@@ -63,14 +66,14 @@ async def query_maps(
     needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
     of another place.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
     selection = options.selection()
     map_ids = options.map_ids()
     if map_ids is None:
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
-    with engine.inference.place_in_queue():
+    with engine.queue.place():
         reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
@@ -78,7 +81,7 @@ async def query_maps(
     answers = [_map_answer(request, engine, report) for report in reports]
     for report in reports:
         if report is recognized or len(reports) == 1:
-            _count_for_health(engine, report)
+            _count_for_health(engine, statistics, report)
     matches = _matches(reports, options.k)
     place = pose = None
     if recognized is not None and recognized.located is not None:
@@ -179,14 +182,14 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
     )
 
 
-def _count_for_health(engine: Engine, report: MapReport) -> None:
+def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
     """Count an answer for the health of its map: of several only the one that has the place, for a frame of elsewhere
     says nothing of the others."""
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return
     answer = blank_answer(report.map_, seen) if report.located is None else answer_of(seen, report.located)
-    engine.upkeep.observe(report.map_id, answer)
+    count_for_map(engine, statistics, report.map_id, answer)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

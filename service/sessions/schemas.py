@@ -10,8 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from core.belief import Odometry, RunOptions, Stride
 from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
-from service.http.fields import Cursor, Milliseconds
-from service.http.parameters import CameraName, EncoderAssertion, Matches, Parameters
+from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
 from service.queries.schemas import QueryAnswer
 

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
+from core.disk.files import disk_errors
 from core.errors import UnknownSequence
-from core.judgement.verdict import Neighborhood
+from core.places import Neighborhood
 from core.recognition.selection import Knowledge, Selection
 from core.storage import Map, Snapshot
-from core.storage.files.disk import refusals
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.sessions.schemas import NewSession
 from service.sessions.store import SessionStore, StoredSession
@@ -208,7 +208,7 @@ class Sessions:
                 )
             self._living[session.id] = session
         try:
-            with refusals("keep a session"):
+            with disk_errors("keep a session"):
                 self._store.write(_stored(session))
         except BaseException:
             with self._lock:
@@ -253,7 +253,7 @@ class Sessions:
             StorageFull, StorageFailure: the disk refuses.
         """
         with self._lock:  # a frame of it that is under way is not to write it down again
-            with refusals("delete a session"):
+            with disk_errors("delete a session"):
                 self._store.forget(session.id)
             self._living.pop(session.id, None)
             self._drop_charts()

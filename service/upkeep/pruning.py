@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.reliability import wilson
+from core.recognition.self_queries import TOGETHER, SelfQueries, spread
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
+from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
-from service.jobs.background import stand_back
-from service.jobs.jobs import JobContext
-from service.places.own_frames import TOGETHER, OwnFrames, load_encoder, spread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext, stand_back
 
 KIND = "prune"
 
@@ -63,7 +60,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
     """The report, and the digests of the places that go, by their ids."""
     wanted = context.arguments
     map_ = context.map(engine.atlas)
-    own = OwnFrames(map_, load_encoder(engine, map_))
+    own = SelfQueries(map_, engine.load_encoder(map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
     asking = _named(names, wanted["queries"])
     references = ~asking if wanted["queries"] is not None else np.ones(len(own), np.bool_)
@@ -115,7 +112,9 @@ def _share(right: NDArray[np.bool_]) -> dict[str, Any]:
     return wilson(int(right.sum()), len(right)).model_dump()
 
 
-def _similarities(engine: Engine, context: JobContext, own: OwnFrames, pairs: NDArray[np.int64]) -> NDArray[np.float32]:
+def _similarities(
+    engine: Engine, context: JobContext, own: SelfQueries, pairs: NDArray[np.int64]
+) -> NDArray[np.float32]:
     found = [np.empty(0, np.float32)]
     for first in range(0, len(pairs), PAIRS_TOGETHER):
         stand_back(engine, context)
@@ -127,7 +126,7 @@ def _similarities(engine: Engine, context: JobContext, own: OwnFrames, pairs: ND
 def _try(
     engine: Engine,
     context: JobContext,
-    own: OwnFrames,
+    own: SelfQueries,
     asking: NDArray[np.bool_],
     references: NDArray[np.bool_],
     wanted: Mapping[str, Any],

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,9 @@ from core.frames.masks import Mask
 from core.places import PlaceFields
 from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
+from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.background import encode_behind
-from service.jobs.context import born
-from service.jobs.jobs import JobContext, JobInterrupted
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext, JobInterrupted, born, encode_behind
 
 KIND = "re-encode"
 
@@ -108,10 +104,10 @@ class _Reencoding:
     def run(self) -> Mapping[str, Any]:
         for _ in range(ROUNDS):
             self._catch_up()
-            with self.source.transfer.quiet():
+            with self.source.transfer.paused_writes():
                 if self._is_level():
                     return self._publish()
-        with self.source.transfer.quiet():  # it is changed faster than it can be encoded
+        with self.source.transfer.paused_writes():  # it is changed faster than it can be encoded
             self._catch_up()
             if not self._is_level():
                 raise RuntimeError("the new map is not what the old one is")
@@ -152,7 +148,7 @@ class _Reencoding:
 
     def _move(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
         """Commit some places: new ones with their frames encoded, known ones with their fields and order as of now."""
-        images = {place.id: self.source.transfer.picture(place.id) for place in new}
+        images = {place.id: self.source.picture(place.id) for place in new}
         # Read behind the images: a place that is still in its row shows the frame that was read.  What was changed
         # or forgotten since it was listed is found by the next round.
         fields = self.source.transfer.find([place.id for place in (*new, *known)])

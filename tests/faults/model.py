@@ -36,7 +36,7 @@ def told(map_: Map) -> State:
     rows = map_.rows_of([found.id for found in listed])
     places = {}
     for found, row in zip(listed, rows, strict=True):
-        kept = map_.transfer.picture(found.id)
+        kept = map_.picture(found.id)
         places[found.id] = {
             "x": None if found.pose is None else found.pose.x,
             "sequence": found.sequence,

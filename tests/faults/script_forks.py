@@ -16,7 +16,7 @@ from pathlib import Path
 
 import faiss
 
-from core.storage.search import parallel
+from core.storage.search import snapshot
 from tests.faults import script
 
 _SET_TRACER, _ANY = 0x59616D61, ctypes.c_ulong(-1)
@@ -40,7 +40,7 @@ def _warm_up() -> None:
         for name in ("go", "passed"):
             (Path(folder) / name).touch()
         script.run(Path(folder) / "data", Path(folder) / "go", Path(folder) / "result", False)
-    parallel.threads.cache_clear()
+    snapshot.threads.cache_clear()
 
 
 def _be_child(line: str) -> None:

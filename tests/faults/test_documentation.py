@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-PAGE = FOLDER.parents[1] / "docs" / "faults.md"
+PAGE = FOLDER.parents[1] / "docs" / "reference" / "faults.md"
 
 
 def injecting() -> set[str]:

@@ -19,8 +19,8 @@ from core.storage.archives.reading import Archive, check
 from service.access.keys import KeyStore
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords
+from service.queries.statistics import QueryStatistics, Statistics
 from service.sessions.store import SessionStore, StoredSession
-from service.upkeep.statistics import QueryStatistics, Statistics
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map

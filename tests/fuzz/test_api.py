@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from service.access.roles import OPERATIONS
-from service.http.links import LINKS
+from service.http.openapi import LINKS
 from tests.fuzz import api
 from tests.service.server import Server
 

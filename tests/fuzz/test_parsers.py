@@ -25,11 +25,12 @@ from core.networks.matfiles import read_mat
 from core.networks.network import load_network, read_definition
 from core.storage.archives.manifest import read_manifest
 from core.storage.archives.tar_layout import manifest_size
-from core.storage.database.cursors import decode_name, decode_number, encode_cursor
 from core.storage.files.arrays import StaleArrays, read_arrays, write_arrays
+from core.storage.pagination import decode_name, decode_number, encode_cursor
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
-from service.http.parameters import EnrolParameters, validated
+from service.http.schemas import validated
+from service.places.parameters import EnrolParameters
 from service.queries.filters import FilterParameters, parse_box, parsed_json
 from service.telemetry.traces import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 RUNNABLE = [
     ".ci/run",
     "docker/entrypoint",
-    *(f"scripts/{name}" for name in ("fuzz", "lint", "lock", "openapi", "serve", "soak", "test")),
+    *(f"scripts/{name}" for name in ("fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")),
 ]
 
 # Replaces Python: a venv is a copy of this script, an installation a line in a log; everything else is real.

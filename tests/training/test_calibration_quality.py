@@ -15,7 +15,7 @@ import pytest
 
 from core.frames.images import decode
 from core.frames.traverses import find_images
-from core.judgement.map_calibration import Measurement, Target, held_figures, recalibrate
+from core.judgement.calibration import Measurement, Target, fit_map_calibration, held_figures
 from core.judgement.trials import Trials
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -62,7 +62,7 @@ def lip6(encoder: Encoder) -> list[Trials]:
 
 
 def measured(encoder: Encoder, of: Trials, precision: float) -> Measurement:
-    return recalibrate(of, encoder.calibration, Target(rule="precision", value=precision), "test").measurement
+    return fit_map_calibration(of, encoder.calibration, Target(rule="precision", value=precision), "test").measurement
 
 
 def assert_honest(found: Measurement) -> None:

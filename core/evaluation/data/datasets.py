@@ -20,7 +20,7 @@ from core.frames.traverses import Truth, find_images, read_ground_truth, toleran
 TRUTH_FILE = "ground_truth.csv"
 
 Rule = Callable[[Sequence[Path], Sequence[Path]], Truth]
-"""Truth from the pictures of queries and references, in that order."""
+"""Truth from the images of queries and references, in that order."""
 
 
 @dataclass(frozen=True)

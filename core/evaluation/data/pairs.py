@@ -32,7 +32,7 @@ class TraversePair:
 
     @property
     def kept_references(self) -> list[Path]:
-        """The pictures to match against."""
+        """The images to match against."""
         return [self.references[index] for index in self.kept]
 
     def negatives(self) -> int:

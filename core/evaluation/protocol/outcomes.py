@@ -63,6 +63,21 @@ def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth) -> list[Outcome
     return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
 
 
+def best_scores(outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
+    """The score of each query's best match, float64 [Q]."""
+    return np.array([outcome.score for outcome in outcomes], np.float64)
+
+
+def best_matched(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
+    """Whether each query's best match is right, bool [Q]."""
+    return np.array([outcome.matched for outcome in outcomes], np.bool_)
+
+
+def has_true_reference(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
+    """Whether each query has a kept true reference, bool [Q]; the others are true negatives."""
+    return np.array([outcome.rank is not None for outcome in outcomes], np.bool_)
+
+
 def answerable(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """The outcomes of queries with a kept true reference; the others are true negatives."""
     return [outcome for outcome in outcomes if outcome.rank is not None]

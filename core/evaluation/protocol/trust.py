@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from core.evaluation.protocol.outcomes import Outcome
-from core.judgement.map_calibration import FEWEST_OUTCOMES, blocks_of
+from core.judgement.calibration import FEWEST_OUTCOMES, blocks_of
+from core.judgement.curves import auc_roc
 from core.judgement.probability import fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import area_under_roc
 from core.judgement.verdict import TOP_PLACES
 
 SAME_PLACE = 3
@@ -81,7 +81,7 @@ def trust(
     believed = probabilities >= BELIEVED
     hits, known = int((believed & right).sum()), sum(outcome.rank is not None for outcome in outcomes)
     return Trust(
-        auc_roc_right=area_under_roc(values, right) or 0.0,
+        auc_roc_right=auc_roc(values, right) or 0.0,
         reliability=reliability(probabilities, right),
         believed_precision=wilson(hits, int(believed.sum())),
         believed_recall=wilson(hits, known),

@@ -11,12 +11,12 @@ from core.evaluation.report.closeup import closeup, embed
 from core.evaluation.report.curves import plot_pr, plot_recall, plot_roc
 from core.evaluation.report.drawing import Plot
 from core.evaluation.report.folder import write_files
-from core.evaluation.report.pictures import Pictures
 from core.evaluation.report.reliability import plot_reliability, trust_table
 from core.evaluation.report.style import script, stylesheet
 from core.evaluation.report.table import figures_table, swatch
 from core.evaluation.report.text import counted, enumerate_words, escape, file_stems, number
 from core.evaluation.report.theme import DARK, LIGHT, Cast
+from core.evaluation.report.thumbnails import Thumbnails
 from core.evaluation.report.trends import plot_cost, plot_scalability, plot_severity
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class Report:
 
     comparison: Comparison
     cast: Cast
-    pictures: Pictures = field(default_factory=Pictures)
+    thumbnails: Thumbnails = field(default_factory=Thumbnails)
     files: dict[str, bytes] = field(default_factory=dict)
 
     def embed(self, plots: Sequence[Plot | None], remarks: Sequence[str] = ()) -> str:
@@ -84,7 +84,7 @@ def _document(report: Report) -> str:
         f'<meta name="theme-color" media="(prefers-color-scheme: dark)" content="{DARK.paper}">'
         f'<title>{title}</title><link rel="icon" href="data:,"><style>{stylesheet()}</style></head>\n'
         f'<body><header>{_opening(report)}<nav class="contents" aria-label="Sections">{contents}</nav></header>\n'
-        f"<main>{body}</main>\n{report.pictures.definitions()}<script>{script()}</script></body></html>\n"
+        f"<main>{body}</main>\n{report.thumbnails.definitions()}<script>{script()}</script></body></html>\n"
     )
 
 
@@ -189,7 +189,7 @@ def _closeups(report: Report) -> str:
     nav = f'<nav class="chips" aria-label="Systems">{chips}</nav>' if len(marks) > 1 else ""
     parts = []
     for run, mark, stem in zip(comparison.runs, marks, stems, strict=True):
-        made = closeup(comparison, run, mark, stem, report.pictures)
+        made = closeup(comparison, run, mark, stem, report.thumbnails)
         report.files |= made.files
         parts.append(made.html)
     return nav + "".join(parts)

@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, sync_file, sync_folder
+from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
@@ -22,11 +24,9 @@ from core.storage.cameras import MOST_CAMERAS
 from core.storage.database import ledger
 from core.storage.database import row_checksums as seals
 from core.storage.database.connections import FILE, connect
-from core.storage.database.ledger import moment_text
+from core.storage.database.ledger import moment_text, named_segments
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.database.segment_table import named_segments
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage, sync_file, sync_folder
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder
@@ -137,10 +137,9 @@ class _Building:
 
     def run(self) -> None:
         manifest = self.archive.manifest
-        self.connection.execute("BEGIN IMMEDIATE")
-        self._sequences(manifest.parts[0])
-        self._cameras(manifest.parts[1])
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            self._sequences(manifest.parts[0])
+            self._cameras(manifest.parts[1])
         for number in range(manifest.groups):
             self._group(*manifest.group(number))
         self._check()
@@ -194,15 +193,14 @@ class _Building:
             return
         kept = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
         self._check_descriptors(kept, chunk, rows.name)
-        records = self.layout.sealed(kept, self.rows)
+        records = self.layout.records_of(kept, self.rows)
         descriptors.append(self.folder, self.layout, self.rows, records)
         checksums: list[int] = records["checksum"].tolist()
-        self.connection.execute("BEGIN IMMEDIATE")
-        for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
-            self._insert(line, row, checksum, images)
-        seals.seal(self.connection, "places", "row >= ?", self.rows)
-        name_appended(self.connection, self.layout, self.rows, checksums)
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
+                self._insert(line, row, checksum, images)
+            seals.seal(self.connection, "places", "row >= ?", self.rows)
+            name_appended(self.connection, self.layout, self.rows, checksums)
         self.rows += len(chunk)
         self.advance(self.rows, self.archive.manifest.places)
 

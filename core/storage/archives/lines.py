@@ -13,7 +13,7 @@ from core.errors import InvalidArchive
 from core.frames.masks import Mask
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
-from core.storage.patches import complaint
+from core.storage.records import validation_message
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to take more."""
@@ -108,7 +108,7 @@ def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
     except UnicodeEncodeError:
         raise InvalidArchive(f"{where} holds half a character (a lone surrogate).") from None
     except (ValidationError, RecursionError) as error:
-        why = complaint(error) if isinstance(error, ValueError) else "nested too deeply"
+        why = validation_message(error) if isinstance(error, ValueError) else "nested too deeply"
         raise InvalidArchive(f"{where}: {why[:400]}.") from None
     return made
 

@@ -28,8 +28,7 @@ from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
-from core.storage.patches import complaint
-from core.storage.records import MapRecord
+from core.storage.records import MapRecord, validation_message
 
 FORMAT = "placerec map"
 VERSION = 1
@@ -187,7 +186,7 @@ def _read_first(value: dict[str, Any]) -> Manifest:
     try:
         manifest = Manifest.model_validate(value)
     except (ValidationError, RecursionError) as error:
-        why = complaint(error) if isinstance(error, ValueError) else "it is nested too deeply"
+        why = validation_message(error) if isinstance(error, ValueError) else "it is nested too deeply"
         raise InvalidArchive(f"{MANIFEST}: {why[:400]}.") from None
     try:
         check_map_id(manifest.map.id)

@@ -12,7 +12,16 @@ from typing import Self
 from core.errors import InvalidArchive
 from core.storage.archives.lines import MOST_LINE_BYTES
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
-from core.storage.archives.tar_layout import BLOCK, END_BYTES, Member, Tape, describe, header, manifest_size, padded
+from core.storage.archives.tar_layout import (
+    BLOCK,
+    END_BYTES,
+    Member,
+    TarLayout,
+    describe,
+    header,
+    manifest_size,
+    padded,
+)
 
 CHUNK_BYTES = 1 << 20
 
@@ -77,7 +86,7 @@ class Archive:
         return b"".join(parts)
 
 
-def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Manifest, Tape, str] | None:
+def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Manifest, TarLayout, str] | None:
     """What the beginning of a file says of all of it; None if it ends before its manifest does.
 
     Args:
@@ -101,7 +110,7 @@ def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Mani
     if following != expected.ljust(rest, b"\0"):
         raise InvalidArchive(f"{MANIFEST} is damaged: it does not match {SEAL} behind it.")
     manifest = read_manifest(text)
-    tape = Tape(manifest, size)
+    tape = TarLayout(manifest, size)
     return manifest, tape, tag_of(text)
 
 

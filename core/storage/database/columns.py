@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Whereabouts
-from core.places import EARTH_RADIUS, Pose
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
 
 _AT_ONCE = 65_536
 _NUMBERS = "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading"
@@ -31,7 +30,7 @@ class Columns:
 
 
 def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
-    """Row, checksum and spot of every place.
+    """Row, checksum and location of every place.
 
     Args:
         rows: that there are.

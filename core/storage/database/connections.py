@@ -9,12 +9,14 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
+from core.disk import sqlite_file
+from core.disk.files import sync_file
+from core.disk.sqlite_file import DURABLE
 from core.storage.database import row_checksums as seals
 from core.storage.database.schema import check_schema, migrate
-from core.storage.files.disk import sync_file
 
 FILE = "map.sqlite"
 
@@ -26,32 +28,22 @@ class DatabaseClosed(Exception):
     """The database was closed, for good, before this use of it."""
 
 
+_SETTINGS = {**DURABLE, "foreign_keys": "ON", "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
+
+
 def connect(path: Path, create: bool = False) -> sqlite3.Connection:
-    """A connection with our settings and no implicit transactions; any thread may use it, one at a time.
+    """A connection with the settings of a map and no implicit transactions; any thread may use it, one at a time.
 
     Raises:
-        sqlite3.Error: there is no such file (unless ``create``), or it cannot be read.
+        sqlite3.Error: the file is missing (unless ``create``) or cannot be read.
     """
-    mode = "rwc" if create else "rw"
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=30, isolation_level=None, check_same_thread=False
-    )
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA temp_store = MEMORY")
-        connection.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
-        seals.teach(connection)
-    except BaseException:
-        connection.close()
-        raise
+    connection = sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
+    seals.teach(connection)
     return connection
 
 
-def connect_aside(path: Path) -> sqlite3.Connection:
-    """A connection that reads the file as if there were no log beside it, and changes neither.
+def connect_without_log(path: Path) -> sqlite3.Connection:
+    """A connection that reads the file as if it had no log, and changes neither of them.
 
     Raises:
         sqlite3.Error: it cannot be read.
@@ -80,8 +72,7 @@ class Database:
         try:
             migrate(self._writer)
             check_schema(self._writer)
-            # SQLite opens a file for reading alone where writing is refused, and it would stay so when that has passed.
-            self._writer.execute("UPDATE map SET only = only WHERE false")
+            sqlite_file.expect_writable(self._writer)
         except BaseException:
             self._writer.close()
             raise
@@ -128,15 +119,9 @@ class Database:
         """
         if self._closed:
             raise DatabaseClosed
-        self._writer.execute("BEGIN IMMEDIATE")
         try:
-            yield self._writer
-            self._writer.execute("COMMIT")
-        except BaseException:
-            with suppress(sqlite3.Error):  # the first error is the one to tell
-                if self._writer.in_transaction:
-                    self._writer.execute("ROLLBACK")
-            raise
+            with sqlite_file.transaction(self._writer):
+                yield self._writer
         finally:
             self.state = object()
 

@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from core.errors import InvalidField, UnknownPlace
+from core.disk.files import Damage
+from core.errors import InvalidField, StorageFailure, UnknownPlace
 from core.places import Place, PlaceFields, Pose
 from core.storage.database import row_checksums as seals
 from core.storage.database.row_checksums import SEALED
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.files.disk import Damage
+from core.storage.files.segment_files import Layout
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 
 DEEPEST_METADATA = 64
@@ -43,6 +44,16 @@ class StoredPlace:
     sequence: int
     ordinal: int
     place: Place
+
+
+@dataclass(frozen=True)
+class NamedSegment:
+    """What SQLite says of a segment file; of one that is ``removed`` no row is alive, and no file need be there."""
+
+    number: int
+    rows: int
+    checksum: int
+    removed: bool = False
 
 
 def _stored(values: tuple[Any, ...]) -> StoredPlace:
@@ -179,10 +190,22 @@ def rows_of_sequence(connection: sqlite3.Connection, name: str) -> list[int]:
     return [row for (row,) in connection.execute(query, (name,)).fetchall()]
 
 
-def picture(connection: sqlite3.Connection, number: int) -> tuple[bytes, bytes] | None:
-    """What is kept of a place's frame, and its SHA-256."""
+def picture(connection: sqlite3.Connection, number: int, place_id: str) -> bytes | None:
+    """The picture kept of a place's frame; None if none is kept.
+
+    Args:
+        number, place_id: of the place.
+
+    Raises:
+        StorageFailure: the picture does not match its SHA-256.
+    """
     found = connection.execute("SELECT bytes, digest FROM pictures WHERE place = ?", (number,)).fetchone()
-    return None if found is None else (found[0], found[1])
+    if found is None:
+        return None
+    content: bytes = found[0]
+    if hashlib.sha256(content).digest() != found[1]:
+        raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
+    return content
 
 
 # Writing
@@ -320,6 +343,27 @@ def delete_sequence(connection: sqlite3.Connection, name: str) -> None:
     (code,) = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
     connection.execute("DELETE FROM places WHERE sequence = ?", (code,))
     _drop_if_empty(connection, int(code))
+
+
+# Segment files
+
+
+def named_segments(connection: sqlite3.Connection, layout: Layout) -> list[NamedSegment]:
+    """The segments in order.
+
+    Raises:
+        Damage: one is missing, or one that is not the last is not full.
+    """
+    query = "SELECT number, rows, checksum, removed FROM segments ORDER BY number"
+    rows = connection.execute(query).fetchall()
+    found = [NamedSegment(number, count, checksum, bool(removed)) for number, count, checksum, removed in rows]
+    for position, segment in enumerate(found):
+        if not all(isinstance(value, int) for value in (segment.number, segment.rows, segment.checksum)):
+            raise Damage(f"map.sqlite: what it says of segment {position + 1} makes no sense")
+        full, last = segment.rows == layout.rows_per_segment, position == len(found) - 1
+        if segment.number != position or segment.rows > layout.rows_per_segment or not (full or last):
+            raise Damage(f"map.sqlite: segment {position + 1} is not as long as it must be")
+    return found
 
 
 def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:

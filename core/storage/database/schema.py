@@ -10,9 +10,10 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from core.disk.files import Damage
+from core.disk.sqlite_file import NotOurs, Schema, TooNew, transaction
 from core.errors import DataDirectoryTooNew
 from core.storage.database import row_checksums as seals
-from core.storage.files.disk import Damage
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
 
@@ -141,7 +142,7 @@ _TIERS: Migration = (
 # A checksum in each row that nothing else vouches for.
 _SEALS: Migration = seals.statements()
 
-# Segments of which no place is left, and whose files are gone (:mod:`core.storage.reclaiming`).
+# Segments of which no place is left, and whose files are gone (:mod:`core.storage.removed_segments`).
 _REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
 
 MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)
@@ -167,32 +168,25 @@ def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MI
         Damage: it is a database, but not one of ours; or it has the tables of today and another version.
         sqlite3.Error: a statement failed; the file is as it was.
     """
-    version: int = connection.execute("PRAGMA user_version").fetchone()[0]
-    (owner,) = connection.execute("PRAGMA application_id").fetchone()
-    is_empty = (version, owner) == (0, 0) and not _columns(connection)
-    if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
-        raise Damage("map.sqlite is not one of placerec's databases")
-    if version > len(migrations):
+    seals.teach(connection)
+    try:
+        return _schema(migrations).migrate(connection, create)
+    except NotOurs as error:
+        raise Damage("map.sqlite is not one of placerec's databases") from error
+    except TooNew as error:
         if _statements(connection) == _expected(migrations, _statements):
-            raise Damage(f"map.sqlite says that it is of schema {version}, but its tables are of {len(migrations)}")
+            claimed = f"map.sqlite says that it is of schema {error.version}"
+            raise Damage(f"{claimed}, but its tables are of {len(migrations)}") from error
         raise DataDirectoryTooNew(
-            f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
-        )
-    if version < len(migrations):
-        seals.teach(connection)
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            for migration in migrations[version:]:
-                for statement in migration:
-                    connection.execute(statement)
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {len(migrations)}")
-            connection.execute("COMMIT")
-        except BaseException:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
-            raise
-    return len(migrations) - version
+            f"A map was written by a later version of placerec (schema {error.version}, this one knows"
+            f" {len(migrations)})."
+        ) from error
+
+
+def _schema(migrations: Sequence[Migration]) -> Schema:
+    """A new file gets all migrations one after the other, too."""
+    every = [statement for migration in migrations for statement in migration]
+    return Schema(APPLICATION_ID, len(migrations), every, dict(enumerate(migrations)))
 
 
 def _statements(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
@@ -244,15 +238,9 @@ def refile(connection: sqlite3.Connection) -> None:
     Raises:
         sqlite3.Error: the disk refuses; all is as it was.
     """
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with transaction(connection):
         connection.execute("DELETE FROM place_values")
         connection.execute(_FILL_VALUES)
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
 
 
 def cut_sequences(connection: sqlite3.Connection, limit: int = 10) -> list[str]:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 
 _HEADER = struct.Struct(">8I")
 _FRAME = struct.Struct(">6I")

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from core.index import Coder, Codes, InvertedLists
-from core.storage.database.segment_table import NamedSegment
+from core.storage.database.ledger import NamedSegment
 from core.storage.files.arrays import Arrays, StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
 from core.storage.search.tiers import Recall, Tier

@@ -17,17 +17,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, CodeTable, InvertedLists
-from core.storage.database.segment_table import NamedSegment
+from core.storage.database.ledger import NamedSegment
 from core.storage.files.arrays import StaleArrays
-from core.storage.files.disk import Damage
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.parallel import threads
 from core.storage.search.rebuilding import codes_of, fitted_coder, remade
 from core.storage.search.recall import measured
 from core.storage.search.segment import Held, flat_index, vectors
-from core.storage.search.snapshot import Snapshot
+from core.storage.search.snapshot import Snapshot, threads
 from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, tier_for
 
 log = logging.getLogger(__name__)

@@ -5,17 +5,61 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import nan
 
 import faiss
 import numpy as np
 from numpy.typing import NDArray
 
 from core.index.exact import Rows, compare
-from core.judgement.verdict import Whereabouts
+from core.places import NO_TIME, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
-from core.storage.search.spots import Spot, joined, memory_of, whereabouts_of
 
 _SMALLEST_TAIL = 8
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where one place is; the fields are those of :class:`Whereabouts`."""
+
+    kind: int
+    position: tuple[float, float, float]
+    sequence: int
+    ordinal: int
+    heading: float = nan
+    timestamp: int = NO_TIME
+
+
+def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
+    """Of n places, row-aligned."""
+    return Whereabouts(
+        np.array([location.kind for location in locations], dtype=np.int8),
+        np.array([location.position for location in locations], dtype=np.float64).reshape(-1, 3),
+        np.array([location.sequence for location in locations], dtype=np.int32),
+        np.array([location.ordinal for location in locations], dtype=np.int64),
+        np.array([location.heading for location in locations], dtype=np.float32),
+        np.array([location.timestamp for location in locations], dtype=np.int64),
+    )
+
+
+def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
+    """One after the other."""
+    if not parts:
+        return whereabouts_of([])
+    return Whereabouts(
+        np.concatenate([part.kind for part in parts]),
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.sequence for part in parts]),
+        np.concatenate([part.ordinal for part in parts]),
+        np.concatenate([part.heading for part in parts]),
+        np.concatenate([part.timestamp for part in parts]),
+    )
+
+
+def memory_of(whereabouts: Whereabouts) -> int:
+    """Bytes of its columns."""
+    columns = vars(whereabouts).values()
+    return sum(column.nbytes for column in columns)
 
 
 def flat_index(capacity: int, dimension: int, halves: bool = False) -> faiss.IndexFlatCodes:
@@ -88,12 +132,12 @@ class Reading:
 class Segment:
     """Consecutive rows of a map.
 
-    held: their descriptors, or None: they are on the shelf (:class:`core.storage.files.row_reader.Shelf`).
+    held: their descriptors, or None: they are on disk (:class:`core.storage.files.row_reader.RowReader`).
     first_row: the map's row that is row 0 here.
     alive: bool [n], False for the rows of places that were forgotten or got another frame.
     checksums: uint32 [n], what SQLite names of each row; 0 where it names none.
     reading: is shared by all states of the segment in which its file may be read.
-    removed: no row is alive, and there are no descriptors any more, in memory or on the shelf.
+    removed: no row is alive, and there are no descriptors any more, in memory or on disk.
     """
 
     held: Held | None
@@ -128,7 +172,7 @@ class Segment:
     def appended(
         self,
         descriptors: Sequence[Descriptor] | Rows,
-        spots: Sequence[Spot],
+        locations: Sequence[Location],
         local: Sequence[Local] | Local,
         checksums: Sequence[int],
         largest: int,
@@ -137,20 +181,20 @@ class Segment:
         return replace(
             self,
             held=None if self.held is None else self.held.appended(len(self), descriptors, local, largest),
-            whereabouts=joined([self.whereabouts, whereabouts_of(spots)]),
+            whereabouts=joined([self.whereabouts, whereabouts_of(locations)]),
             alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
             checksums=np.concatenate([self.checksums, np.array(checksums, dtype=np.uint32)]),
         )
 
-    def moved(self, spots: Mapping[int, Spot]) -> Segment:
+    def moved(self, locations: Mapping[int, Location]) -> Segment:
         """With some of the map's rows somewhere else."""
         old = self.whereabouts
         new = old.take(np.arange(len(old)))
-        for row, spot in spots.items():
+        for row, location in locations.items():
             offset = row - self.first_row
-            new.kind[offset], new.position[offset] = spot.kind, spot.position
-            new.sequence[offset], new.ordinal[offset] = spot.sequence, spot.ordinal
-            new.heading[offset], new.timestamp[offset] = spot.heading, spot.timestamp
+            new.kind[offset], new.position[offset] = location.kind, location.position
+            new.sequence[offset], new.ordinal[offset] = location.sequence, location.ordinal
+            new.heading[offset], new.timestamp[offset] = location.heading, location.timestamp
         return replace(self, whereabouts=new)
 
     def without(self, rows: Sequence[int]) -> Segment:

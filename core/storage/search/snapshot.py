@@ -7,17 +7,20 @@ still alive, are copied, for the segments that the write touches.
 
 A small map holds its descriptors in memory and ranks every place (the tier ``exact``).  A larger one
 holds codes of them (``compact``), by nearest centre too in the largest maps (``inverted``): the codes
-name the few places that are worth an exact comparison, whose descriptors are read from the shelf.
+name the few places that are worth an exact comparison, whose descriptors are read from disk.
 Rows that have no code yet are compared exactly, so that what is searched is always the whole map.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
+from threading import Barrier
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +29,15 @@ from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
 from core.index.exact import Rows
 from core.index.ranking import ranked
-from core.judgement.verdict import Whereabouts
-from core.method.cells import ScatteredCells
+from core.method.agreement import ScatteredCells
+from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
-from core.storage.files.row_reader import Shelf
+from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
-from core.storage.search.parallel import threads, together
-from core.storage.search.segment import Held, Segment, vectors
-from core.storage.search.spots import Spot, joined, whereabouts_of
+from core.storage.search.segment import Held, Location, Segment, joined, vectors, whereabouts_of
+from core.threads import cores, in_turns, keep_to
 
-__all__ = ["SHORTLIST", "Ranking", "Segment", "Snapshot", "Spot"]
+__all__ = ["SHORTLIST", "Location", "Ranking", "Segment", "Snapshot"]
 
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Rows, best first, and their inner products."""
@@ -45,7 +47,27 @@ SHORTLIST = 100
 
 _PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
 _SHARE = 2  # one of two cores takes nearly all of the memory's speed, and the other has frames to encode
-_PART_ROWS = 25  # that one thread reads from the shelf at a time
+_PART_ROWS = 25  # that one thread reads from disk at a time
+
+Part = TypeVar("Part")
+
+
+@cache
+def threads() -> tuple[ThreadPoolExecutor, int]:
+    """The threads, and how many they are."""
+    count = cores()
+    pool = ThreadPoolExecutor(count, "search", keep_to, (None,))
+    # All of them at once and now: a thread is as nice as the one that first needed it, and cannot be made less so.
+    begun = Barrier(count)
+    for _ in range(count):
+        pool.submit(begun.wait)
+    return pool, count
+
+
+def together(run: Callable[[Part], None], parts: Sequence[Part], share: int = 1) -> None:
+    """Run every part once, on one thread for each ``share`` cores, the calling one among them."""
+    helpers = min(len(parts), cores() // share) - 1
+    in_turns(run, parts, threads()[0] if helpers > 0 else None, helpers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +83,19 @@ class _Part:
 class Snapshot:
     """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's.
 
-    shelf: the descriptors of segments that hold none in memory.
+    row_reader: the descriptors of segments that hold none in memory.
     table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
     lists: the same rows by nearest centre; None in all but the largest maps.
     holds: whether new rows are held in memory.
     halves: their descriptors are held in half precision, which says all of what is stored.
-    guard: entered around everything that reads from the shelf; names what the disk refuses.
+    guard: entered around everything that reads from disk; names what the disk refuses.
     """
 
     dimension: int
     rows_per_segment: int
     segments: tuple[Segment, ...] = ()
     local_shape: tuple[int, int] = NO_LOCAL
-    shelf: Shelf | None = None
+    row_reader: RowReader | None = None
     table: CodeTable | None = None
     lists: InvertedLists | None = None
     holds: bool = True
@@ -122,7 +144,7 @@ class Snapshot:
 
     @cached_property
     def _held(self) -> NDArray[np.bool_]:
-        """By row, whether its descriptor is not on the shelf, but in memory or removed: bool [rows]."""
+        """By row, whether its descriptor is not on disk, but in memory or removed: bool [rows]."""
         return np.repeat(
             np.array([segment.held is not None or segment.removed for segment in self.segments], np.bool_),
             np.array([len(segment) for segment in self.segments], np.int64),
@@ -179,10 +201,10 @@ class Snapshot:
         if allowed is not None and allowed.shape != (self.rows,):
             raise ValueError(f"the map has {self.rows} rows to allow")
         rows, products = self._compare_held(queries, allowed)
-        if self.shelf is None or self._held.all():
+        if self.row_reader is None or self._held.all():
             return [ranked(rows, found) for found in products]
         with self.guard():
-            return self._with_shelf(queries, allowed, rows, products)
+            return self._with_rows_on_disk(queries, allowed, rows, products)
 
     def _compare_held(
         self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
@@ -199,14 +221,14 @@ class Snapshot:
         together(compare, parts, _SHARE)
         return rows, products
 
-    def _with_shelf(
+    def _with_rows_on_disk(
         self,
         queries: NDArray[np.float32],
         allowed: NDArray[np.bool_] | None,
         held: NDArray[np.int64],
         products: NDArray[np.float32],
     ) -> list[Ranking]:
-        """The rankings once the rows on the shelf are looked at too."""
+        """The rankings once the rows on disk are looked at too."""
         chosen = self.alive & ~self._held
         if allowed is not None:
             chosen &= allowed
@@ -234,12 +256,12 @@ class Snapshot:
         return np.sort(found.rows)
 
     def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Inner products of queries with rows on the shelf, float32 [B, k]."""
-        assert self.shelf is not None
-        shelf, products = self.shelf, np.empty((len(queries), len(rows)), np.float32)
+        """Inner products of queries with rows on disk, float32 [B, k]."""
+        assert self.row_reader is not None
+        row_reader, products = self.row_reader, np.empty((len(queries), len(rows)), np.float32)
 
         def compare(part: slice) -> None:
-            products[:, part] = shelf.inner_products(queries, rows[part], self._checksums(rows[part]))
+            products[:, part] = row_reader.inner_products(queries, rows[part], self._checksums(rows[part]))
 
         parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
         if parts:
@@ -268,7 +290,7 @@ class Snapshot:
         return self.locals_in_place(rows).together()
 
     def locals_in_place(self, rows: NDArray[np.int64]) -> ScatteredCells:
-        """The same where they are held, as nobody will change them; those on the shelf are read."""
+        """The same where they are held, as nobody will change them; those on disk are read."""
         self._check_rows(rows)
         numbers, offsets = np.divmod(rows, self.rows_per_segment)
         used = sorted(set(numbers.tolist()))
@@ -276,17 +298,17 @@ class Snapshot:
         blocks = [self.segments[number].local for number in held]
         block = np.searchsorted(held, numbers)
         if len(held) < len(used) or not used:
-            on_shelf = np.flatnonzero(~np.isin(numbers, held))
-            blocks.append(self._locals_on_shelf(rows[on_shelf]))
-            block[on_shelf], offsets[on_shelf] = len(held), np.arange(len(on_shelf))
+            on_disk = np.flatnonzero(~np.isin(numbers, held))
+            blocks.append(self._locals_on_disk(rows[on_disk]))
+            block[on_disk], offsets[on_disk] = len(held), np.arange(len(on_disk))
         return ScatteredCells(tuple(blocks), block, offsets)
 
-    def _locals_on_shelf(self, rows: NDArray[np.int64]) -> Local:
+    def _locals_on_disk(self, rows: NDArray[np.int64]) -> Local:
         if not len(rows):
             return np.empty((0, *self.local_shape), np.int8)
-        assert self.shelf is not None
+        assert self.row_reader is not None
         with self.guard():
-            return self.shelf.locals(rows, self._checksums(rows))
+            return self.row_reader.locals(rows, self._checksums(rows))
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D], a copy.
@@ -302,23 +324,23 @@ class Snapshot:
             segment = self.segments[int(rows[position]) // self.rows_per_segment]
             found[position] = vectors(segment.index)[int(rows[position]) - segment.first_row]
         if not held.all():
-            assert self.shelf is not None
+            assert self.row_reader is not None
             wanted = rows[~held]
             with self.guard():
-                found[~held] = self.shelf.descriptors(wanted, self._checksums(wanted))
+                found[~held] = self.row_reader.descriptors(wanted, self._checksums(wanted))
         return found
 
     def appended(
         self,
         descriptors: Sequence[Descriptor] | Rows,
-        spots: Sequence[Spot],
+        locations: Sequence[Location],
         local: Sequence[Local] | Local = (),
         checksums: Sequence[int] | None = None,
     ) -> Snapshot:
         """With further places.  Only on the newest snapshot, by one thread at a time.
 
         Args:
-            descriptors, spots, local: one of each a place, float32 [D] (or float16, in a map that holds halves) and
+            descriptors, locations, local: one of each a place, float32 [D] (or float16, in a map that holds halves) and
                 int8 [C, L]; ``local`` may be left out where the map has no local descriptors.
             checksums: what SQLite names of the rows; None: nothing.
         """
@@ -334,7 +356,7 @@ class Snapshot:
                 segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
-                descriptors[done:stop], spots[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
+                descriptors[done:stop], locations[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
             )
             done = min(stop, len(descriptors))
         table = self.table
@@ -342,11 +364,11 @@ class Snapshot:
             table = table.appended(table.coder.encode(np.asarray(descriptors, np.float32)))
         return replace(self, segments=tuple(segments), table=table)
 
-    def moved(self, spots: Mapping[int, Spot]) -> Snapshot:
+    def moved(self, locations: Mapping[int, Location]) -> Snapshot:
         """With the places of some rows somewhere else."""
         segments = list(self.segments)
-        for number, rows in self._by_segment(list(spots)).items():
-            segments[number] = segments[number].moved({row: spots[row] for row in rows})
+        for number, rows in self._by_segment(list(locations)).items():
+            segments[number] = segments[number].moved({row: locations[row] for row in rows})
         return replace(self, segments=tuple(segments))
 
     def without(self, rows: Sequence[int]) -> Snapshot:
@@ -368,7 +390,7 @@ class Snapshot:
         return replace(self, table=self.table.appended(codes))
 
     def holding(self, number: int, held: Held | None) -> Snapshot:
-        """With the descriptors of a segment in memory, or on the shelf only; one that was removed has none."""
+        """With the descriptors of a segment in memory, or on disk only; one that was removed has none."""
         segments = list(self.segments)
         if segments[number].removed:
             return self

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from service.access.principals import TOKEN
+from service.access.roles import TOKEN
 
 VARIABLE = "PLACEREC_KEY"
 _LOOPBACK = re.compile(r"localhost|.*\.localhost|127\.[0-9.]+|::1")

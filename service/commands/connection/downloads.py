@@ -172,7 +172,7 @@ def settle(partial: Path, path: Path) -> None:
     Raises:
         Failure: the disk refuses.
     """
-    from core.storage.files.disk import sync_folder
+    from core.disk.files import sync_folder
 
     try:
         os.replace(partial, path)

@@ -15,9 +15,10 @@ from core.judgement.verdict import Calibration
 from core.method.agreement import AgreementDefinition, Cells, agreement
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
+from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.projection import Projection
-from core.method.regions import extract_regions, unit_length
+from core.method.regions import extract_regions
 from core.method.vlad import aggregate
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.networks.backbone import PluggedNetwork

@@ -11,7 +11,7 @@ import core.networks.convolution
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
 from core.method.catalogue import PACKAGED
-from core.networks.forward import CudaPass, FusedPass, MaxPooling, fused_pass
+from core.networks.forward import CudaPass, FusedPass, fused_pass
 from core.networks.network import (
     Convolution,
     Layer,
@@ -78,15 +78,6 @@ def test_leaky_rectifiers_averages_and_a_last_layer_without_rectifier() -> None:
     )
     with torch.inference_mode():
         assert_same(FusedPass(network)(images(2, 33)), network(images(2, 33)))
-
-
-@pytest.mark.parametrize(("kernel", "stride"), [(3, 2), (2, 2), (3, 3), (2, 3), (5, 1)])
-@pytest.mark.parametrize("side", [7, 8, 12])
-@pytest.mark.parametrize("ceil", [False, True])
-def test_pooling_is_torchs_own(kernel: int, stride: int, side: int, ceil: bool) -> None:
-    x = torch.randn(2, 5, side, side + 1, generator=torch.Generator().manual_seed(side))
-    made = MaxPooling(Pooling(name="p", kernel=kernel, stride=stride, ceil=ceil))(x)
-    torch.testing.assert_close(made, nn.functional.max_pool2d(x, kernel, stride, ceil_mode=ceil), atol=0, rtol=0)
 
 
 def test_bfloat16_comes_near_and_gives_float32() -> None:

@@ -22,11 +22,8 @@ MODULES = (
     "uvloop",
     "service.app.application",
     "service.commands.serve",
-    "service.http.connections",
-    "service.http.protocol",
     "service.telemetry.native_output",
     "service.http.server",
-    "service.http.websocket_protocol",
 )
 
 

@@ -151,7 +151,7 @@ class Storage:
         snapshot, items = source.snapshot(), []
         for place_id, ordinal in operation["places"]:
             place, row = source.transfer.find([place_id])[place_id]
-            picture = source.transfer.picture(place_id)
+            picture = source.picture(place_id)
             item = Enrolment(
                 place_id,
                 PlaceFields(**{name: getattr(place, name) for name in PlaceFields.model_fields}),

@@ -10,8 +10,7 @@ import pytest
 
 from core.errors import StorageFailure
 from service.access import audit
-from service.access.audit import Refusals, kept_in, note_change, told
-from service.access.principals import ASKER, Asker
+from service.access.audit import ASKER, Asker, Refusals, asker_fields, audit_file, note_change
 from service.jobs.jobs import Jobs
 
 EVE = Asker("eve", "0123456789ab", "prune_map", "a-request", None, "10.0.0.1")
@@ -23,7 +22,7 @@ def heard(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_what_is_not_known_is_left_out() -> None:
-    assert told(EVE) == {
+    assert asker_fields(EVE) == {
         "principal": "eve",
         "key": "0123456789ab",
         "operation": "prune_map",
@@ -70,7 +69,7 @@ def test_a_job_tells_at_its_end_who_asked_for_it_over_a_restart(
     }
     assert set(lines) == {(lost.id, "job failed"), (job.id, "job running"), (job.id, "job succeeded")}
     for line in lines.values():
-        assert told(EVE).items() <= line.items() and line["map"] == "lab"
+        assert asker_fields(EVE).items() <= line.items() and line["map"] == "lab"
     assert lines[lost.id, "job failed"]["problem"].endswith("job-lost")
     assert lines[job.id, "job succeeded"]["dry_run"] is False
 
@@ -91,7 +90,7 @@ def test_a_refusal_that_repeats_is_told_once(caplog: pytest.LogCaptureFixture, m
 
 def test_a_file_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "audit.jsonl"
-    with kept_in(path):
+    with audit_file(path):
         note_change(EVE, {"map": "lab"}, {}, 200)
         path.rename(tmp_path / "old.jsonl")
         note_change(EVE, {"map": "yard"}, {}, 200)
@@ -99,5 +98,5 @@ def test_a_file_of_its_own(tmp_path: Path) -> None:
     for name, map_id in (("old.jsonl", "lab"), ("audit.jsonl", "yard")):
         (line,) = (json.loads(text) for text in (tmp_path / name).read_text().splitlines())
         assert (line["logger"], line["map"], line["principal"]) == ("placerec.audit", map_id, "eve")
-    with pytest.raises(StorageFailure, match="cannot be opened"), kept_in(tmp_path / "absent" / "audit.jsonl"):
+    with pytest.raises(StorageFailure, match="cannot be opened"), audit_file(tmp_path / "absent" / "audit.jsonl"):
         pass

@@ -15,7 +15,7 @@ import pytest
 from core.errors import InvalidIdentifier
 from service.access.keyring import GRACE_SECONDS, STUCK_SECONDS, USE_SECONDS, Keyring
 from service.access.keys import FILE, KeyStore
-from service.access.principals import TOKEN, Principal
+from service.access.roles import TOKEN, Principal
 from service.errors.faults import InvalidRequest, KeyNeeded, KeyRefused, KeysUnreadable
 
 
@@ -182,7 +182,7 @@ def test_who_is_let_in(store: KeyStore) -> None:
     other = token[:-1] + ("A" if token[-1] != "A" else "B")
     unknown = "placerec_000000000000_" + token[-43:]
     for wrong in (other, unknown):
-        with pytest.raises(KeyRefused, match="not one of this service"):
+        with pytest.raises(KeyRefused, match="does not know this key"):
             running.principal(bearer(wrong))
 
 

@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from service.access.gate import Way, ways_of
-from service.access.roles import OPERATIONS, ROLES, Role, Rule, covers
+from service.access.roles import OPERATIONS, Role, Rule, covers
 from service.app.application import create_app
-from service.http.openapi import document
 from service.settings import Settings
 
 OPEN = {"check_liveness", "check_readiness", "read_version", "read_openapi", "read_documentation"}
@@ -24,7 +23,7 @@ def ways() -> list[Way]:
 
 @pytest.fixture(scope="module")
 def described() -> dict[str, Any]:
-    return document(create_app(Settings(host="127.0.0.1")))
+    return create_app(Settings(host="127.0.0.1")).openapi()
 
 
 def test_every_route_has_a_row_and_every_row_a_route(ways: list[Way]) -> None:
@@ -41,7 +40,7 @@ def test_no_two_operations_have_one_name(ways: list[Way]) -> None:
 
 
 def test_what_is_open_to_all_is_named_here_too() -> None:
-    assert {operation for operation, role in ROLES.items() if role == "open"} == OPEN
+    assert {operation for operation, rule in OPERATIONS.items() if rule.role == "open"} == OPEN
 
 
 def test_a_route_below_a_map_is_held_to_it(ways: list[Way]) -> None:
@@ -88,7 +87,7 @@ def test_the_interface_says_what_each_operation_needs(described: dict[str, Any])
     assert described["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
     for item in described["paths"].values():
         for operation in item.values():
-            name, role = operation["operationId"], ROLES[operation["operationId"]]
+            name, role = operation["operationId"], OPERATIONS[operation["operationId"]].role
             assert operation["x-role"] == role
             answers = set(operation["responses"])
             if role == "open":

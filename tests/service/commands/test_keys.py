@@ -11,7 +11,7 @@ import pytest
 import typer.main
 
 from service.access.keys import KeyStore
-from service.access.principals import TOKEN
+from service.access.roles import TOKEN
 from service.commands import application
 from service.commands.connection.client import Refused, refusal
 from service.commands.connection.credentials import travels_openly

@@ -29,7 +29,7 @@ def test_it_does_not_start_on_the_data_of_another(server: Server) -> None:
 
 def test_it_does_not_start_on_a_port_in_use(server: Server, tmp_path: Path) -> None:
     said = refused("--port", server.port, "--data-dir", tmp_path)
-    assert f"Error: Port {server.port} of 127.0.0.1 cannot be had" in said
+    assert f"Error: Cannot listen on port {server.port} of 127.0.0.1" in said
     assert not list(tmp_path.iterdir())
 
 

@@ -8,9 +8,9 @@ from contextlib import suppress
 
 import pytest
 
-from tests.service.http.wire import answer, ended, eventually, get, open_files, opened, post, rest
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+from tests.service.wire import answer, ended, eventually, get, open_files, opened, post, rest
 
 
 def problem(data: bytes) -> tuple[int, str]:

@@ -10,7 +10,6 @@ import httpx
 import pytest
 
 from service.app.application import create_app
-from service.http.openapi import document
 from service.settings import Settings
 from tests.service.server import ROOT
 
@@ -32,7 +31,7 @@ FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")
 
 @pytest.fixture(scope="module")
 def described() -> dict[str, Any]:
-    return document(create_app(Settings(host="127.0.0.1")))
+    return create_app(Settings(host="127.0.0.1")).openapi()
 
 
 @pytest.fixture(scope="module")

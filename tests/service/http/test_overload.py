@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import re
 
-from tests.service.http.wire import answer, get, opened, post
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+from tests.service.wire import answer, get, opened, post
 
 
 def test_of_64_callers_on_a_queue_of_8_each_is_answered_or_told_to_come_again(strict: Server) -> None:

@@ -9,9 +9,9 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tests.service.http.wire import eventually, get, opened, rest
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+from tests.service.wire import eventually, get, opened, rest
 
 SECRET = "s3cr3t-that-nobody-may-read"
 HEADERS = {"Authorization": f"Bearer {SECRET}", "Cookie": f"key={SECRET}", "X-Other": SECRET}

@@ -13,9 +13,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from tests.service.http.wire import eventually, get, opened, post, rest
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem, typed
+from tests.service.wire import eventually, get, opened, post, rest
 
 FRAMES = [jpeg(seed) for seed in range(8)]
 

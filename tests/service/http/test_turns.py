@@ -16,10 +16,10 @@ from uvicorn.server import ServerState
 
 from service.http.bodies import UploadMemory
 from service.http.connections import Connections, untaken
-from service.http.protocol import HttpConnection
+from service.http.http_connection import HttpConnection
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
-from tests.service.http.wire import get, post
+from tests.service.wire import get, post
 
 LARGE = bytes(3_000_000)
 CLOSE = "Connection: close"

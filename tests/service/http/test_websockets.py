@@ -9,9 +9,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from tests.service.http.wire import ended, eventually, get, open_files, opened, rest
 from tests.service.scenes import jpeg
 from tests.service.server import Server
+from tests.service.wire import ended, eventually, get, open_files, opened, rest
 
 TEXT, CONTINUED, FINAL = 0x01, 0x00, 0x80
 

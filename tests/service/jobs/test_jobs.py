@@ -14,7 +14,8 @@ import pytest
 
 from core.errors import DataDirectoryTooNew, UnknownMap
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
-from service.jobs.jobs import JobContext, Jobs
+from service.jobs.context import JobContext
+from service.jobs.jobs import Jobs
 from service.jobs.records import FILE, Job
 
 Kinds = Mapping[str, Callable[[JobContext], Mapping[str, Any]]]

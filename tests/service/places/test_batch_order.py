@@ -13,7 +13,7 @@ import pytest
 from service.engine.queue import Patience
 from service.errors.faults import BatchOutOfOrder, ClientGone
 from service.places import batch_order as succession
-from service.places.batch_order import Sequel, Stage, Succession
+from service.places.batch_order import BatchOrder, Sequel, Stage
 from tests.service.places.test_batches import send
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -35,7 +35,7 @@ async def begun(waiting: asyncio.Task[None]) -> None:
 
 @pytest.mark.anyio
 async def test_one_waits_until_the_other_has_come_so_far() -> None:
-    line = Succession()
+    line = BatchOrder()
     with line.enter("lab", "b", "a", patience()) as second:
         encoding = asyncio.ensure_future(second.wait_for(Stage.ENCODED))
         storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
@@ -53,7 +53,7 @@ async def test_one_waits_until_the_other_has_come_so_far() -> None:
 
 @pytest.mark.anyio
 async def test_what_fails_is_not_stored_and_may_come_again() -> None:
-    line = Succession()
+    line = BatchOrder()
     second = Sequel(line, "lab", None, "a", patience())
     with pytest.raises(ValueError), line.enter("lab", "a", None, patience()):
         raise ValueError
@@ -70,7 +70,7 @@ async def test_what_fails_is_not_stored_and_may_come_again() -> None:
 
 @pytest.mark.anyio
 async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Succession()
+    line = BatchOrder()
     with line.enter("lab", "slow", None, patience()):
         with pytest.raises(BatchOutOfOrder):
             await Sequel(line, "lab", None, "slow", patience(0.05)).wait_for(Stage.STORED)
@@ -88,7 +88,7 @@ async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.anyio
 async def test_so_many_names_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(succession, "KEPT", 3)
-    line = Succession()
+    line = BatchOrder()
     with line.enter("lab", "open", None, patience()):
         for number in range(9):
             with line.enter("lab", str(number), None, patience()):

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from core.disk.files import write_at
 from core.errors import StorageFailure, StorageFull
-from core.storage.files.disk import write_at
 from service.errors.faults import BodyTooLarge, ClientGone, MalformedBody, StagingFull
 from service.places import staging as module
 from service.places.staging import Staging

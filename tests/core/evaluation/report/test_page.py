@@ -13,7 +13,7 @@ from core.errors import StorageFailure
 from core.evaluation import Comparison, ScalePoint, SeverityCurve
 from core.evaluation.report import write_report
 from core.frames.traverses import tolerance_truth
-from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_pictures
+from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_images
 
 
 def page_of(folder: Path, comparison: Comparison) -> tuple[str, Page]:
@@ -81,7 +81,7 @@ def test_page_refers_to_nothing_outside_itself(written: Written) -> None:
     assert not re.search(r"https?:|//\w", re.sub(r"data:[\w/;,+=-]*", "", html))
 
 
-def test_every_picture_has_a_text(written: Written) -> None:
+def test_every_image_has_a_text(written: Written) -> None:
     page = written.page
     images = page.named("img")
     assert images
@@ -117,9 +117,9 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
     ]
     for name in names:
         if name.endswith(".png"):
-            picture = cv2.imread(str(written.folder / name))
-            assert picture is not None, name
-            assert picture.std() > 5, f"{name} is blank"
+            image = cv2.imread(str(written.folder / name))
+            assert image is not None, name
+            assert image.std() > 5, f"{name} is blank"
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     hostile = replace(
         comparison,
         name=evil,
-        queries=write_pictures(tmp_path / "hostile", 8, names),
+        queries=write_images(tmp_path / "hostile", 8, names),
         notes=[evil],
         runs=[make_run(evil, comparison.runs[0].scores, comparison.kept, comparison.truth, title=evil)],
         severity=[SeverityCurve(evil, evil, [0.0, 1.0], evil, [0.9, 0.5], [0.8, 0.3])],
@@ -234,12 +234,12 @@ def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
     assert ["regions of interest" in section.text for section in sections] == [False, True]
 
 
-def test_pictures_that_are_gone_leave_their_names(tmp_path: Path) -> None:
+def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     comparison.queries[3].unlink()
     without = replace(comparison, references=[])
     _, page = page_of(tmp_path / "report", without)
-    assert sum(article.text.count("no picture") for article in page.named("article")) >= len(page.named("article")) * 2
+    assert sum(article.text.count("no image") for article in page.named("article")) >= len(page.named("article")) * 2
 
 
 def test_same_comparison_same_bytes(tmp_path: Path, written: Written) -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from core.disk.files import Damage
 from core.storage.database.connections import Database, DatabaseClosed, connect
 from core.storage.database.schema import migrate
-from core.storage.files.disk import Damage
 
 
 @pytest.fixture

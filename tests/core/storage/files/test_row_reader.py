@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 from core.storage.files.row_formats import Precision
-from core.storage.files.row_reader import Shelf
+from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
-from tests.core.storage.frames import descriptor_of, local_of
+from tests.core.storage.frames import descriptor_of, local_of, packed
 
 SHAPE, ROWS = (3, 5), 10
 
@@ -22,13 +22,13 @@ def layout_of(precision: Precision) -> Layout:
     return Layout(dimension=32, identity="encoder@1", rows_per_segment=4, local_shape=SHAPE, precision=precision)
 
 
-def filled(folder: Path, precision: Precision) -> tuple[Shelf, NDArray[np.void]]:
+def filled(folder: Path, precision: Precision) -> tuple[RowReader, NDArray[np.void]]:
     """A shelf of ten rows in three segments, and its records."""
     layout = layout_of(precision)
     names = [f"row {row}" for row in range(ROWS)]
-    records = layout.packed([descriptor_of(name, 32) for name in names], [local_of(name) for name in names], 0)
+    records = packed(layout, [descriptor_of(name, 32) for name in names], [local_of(name) for name in names], 0)
     append(folder, layout, 0, records)
-    return Shelf(folder, layout), records
+    return RowReader(folder, layout), records
 
 
 EVERY: list[Precision] = ["full", "half", "compressed"]
@@ -50,9 +50,9 @@ def test_rows_come_in_the_order_asked_for(tmp_path: Path, precision: Precision, 
 @pytest.mark.parametrize("precision", EVERY)
 def test_a_map_without_local_descriptors_has_none_to_read(tmp_path: Path, precision: Precision) -> None:
     layout = Layout(dimension=32, identity="encoder@1", rows_per_segment=4, precision=precision)
-    records = layout.packed([descriptor_of("a", 32)], [np.empty((0, 0), np.int8)], 0)
+    records = packed(layout, [descriptor_of("a", 32)], [np.empty((0, 0), np.int8)], 0)
     append(tmp_path, layout, 0, records)
-    shelf, row = Shelf(tmp_path, layout), np.array([0])
+    shelf, row = RowReader(tmp_path, layout), np.array([0])
     np.testing.assert_array_equal(shelf.descriptors(row, records["checksum"]), layout.descriptors_of(records))
     assert shelf.locals(row, records["checksum"]).shape == (1, 0, 0)
 

@@ -1,0 +1,152 @@
+"""Request headers of RFC 9110: the preferred form of an answer, entity tags and conditions, and ranges of bytes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from core.errors import RevisionMismatch
+from service.errors.faults import ExportGone, RangeNotSatisfiable
+
+_ETAG = re.compile(r'(W/)?"([^"]*)"')
+_RANGE = re.compile(r"bytes=\s*(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))\s*", re.IGNORECASE)
+
+
+# Content negotiation (section 12.5.1)
+
+
+def preferred(accept: str | None, *offered: str) -> str:
+    """The offered media type to which an Accept header gives the most weight.
+
+    The first one is chosen among equals, and if the header accepts none of them.
+    """
+    if not accept:
+        return offered[0]
+    weights = [_weight(accept, media_type) for media_type in offered]
+    return offered[max(range(len(offered)), key=lambda index: (weights[index], -index))]
+
+
+def _weight(accept: str, media_type: str) -> float:
+    """The weight of a media type: that of the most specific media range which includes it."""
+    specificities = {media_type: 3, media_type.split("/")[0] + "/*": 2, "*/*": 1}
+    best, weight = 0, 0.0
+    for entry in accept.lower().split(","):
+        name, *parameters = (part.strip() for part in entry.split(";"))
+        specificity = specificities.get(name, 0)
+        if specificity > best:
+            best, weight = specificity, _quality(parameters)
+    return weight
+
+
+def _quality(parameters: list[str]) -> float:
+    for parameter in parameters:
+        if parameter.startswith("q="):
+            try:
+                return float(parameter[2:])
+            except ValueError:
+                return 0.0
+    return 1.0
+
+
+# Entity tags and conditional requests (section 13)
+
+
+def entity_tag(revision: int) -> str:
+    """The ETag of a map's revision."""
+    return f'"{revision}"'
+
+
+def expected_revision(if_match: str | None, current: int) -> int | None:
+    """The revision that an edit requires; None if it accepts any.
+
+    Args:
+        if_match: the value of the If-Match header.
+        current: the map's revision now.
+
+    Raises:
+        RevisionMismatch: the header names only other revisions.
+    """
+    if if_match is None or if_match.strip() == "*":
+        return None
+    if str(current) not in strong_tags(if_match):
+        raise RevisionMismatch(
+            f"The map has changed: it is at revision {current} and its ETag is {entity_tag(current)}. "
+            "Read it again and repeat the edit."
+        )
+    return current
+
+
+def strong_tags(header: str | None) -> list[str]:
+    """The strong entity tags of a header, without their quotes."""
+    return [tag for weak, tag in _ETAG.findall(header or "") if not weak]
+
+
+def named_tags(headers: Mapping[str, str]) -> list[str]:
+    """The entity tags of the content of which the caller has a part and wants the rest."""
+    return strong_tags(headers.get("if-match")) + strong_tags(headers.get("if-range"))
+
+
+def check_match(headers: Mapping[str, str], tag: str) -> None:
+    """Check that If-Match, if the caller sends it, allows the content with this tag.
+
+    Raises:
+        ExportGone: the header names only other content.
+    """
+    wanted = headers.get("if-match")
+    if wanted is not None and wanted.strip() != "*" and tag not in strong_tags(wanted):
+        raise ExportGone("The export that If-Match names is no longer kept. Download the map again from the beginning.")
+
+
+def is_known(headers: Mapping[str, str], tag: str) -> bool:
+    """Whether If-None-Match says that the caller has the content with this tag already."""
+    held = headers.get("if-none-match")
+    return held is not None and (held.strip() == "*" or tag in [found for _, found in _ETAG.findall(held)])
+
+
+# Range requests (section 14)
+
+
+@dataclass(frozen=True)
+class Slice:
+    """The bytes from ``start`` up to, not including, ``stop`` of ``size`` bytes."""
+
+    start: int
+    stop: int
+    size: int
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the slice is all of the content."""
+        return (self.start, self.stop) == (0, self.size)
+
+    @property
+    def content_range(self) -> str:
+        """The value of the Content-Range header."""
+        return f"bytes {self.start}-{self.stop - 1}/{self.size}"
+
+
+def wanted_slice(headers: Mapping[str, str], tag: str, size: int) -> Slice:
+    """The part of the content that the caller asks for.
+
+    It is all of the content unless the caller asks for one range, and for a range of the content with this tag.
+    Several ranges, other units and ranges that cannot be parsed may be ignored (section 14.2), and are.
+
+    Raises:
+        RangeNotSatisfiable: the range begins after the end.
+    """
+    whole = Slice(0, size, size)
+    named = _RANGE.fullmatch(headers.get("range", ""))
+    condition = headers.get("if-range")
+    if named is None or (condition is not None and tag not in strong_tags(condition)):
+        return whole
+    first, last, suffix = named.groups()
+    if suffix is not None:
+        start, stop = max(0, size - int(suffix)), size
+    else:
+        start, stop = int(first), size if last is None else min(size, int(last) + 1)
+        if last is not None and int(last) < start:
+            return whole
+    if start >= stop:
+        raise RangeNotSatisfiable(f"The export has {size} bytes; the requested range begins after its end.", size)
+    return Slice(start, stop, size)

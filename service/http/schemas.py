@@ -1,0 +1,66 @@
+"""Models and fields that the requests and answers of several resources share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from core.places import Camera
+from service.errors.faults import InvalidRequest
+from service.errors.problems import invalid_request
+
+IDENTITY_EXAMPLE = "m-region-vlad@3c9d…"
+
+Milliseconds = Annotated[dict[str, float], Field(description="Milliseconds spent in each stage.")]
+Cursor = Annotated[str | None, Field(description="Send it as ?cursor= to get the next page; null on the last page.")]
+CameraName = Annotated[
+    Camera | None, Field(description="The camera of the map that took the frame; its mask is applied.")
+]
+EncoderAssertion = Annotated[
+    str | None,
+    Field(max_length=256, description="Name or identity that the map's encoder must have (409 otherwise)."),
+]
+Matches = Annotated[int, Field(ge=1, le=100, description="How many matches to list.")]
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def validated(model: type[Model], value: Any) -> Model:
+    """Validate a value with a model.
+
+    Raises:
+        InvalidRequest: the value does not fit the model.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise invalid_request(error.errors(include_url=False)) from error
+
+
+class Parameters(BaseModel):
+    """Base of the parameters of one operation; unknown names are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def joined(self, fields: Mapping[str, str]) -> Self:
+        """These parameters, from the query string, together with the fields of a form.
+
+        Raises:
+            InvalidRequest: a field is unknown, invalid, or given in the query string too.
+        """
+        if not fields:
+            return self
+        given = self.model_dump(exclude_unset=True)
+        twice = sorted(set(given) & set(fields))
+        if twice:
+            raise InvalidRequest(f"{twice[0]} is given both in the query string and in the form.")
+        return validated(type(self), {**given, **fields})
+
+
+class PageParameters(Parameters):
+    """Which part of a listing."""
+
+    cursor: str | None = Field(default=None, max_length=1024, description="The next_cursor of the previous page.")
+    limit: int = Field(default=100, ge=1, le=1000, description="Most items on a page.")

@@ -1,0 +1,143 @@
+"""What callers say about a place beside its frame: in the query string, in form fields, in the JSON of a batch."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import Query
+from pydantic import BeforeValidator, Field, model_validator
+
+from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
+from service.errors.faults import InvalidRequest
+from service.http.bodies import json_size
+from service.http.schemas import CameraName, EncoderAssertion, PageParameters, Parameters, validated
+from service.http.uploads import parse_metadata
+from service.settings import Settings
+
+POSE = ("x", "y", "z", "latitude", "longitude", "heading")
+
+
+def check_metadata(metadata: dict[str, Any], settings: Settings) -> None:
+    """Check that metadata can be stored.
+
+    Raises:
+        InvalidRequest: the metadata is too large, or cannot be written as JSON.
+    """
+    if json_size(metadata, "metadata") > settings.max_metadata_bytes:
+        raise InvalidRequest(f"metadata: the value has more than {settings.max_metadata_bytes} bytes.")
+
+
+class PlaceDescription(Parameters):
+    """Pose, time and traverse of a frame, flat."""
+
+    x: Coordinate | None = Field(default=None, description="Metres in the map's frame; with y.", examples=[1.5])
+    y: Coordinate | None = Field(default=None, description="Metres in the map's frame; with x.", examples=[2.0])
+    z: Coordinate | None = Field(default=None, description="Metres in the map's frame; beside x and y.")
+    latitude: float | None = Field(default=None, ge=-90, le=90, allow_inf_nan=False, description="Degrees, WGS 84.")
+    longitude: float | None = Field(default=None, ge=-180, le=180, allow_inf_nan=False, description="Degrees, WGS 84.")
+    heading: float | None = Field(
+        default=None,
+        ge=-360,
+        le=360,
+        allow_inf_nan=False,
+        description="Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude.",
+        examples=[90.0],
+    )
+    timestamp: Timestamp | None = Field(
+        default=None,
+        description="When the frame was taken (ISO 8601; UTC without a zone).",
+        examples=["2026-11-20T10:00:00Z"],
+    )
+    sequence: Sequence | None = Field(
+        default=None, description="The traverse that the frame belongs to.", examples=["monday"]
+    )
+    camera: CameraName = None
+
+    def fields(self, metadata: dict[str, Any], settings: Settings) -> PlaceFields:
+        """The fields of a place with this description.
+
+        Raises:
+            InvalidRequest: the pose is incomplete or of both kinds, or the metadata cannot be stored.
+        """
+        check_metadata(metadata, settings)
+        pose = {name: value for name in POSE if (value := getattr(self, name)) is not None}
+        return PlaceFields(
+            pose=validated(Pose, pose) if pose else None,
+            timestamp=self.timestamp,
+            sequence=self.sequence,
+            camera=self.camera,
+            metadata=metadata,
+        )
+
+
+class EnrolParameters(PlaceDescription):
+    """Beside one frame to enrol."""
+
+    metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"camera": "front"}'])
+    encoder: EncoderAssertion = None
+
+    def place_fields(self, settings: Settings) -> PlaceFields:
+        """The fields of the place; it raises what ``PlaceDescription.fields`` raises."""
+        metadata = {} if self.metadata is None else parse_metadata(self.metadata)
+        return self.fields(metadata, settings)
+
+
+BatchName = Annotated[str | None, Field(pattern=r"^[A-Za-z0-9._~-]{1,64}$", examples=["monday-17"])]
+
+
+class BatchParameters(Parameters):
+    """Beside many frames to enrol."""
+
+    encoder: EncoderAssertion = None
+    background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
+    batch: BatchName = Field(
+        default=None,
+        description="A name for this batch, for example a random one, to which another batch can refer with after.",
+    )
+    after: BatchName = Field(
+        default=None,
+        description="The batch of this map after which this one is to be stored. It may still be under way: this one "
+        "is encoded meanwhile. If it is not stored in time, the answer is 409 batch-out-of-order, and nothing of "
+        "this batch is stored.",
+    )
+
+    @model_validator(mode="after")
+    def _can_follow(self) -> BatchParameters:
+        if self.background and (self.batch, self.after) != (None, None):
+            raise ValueError(
+                "batch and after cannot be used with background, only in requests that are answered once all is stored"
+            )
+        if self.batch is not None and self.batch == self.after:
+            raise ValueError("a batch cannot come after itself")
+        return self
+
+
+class BatchItem(PlaceDescription):
+    """One place of a batch: its frame is in a part of the form, or is the one that the place already has."""
+
+    id: str = Field(description="Id of the place.", examples=["p7"])
+    file: str | None = Field(default=None, description="Name of the file part.", examples=["frame7"])
+    sha256: str | None = Field(
+        default=None,
+        pattern="^[0-9a-f]{64}$",
+        description="Instead of a file: the SHA-256 of the frame that the place already has. If it does have it, "
+        "only its fields are replaced; otherwise the answer is 409 frame-needed, and the frame has to be sent.",
+    )
+    metadata: Annotated[dict[str, Any], BeforeValidator(lambda value: {} if value is None else value)] = Field(
+        default_factory=dict
+    )
+
+    @model_validator(mode="after")
+    def _names_its_frame(self) -> BatchItem:
+        if (self.file is None) == (self.sha256 is None):
+            raise ValueError("give either the name of its part as file, or the digest of its frame as sha256")
+        return self
+
+
+class PlacePageParameters(PageParameters):
+    """Which places."""
+
+    sequence: str | None = Field(default=None, max_length=128, description="Only the places of this traverse.")
+
+
+PlacePageQuery = Annotated[PlacePageParameters, Query()]
