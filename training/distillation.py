@@ -153,7 +153,7 @@ def distill(
 
     if start is not None and first == 0:
         pixels = torch.cat([clean for clean, _ in itertools.islice(crops_of(split.train, 0, 8 * batch, seed + 3), 8)])
-        student.take_up(load_file(start), pixels)
+        student.load_folded_weights(load_file(start), pixels)
         average.load_state_dict(student.state_dict())
     backbone = list(student.stages.parameters())
     heads_alone = 0 if start is None else int(HEADS_ALONE * steps)

@@ -104,7 +104,7 @@ class MapModel:
     # Writes; each returns the answer that it must get
 
     def enrol(self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None) -> str:
-        """One frame: created, replaced, updated or unchanged."""
+        """Enrol a frame; created, replaced, updated or unchanged."""
         known = self.places.get(place_id)
         if known is not None and known.shown.digest == shown.digest:
             return self.set_fields(place_id, fields)
@@ -120,7 +120,7 @@ class MapModel:
         return "created" if known is None else "replaced"
 
     def set_fields(self, place_id: str, fields: Fields) -> str:
-        """Other fields for the same frame."""
+        """Change the fields of a place and keep its frame."""
         place = self.place(place_id)
         if canonical(place.fields) == canonical(fields):
             return "unchanged"
@@ -129,11 +129,11 @@ class MapModel:
         return "updated"
 
     def patch(self, place_id: str, changes: Fields) -> str:
-        """A merge patch."""
+        """Apply a merge patch to the fields of a place."""
         return self.set_fields(place_id, merged(self.place(place_id).fields, changes))
 
     def adopt(self, place_id: str, of: PlaceModel, ordinal: int | None) -> None:
-        """A place of another map with its history."""
+        """Take over a place of another map with its history."""
         before = self.places.get(place_id)
         same = before is not None and before.shown.digest == of.shown.digest
         self.enrol(place_id, of.shown, of.fields, of.kept)
@@ -145,13 +145,13 @@ class MapModel:
         self.ends[place.sequence] = max(self.ends[place.sequence], place.ordinal + 1)
 
     def forget(self, place_id: str) -> None:
-        """One place."""
+        """Remove a place."""
         gone = self.place(place_id)
         del self.places[place_id]
         self._drop_if_empty(gone.sequence)
 
     def forget_sequence(self, name: str) -> int:
-        """All of a traverse."""
+        """Remove all places of a traverse; their number."""
         gone = [place_id for place_id, place in self.places.items() if place.sequence == name]
         if not gone:
             raise Refused("UnknownSequence")
@@ -160,7 +160,7 @@ class MapModel:
         return len(gone)
 
     def edit(self, changes: dict[str, Any]) -> int:
-        """Settings; the revision that follows."""
+        """Change settings; the new revision."""
         if any(self.settings[name] != value for name, value in changes.items()):
             self.settings = {**self.settings, **changes}
             self.revision, self.updated = self.revision + 1, ANY

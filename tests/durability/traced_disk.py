@@ -38,7 +38,7 @@ SECTOR = 512
 
 
 def arguments(trace_file: Path) -> list[str]:
-    """What to put before a command, or before ``-p`` and a process, so that its trace can be replayed."""
+    """The words before a command, or before ``-p`` and a process id, that trace it so that it can be replayed."""
     calls = f"trace={','.join(TRACED)}"
     return [strace() or "strace", "-f", "-y", "-xx", "-s", str(1 << 24), "-e", calls, "-o", str(trace_file)]
 

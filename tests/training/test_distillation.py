@@ -79,7 +79,7 @@ def test_a_run_goes_on_from_earlier_weights(photographs: Path, teacher_weights: 
     assert torch.nn.functional.cosine_similarity(maps[0], maps[1], dim=0) > 0.98
 
 
-def test_taking_up_weights_keeps_the_features() -> None:
+def test_loading_folded_weights_keeps_the_features() -> None:
     torch.manual_seed(1)
     student, other = Student(), Student()
     student.train()
@@ -87,7 +87,7 @@ def test_taking_up_weights_keeps_the_features() -> None:
     with torch.no_grad():
         student.features(pixels)
     student.eval()
-    other.take_up(student.folded_weights(), pixels)
+    other.load_folded_weights(student.folded_weights(), pixels)
     other.eval()
     with torch.no_grad():
         for taken, original in zip(other.features(pixels), student.features(pixels), strict=True):

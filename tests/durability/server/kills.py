@@ -152,7 +152,7 @@ class Client:
 
 @dataclass
 class Tally:
-    """What a campaign has done."""
+    """Counts of a campaign."""
 
     kills: int = 0
     operations: int = 0

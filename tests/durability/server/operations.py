@@ -139,7 +139,7 @@ def pruned(world: World, map_id: str, report: dict[str, Any]) -> World:
 
 
 def send(client: httpx.Client, operation: Operation) -> dict[str, Any]:
-    """Make the request; the answer as the model gives it, the places that it told, and what else is of use."""
+    """Send the request; the answer in the model's form, with the places in it."""
     return _SENT[operation["do"]](client, operation)
 
 

@@ -35,11 +35,11 @@ class ServerProcess:
             self._handle = os.pidfd_open(number)
 
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process runs."""
         return self._handle is not None and not select.select([self._handle], [], [], 0)[0]
 
     def wait(self) -> Self:
-        """Return when it is ready."""
+        """Wait until the server is ready."""
         until = time.monotonic() + START_SECONDS
         while time.monotonic() < until:
             assert self.is_running(), f"the server has ended:\n{self.log.read_text()[-4000:]}"
@@ -50,7 +50,7 @@ class ServerProcess:
         raise AssertionError(f"the server is not ready:\n{self.log.read_text()[-4000:]}")
 
     def kill(self) -> None:
-        """SIGKILL, as often as one likes; returns when it is gone."""
+        """Send SIGKILL and wait for the end; more than once does no harm."""
         if self._handle is None:
             return
         with suppress(ProcessLookupError):
@@ -58,7 +58,7 @@ class ServerProcess:
         assert select.select([self._handle], [], [], 60)[0], "the process does not end"
 
     def close(self) -> None:
-        """Kill it and let everything go."""
+        """Kill the server and close the connections."""
         self.kill()
         self.client.close()
         if self._handle is not None:

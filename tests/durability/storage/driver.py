@@ -216,7 +216,7 @@ UNSYNCED = ("log", "descriptors", "names")
 
 
 def _leave_unsynced(what: str) -> None:
-    """Break the storage layer: leave SQLite's log, segment files or folders unsynced, which is to be found out."""
+    """Break the storage layer: leave SQLite's log, segment files or folders unsynced, for a test of the harness."""
     sync, connect = os.fsync, database.connect
 
     def sync_others(file: int) -> None:

@@ -28,7 +28,7 @@ Point = tuple[str, int]
 
 @dataclass
 class PointTally:
-    """What has been done."""
+    """Counts of the points that were tried."""
 
     points: int = 0
     killed: int = 0  # the others were not met: threads do not run alike twice
@@ -52,7 +52,7 @@ def points(processes: StorageProcesses, folder: Path, seed: object) -> list[Poin
 
 
 def kill_at(processes: StorageProcesses, folder: Path, seed: object, point: Point) -> tuple[bool, int]:
-    """Run until the point, and compare; whether it was met, and operations begun.
+    """Run until the point and compare; whether the point was reached, and how many operations were begun.
 
     Raises:
         Lost: something that was acknowledged is not there, or something is half there.

@@ -81,7 +81,7 @@ class Worker:
 
 @dataclass
 class Tally:
-    """What a campaign has done."""
+    """Counts of a campaign."""
 
     kills: int = 0
     operations: int = 0

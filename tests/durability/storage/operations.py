@@ -29,19 +29,19 @@ DEFAULTS = MapSettings().model_dump(mode="json")
 
 
 def image_of(picture: str) -> bytes:
-    """The bytes of a picture: from a few to some tens of thousands, as it pleases its name."""
+    """The bytes of a picture: a few to some tens of thousands, depending on its name."""
     length = 1 << (digest_of(picture)[0] % 16)
     return (f"image of {picture} ".encode() * (1 + length // 12))[:length] + picture.encode()
 
 
 def thumbnail_of(picture: str) -> bytes:
-    """What is kept of it where thumbnails are."""
+    """The bytes of its thumbnail."""
     return f"thumbnail of {picture}".encode()
 
 
 @lru_cache(maxsize=4096)
 def shown(picture: str) -> Shown:
-    """What must be found of a place that shows the picture."""
+    """What must be found of a place with this picture."""
     real = descriptor_of(picture)[np.newaxis]
     kept: tuple[Precision, ...] = ("full", "half", "compressed")
     stored = {name: unpack_descriptors(pack_descriptors(real, name), name, DIMENSION) for name in kept}
@@ -171,7 +171,7 @@ _APPLIED: dict[str, Callable[[World, Operation], Any]] = {
 
 
 def chosen(random: Random, world: World, prefix: str) -> Operation:
-    """The next operation of the one who has the maps whose ids begin so."""
+    """The next operation of the worker whose maps' ids begin with ``prefix``."""
     names = [f"{prefix}{number}" for number in range(MAPS)]
     listed = [name for name in names if name in world and world[name].listed]
     unlisted = [name for name in names if name in world and not world[name].listed]
@@ -300,7 +300,7 @@ def _cameras(random: Random, world: World, name: str, listed: list[str]) -> Oper
 
 
 def _adopted(random: Random, world: World, name: str, listed: list[str]) -> Operation | None:
-    """Places of a map that keeps descriptors alike, so that they come over as they are."""
+    """Places of another map with the same precision, so that descriptors are taken over unchanged."""
     precision = world[name].precision
     sources = [one for one in listed if one != name and world[one].precision == precision and world[one].places]
     if not sources or precision == "compressed":

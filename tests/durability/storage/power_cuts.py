@@ -19,7 +19,7 @@ ATTACHING_SECONDS = 30.0
 
 
 def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.Popen[bytes]:
-    """Let a tracer follow a process that waits, then let that go on."""
+    """Attach a tracer to a waiting process, then let the process go on."""
     with log.open("ab") as told:
         tracing = subprocess.Popen([*tracer, "-p", str(process.number)], stderr=told)
     until = time.monotonic() + ATTACHING_SECONDS
@@ -33,7 +33,7 @@ def attach(process: StorageProcess, tracer: list[str], log: Path) -> subprocess.
 
 @dataclass
 class PowerTally:
-    """What a replay has done."""
+    """Counts of a replay."""
 
     operations: int = 0
     writes: int = 0
@@ -46,7 +46,7 @@ class PowerTally:
 
 
 def record(processes: StorageProcesses, folder: Path, seed: object, operations: int) -> tuple[Path, list[World]]:
-    """A traced process that does random operations; its trace, and the world after each acknowledgement.
+    """Trace a process that does random operations; the trace, and the world after each acknowledgement.
 
     Raises:
         Lost: an answer was wrong.

@@ -1,4 +1,4 @@
-"""Damage to JPEG files that knows their parts: lengths, frame headers, tables, scans."""
+"""Damage to the parts of JPEG files: lengths, frame headers, tables, scans."""
 
 from __future__ import annotations
 

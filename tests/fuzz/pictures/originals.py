@@ -1,4 +1,4 @@
-"""Sound pictures in every way that the three formats can hold one: what the mutations start from."""
+"""Sound pictures in all variants of the three formats, which the mutations start from."""
 
 from __future__ import annotations
 

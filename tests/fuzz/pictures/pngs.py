@@ -1,4 +1,4 @@
-"""Damage to PNG files that knows their chunks, with checksums made right again where the lie is elsewhere."""
+"""Damage to the chunks of PNG files; checksums are corrected unless they are what is damaged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage to WebP files that knows their chunks: sizes, canvas, flags, key frames."""
+"""Damage to the chunks of WebP files: sizes, canvas, flags, key frames."""
 
 from __future__ import annotations
 
