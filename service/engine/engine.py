@@ -20,7 +20,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.queue import Encoded, EncoderQueue, Outcomes, Patience, Then
+from service.engine.queue import Encoded, EncoderQueue, Outcomes, RequestDeadline, Then
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.settings import Settings
@@ -196,7 +196,7 @@ class Engine:
         self,
         map_: Map,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         mask: Mask | None = None,
         then: Then | None = None,
     ) -> Encoded:
@@ -207,7 +207,7 @@ class Engine:
             Others: as for ``EncoderQueue.encode``.
         """
         try:
-            return await self.queue.encode(map_.record.encoder, data, patience, mask, then)
+            return await self.queue.encode(map_.record.encoder, data, deadline, mask, then)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -215,7 +215,7 @@ class Engine:
         self,
         map_: Map,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         k: int,
         selection: Selection | None = None,
         mask: Mask | None = None,
@@ -233,12 +233,16 @@ class Engine:
             Others: as for ``encode_for``.
         """
         with self.queue.place():
-            encoded = await self.encode_for(map_, data, patience, mask, search_ahead(map_, k, selection))
+            encoded = await self.encode_for(map_, data, deadline, mask, search_ahead(map_, k, selection))
         (recognized,) = await self.searches.recognize(map_, [encoded], k, selection)
         return recognized
 
     async def encode_many(
-        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+        self,
+        identity: str,
+        frames: Sequence[bytes],
+        deadline: RequestDeadline,
+        masks: Sequence[Mask | None] | None = None,
     ) -> AsyncGenerator[Outcomes]:
         """Encode many frames, as ``EncoderQueue.encode_many`` does; close the generator (``contextlib.aclosing``).
 
@@ -249,7 +253,7 @@ class Engine:
             EncoderNotInstalled: the encoder is not installed (any more).
             Others: as for ``EncoderQueue.encode_many``.
         """
-        async with aclosing(self.queue.encode_many(identity, frames, patience, masks)) as outcomes:
+        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for _, outcome in some:
                     if isinstance(outcome, UnknownEncoder):
@@ -257,11 +261,15 @@ class Engine:
                 yield some
 
     async def encode_all(
-        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+        self,
+        identity: str,
+        frames: Sequence[bytes],
+        deadline: RequestDeadline,
+        masks: Sequence[Mask | None] | None = None,
     ) -> list[Encoded | Exception]:
         """What became of each of many frames, in their order, without the pixels, which would fill the memory."""
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many(identity, frames, patience, masks)) as outcomes:
+        async with aclosing(self.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()

@@ -1,4 +1,4 @@
-"""Frames on their way through the encoder: a place in the bounded queue, a turn, patience that may end before it."""
+"""Frames on their way through the encoder: a place in the bounded queue, a turn, deadline that may end before it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from service.engine.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then
 from service.errors.faults import ClientGone, QueueFull
 from service.telemetry.metrics import Metrics
 
-__all__ = ["Encoded", "EncoderQueue", "Outcomes", "Patience", "Then"]
+__all__ = ["Encoded", "EncoderQueue", "Outcomes", "RequestDeadline", "Then"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
 """What became of some frames of many, each with its index."""
@@ -34,15 +34,15 @@ UNWATCHED = 0.25
 
 
 @dataclass(frozen=True)
-class Patience:
-    """How long a caller waits: until ``deadline`` (``time.monotonic``) or until ``hung_up`` returns."""
+class RequestDeadline:
+    """When a request stops waiting: at the time ``at`` (``time.monotonic``), or as soon as ``hung_up`` returns."""
 
-    deadline: float
+    at: float
     hung_up: Callable[[], Awaitable[None]]
 
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds until the deadline; negative after it."""
-        return self.deadline - time.monotonic()
+        return self.at - time.monotonic()
 
 
 class EncoderQueue:
@@ -123,7 +123,7 @@ class EncoderQueue:
         self,
         identity: str,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         mask: Mask | None = None,
         then: Then | None = None,
     ) -> Encoded:
@@ -137,18 +137,18 @@ class EncoderQueue:
             InvalidImage: it cannot be decoded.
             UnknownEncoder, InvalidModel: as for ``load``.
         """
-        if patience.left() <= 0:
+        if deadline.seconds_left() <= 0:
             raise late()
-        turn = Turn(identity, data, mask, patience.deadline, then=then)
+        turn = Turn(identity, data, mask, deadline.at, then=then)
         self._batches.put([turn])
         result = asyncio.wrap_future(turn.result)
         gone: asyncio.Future[Any] | None = None
         try:
-            await asyncio.wait({result}, timeout=min(UNWATCHED, patience.left()))
+            await asyncio.wait({result}, timeout=min(UNWATCHED, deadline.seconds_left()))
             if not result.done():
-                gone = asyncio.ensure_future(patience.hung_up())
+                gone = asyncio.ensure_future(deadline.hung_up())
                 waited: set[asyncio.Future[Any]] = {result, gone}
-                left = max(0.0, patience.left())
+                left = max(0.0, deadline.seconds_left())
                 await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
             # A frame that the encoder has begun is finished: dropping it would save nothing.
             if not result.done() and turn.result.cancel():
@@ -165,7 +165,7 @@ class EncoderQueue:
         self,
         identity: str,
         frames: Sequence[bytes],
-        patience: Patience,
+        deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
     ) -> AsyncGenerator[Outcomes]:
         """Encode the frames of a bulk request, some ahead at a time; call it within ``place``.
@@ -180,16 +180,18 @@ class EncoderQueue:
         hidden = [None] * len(frames) if masks is None else masks
         open_: dict[asyncio.Future[Encoded], tuple[int, Turn]] = {}
         begun, bulk = 0, len(frames) > 1
-        gone = asyncio.ensure_future(patience.hung_up())
+        gone = asyncio.ensure_future(deadline.hung_up())
         try:
             while begun < len(frames) or open_:
                 following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
-                turns = [Turn(identity, frames[i], hidden[i], patience.deadline, bulk, asks=False) for i in following]
+                turns = [Turn(identity, frames[i], hidden[i], deadline.at, bulk, asks=False) for i in following]
                 self._batches.put(turns)
                 open_ |= {asyncio.wrap_future(turn.result): (i, turn) for i, turn in zip(following, turns, strict=True)}
                 begun = following.stop
                 waited: set[asyncio.Future[Any]] = {*open_, gone}
-                await asyncio.wait(waited, timeout=max(0.0, patience.left()), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(
+                    waited, timeout=max(0.0, deadline.seconds_left()), return_when=asyncio.FIRST_COMPLETED
+                )
                 done = [(future, *open_.pop(future)) for future in [*open_] if future.done()]
                 if not done and (begun < len(frames) or any(turn.result.cancel() for _, turn in open_.values())):
                     raise _gone() if gone.done() else late()

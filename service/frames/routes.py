@@ -19,7 +19,7 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.frames.schemas import Box, Descriptor, Layer, MatchScore, Region, RegionsView
-from service.http.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.http.dependencies import DeadlineDep, EngineDep, milliseconds_since, rounded, single_values, started
 from service.http.negotiation import preferred
 from service.http.openapi import BINARY, form_body, frame_body
 from service.http.parameters import EncoderParameters, MatchParameters, RegionsParameters
@@ -47,7 +47,7 @@ JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
     },
 )
 async def encode(
-    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The descriptor of a frame, float32: base64 in JSON, or the bytes alone (`Accept: application/octet-stream`).
 
@@ -58,7 +58,7 @@ async def encode(
     frame = await read_frame(request, engine.settings)
     identity = await in_thread(engine.resolve, options.joined(frame.fields).encoder)
     with engine.queue.place():
-        encoded = await engine.queue.encode(identity, frame.data, patience)
+        encoded = await engine.queue.encode(identity, frame.data, deadline)
     regions = len(encoded.encoding.regions)
     if regions == 0:
         raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
@@ -82,7 +82,7 @@ async def encode(
     responses={200: {"description": "The regions.", "content": {PNG: {"schema": BINARY}}}},
 )
 async def regions(
-    options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The regions of interest of a frame: as JSON, or drawn (`?format=png`, or `Accept: image/png`)."""
     engine.queue.check_room()
@@ -90,7 +90,7 @@ async def regions(
     options = options.joined(frame.fields)
     identity = await in_thread(engine.resolve, options.encoder)
     with engine.queue.place():
-        encoded = await engine.queue.encode(identity, frame.data, patience)
+        encoded = await engine.queue.encode(identity, frame.data, deadline)
     found = encoded.encoding.regions
     layers = await in_thread(layer_grids, encoded.encoder)
     chosen = strongest(found, options.limit)
@@ -139,7 +139,7 @@ async def regions(
     responses={200: {"description": "The score.", "content": {PNG: {"schema": BINARY}}}},
 )
 async def match(
-    options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
     itself reach where parts of it are plain."""
@@ -148,8 +148,8 @@ async def match(
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
     with engine.queue.place():
-        a = await in_thread(as_drawn, await engine.queue.encode(identity, first, patience))
-        b = await engine.queue.encode(identity, second, patience)
+        a = await in_thread(as_drawn, await engine.queue.encode(identity, first, deadline))
+        b = await engine.queue.encode(identity, second, deadline)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
     explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None

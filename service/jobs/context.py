@@ -11,7 +11,7 @@ from core.errors import UnknownMap
 from core.frames.masks import Mask
 from core.storage import Atlas, Map
 from service.engine.engine import Engine
-from service.engine.queue import Encoded, Patience
+from service.engine.queue import Encoded, RequestDeadline
 from service.errors.faults import ClientGone
 from service.jobs.records import Job
 
@@ -164,11 +164,13 @@ def stand_back(engine: Engine, context: JobContext) -> None:
         context.pause(0.01)
 
 
-def run_behind(engine: Engine, context: JobContext, work: Callable[[Patience], Coroutine[Any, Any, Result]]) -> Result:
+def run_behind(
+    engine: Engine, context: JobContext, work: Callable[[RequestDeadline], Coroutine[Any, Any, Result]]
+) -> Result:
     """Run a coroutine that waits for the encoder, behind the requests that wait for it; blocks the job's thread.
 
     Args:
-        work: what to run, with the patience of the job: it ends when the job is to stop.
+        work: what to run, with the deadline of the job: it ends when the job is to stop.
 
     Raises:
         JobCancelled, JobInterrupted.
@@ -179,9 +181,9 @@ def run_behind(engine: Engine, context: JobContext, work: Callable[[Patience], C
             await asyncio.sleep(POLL_SECONDS)
 
     stand_back(engine, context)
-    patience = Patience(time.monotonic() + LONGEST_SECONDS, stopped)
+    deadline = RequestDeadline(time.monotonic() + LONGEST_SECONDS, stopped)
     try:
-        return asyncio.run_coroutine_threadsafe(work(patience), engine.loop).result()
+        return asyncio.run_coroutine_threadsafe(work(deadline), engine.loop).result()
     except ClientGone:
         context.check_cancelled()
         raise
@@ -198,7 +200,7 @@ def encode_behind(
         JobCancelled, JobInterrupted.
     """
 
-    async def encode(patience: Patience) -> list[Encoded | Exception]:
-        return await engine.encode_all(identity, frames, patience, masks)
+    async def encode(deadline: RequestDeadline) -> list[Encoded | Exception]:
+        return await engine.encode_all(identity, frames, deadline, masks)
 
     return run_behind(engine, context, encode)

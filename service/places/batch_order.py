@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import BatchOutOfOrder, ClientGone
 
 KEPT = 1024
@@ -36,14 +36,14 @@ class BatchOrder:
         self._changed = asyncio.Event()
 
     @contextmanager
-    def enter(self, map_id: str, batch: str | None, after: str | None, patience: Patience) -> Iterator[Sequel]:
+    def enter(self, map_id: str, batch: str | None, after: str | None, deadline: RequestDeadline) -> Iterator[Sequel]:
         """A batch of this name in line, behind another; left without an error, it is stored.
 
         Args:
             batch: None: nobody can come after it.
             after: None: it waits for nobody.
         """
-        sequel = Sequel(self, map_id, batch, after, patience)
+        sequel = Sequel(self, map_id, batch, after, deadline)
         sequel.reach(Stage.BEGUN)
         try:
             yield sequel
@@ -78,8 +78,10 @@ class BatchOrder:
 class Sequel:
     """One batch in line."""
 
-    def __init__(self, line: BatchOrder, map_id: str, batch: str | None, after: str | None, patience: Patience) -> None:
-        self._line, self._patience = line, patience
+    def __init__(
+        self, line: BatchOrder, map_id: str, batch: str | None, after: str | None, deadline: RequestDeadline
+    ) -> None:
+        self._line, self._deadline = line, deadline
         self._map_id, self._batch, self._after = map_id, batch, after
 
     def reach(self, stage: Stage | None) -> None:
@@ -97,10 +99,10 @@ class Sequel:
         if self._after is None:
             return
         absent_since = time.monotonic()
-        gone = asyncio.ensure_future(self._patience.hung_up())
+        gone = asyncio.ensure_future(self._deadline.hung_up())
         try:
             while (found := self._line.stage(self._map_id, self._after)) is None or found < stage:
-                left = self._patience.left()
+                left = self._deadline.seconds_left()
                 if found is None:
                     left = min(left, absent_since + GRACE - time.monotonic())
                 else:

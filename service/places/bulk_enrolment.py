@@ -14,7 +14,7 @@ from starlette.requests import Request
 
 from core.storage import Map
 from service.engine.engine import Engine
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
@@ -178,8 +178,8 @@ class _BulkEnrolment:
             check_own(error)
             failures[positions[index]] = error
 
-        async def work(patience: Patience) -> dict[int, Enrolled]:
-            return await enrol(self.engine, self.map, candidates, patience, reject, queued=False)
+        async def work(deadline: RequestDeadline) -> dict[int, Enrolled]:
+            return await enrol(self.engine, self.map, candidates, deadline, reject, queued=False)
 
         stored = run_behind(self.engine, self.context, work) if candidates else {}
         for one in stored.values():

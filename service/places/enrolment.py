@@ -13,7 +13,7 @@ from core.places import Place, PlaceFields
 from core.recognition.recognition import describe, frame_digest
 from core.storage import Change, Enrolment, Map, SameFrame
 from service.engine.engine import Engine
-from service.engine.queue import AHEAD, Encoded, Patience
+from service.engine.queue import AHEAD, Encoded, RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import Sequel, Stage
 from service.worker_threads import in_thread
@@ -78,7 +78,7 @@ async def enrol(
     engine: Engine,
     map_: Map,
     candidates: Sequence[Candidate],
-    patience: Patience,
+    deadline: RequestDeadline,
     reject: Callable[[int, Exception], None] = _raise,
     queued: bool = True,
     sequel: Sequel | None = None,
@@ -116,7 +116,7 @@ async def enrol(
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [candidates[i].mask for i in new]
             with engine.queue.place(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many(map_.record.encoder, bodies, patience, masks)) as outcomes:
+                async with aclosing(engine.encode_many(map_.record.encoder, bodies, deadline, masks)) as outcomes:
                     async for some in outcomes:
                         frames = {new[index]: outcome for index, outcome in some}
                         # Thumbnails are made, and pixels let go, while the encoder is at the next frames.

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from core import errors
 from core.storage.patches import merge_patch
 from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BatchOutOfOrder,
     EncoderNotInstalled,
@@ -24,11 +24,11 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.bodies import StrictRoute
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     FromState,
     MapId,
     Page,
-    PatienceDep,
     PlaceId,
     PlacePageQuery,
     SequenceName,
@@ -113,7 +113,7 @@ async def enrol_place(
     request: Request,
     response: Response,
     engine: EngineDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> EnrolledPlace:
     """Enrol one frame under an id of the caller's.
 
@@ -124,7 +124,7 @@ async def enrol_place(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = options.place_fields(engine.settings)
     mask = await camera_mask(map_, fields.camera)
-    stored = (await enrol(engine, map_, [Candidate(place_id, fields, data, mask)], patience))[0]
+    stored = (await enrol(engine, map_, [Candidate(place_id, fields, data, mask)], deadline))[0]
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "change": stored.change}
     return EnrolledPlace(
@@ -153,7 +153,7 @@ async def enrol_places(
     jobs: JobsDep,
     staging: StagingDep,
     batch_order: BatchOrderDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> BatchResults | Response:
     """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
 
@@ -168,12 +168,12 @@ async def enrol_places(
     """
     if options.background:
         return await _enrol_later(map_id, options, request, engine, jobs, staging)
-    with batch_order.enter(map_id, options.batch, options.after, patience) as sequel:
-        return await _enrol_now(map_id, options, request, engine, patience, sequel)
+    with batch_order.enter(map_id, options.batch, options.after, deadline) as sequel:
+        return await _enrol_now(map_id, options, request, engine, deadline, sequel)
 
 
 async def _enrol_now(
-    map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
+    map_id: str, options: BatchParameters, request: Request, engine: Engine, deadline: RequestDeadline, sequel: Sequel
 ) -> BatchResults:
     engine.queue.check_room()
     map_ = await engine.map(map_id)
@@ -206,7 +206,7 @@ async def _enrol_now(
         engine,
         map_,
         list(candidates.values()),
-        patience,
+        deadline,
         lambda index, error: reject(positions[index], error),
         sequel=sequel,
     )

@@ -18,7 +18,7 @@ from core.method.vlad import assign
 from core.places import Place
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.queue import Encoded, RequestDeadline
 from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
 from service.queries.schemas import (
     CellPair,
@@ -43,7 +43,7 @@ def as_drawn(encoded: Encoded) -> Encoded:
 
 
 async def explained_match(
-    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, patience: Patience
+    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, deadline: RequestDeadline
 ) -> MatchExplanation | None:
     """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
 
@@ -60,7 +60,7 @@ async def explained_match(
         with suppress(UnknownCamera):  # forgotten since; the place stays as it was enrolled
             mask = await camera_mask(map_, place.camera)
         with engine.queue.place():
-            again = await engine.encode_for(map_, picture, patience, mask)
+            again = await engine.encode_for(map_, picture, deadline, mask)
     match = replace(stored, regions=None if again is None else again.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
     told = await in_thread(lambda: view(encoder, explain(encoder, shown, match), shown, match))

@@ -23,9 +23,9 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     MapId,
-    PatienceDep,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -115,7 +115,7 @@ async def query_or_enrol(
     response: Response,
     engine: EngineDep,
     statistics: StatisticsDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> ClosureAnswer:
     """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
 
@@ -131,7 +131,7 @@ async def query_or_enrol(
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
     with engine.queue.place():
-        encoded = await engine.encode_for(map_, data, patience, mask)
+        encoded = await engine.encode_for(map_, data, deadline, mask)
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:

@@ -19,10 +19,10 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     FromState,
     MapId,
-    PatienceDep,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -66,7 +66,7 @@ async def query(
     engine: EngineDep,
     statistics: StatisticsDep,
     pictures: PicturesDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> QueryAnswer:
     """Locate one frame in a map.
 
@@ -75,11 +75,11 @@ async def query(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
-    recognized = await engine.recognize(map_, data, patience, options.k, options.selection(), mask)
+    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask)
     answer = told_answer(engine, statistics, map_, recognized)
     if options.explain and answer.matches:
         encoded, best = await in_thread(as_drawn, recognized.encoded), answer.matches[0].place.id
-        answer.explanation = await explained_match(engine, pictures, map_, encoded, best, patience)
+        answer.explanation = await explained_match(engine, pictures, map_, encoded, best, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     return answer
@@ -96,7 +96,7 @@ async def query_batch(
     request: Request,
     engine: EngineDep,
     statistics: StatisticsDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> BatchAnswers:
     """Locate many frames in a map; one that is bad fails alone."""
     engine.queue.check_room()
@@ -115,7 +115,7 @@ async def query_batch(
     encoded: dict[int, Encoded] = {}
     with engine.queue.place(len(files)):
         outcomes = await engine.encode_all(
-            map_.record.encoder, [part.data for part in files], patience, [mask] * len(files)
+            map_.record.encoder, [part.data for part in files], deadline, [mask] * len(files)
         )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:

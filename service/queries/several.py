@@ -17,7 +17,7 @@ from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.queue import Encoded, RequestDeadline
 from service.errors.faults import EncoderNotInstalled
 
 OWN_ERRORS = (
@@ -80,7 +80,7 @@ async def ask_maps(
     frames: Sequence[RigFrame],
     k: int,
     selection: Selection | None,
-    patience: Patience,
+    deadline: RequestDeadline,
 ) -> list[MapReport]:
     """What each map says of the frames, in the order of the ids; call it within ``queue.place``.
 
@@ -96,7 +96,7 @@ async def ask_maps(
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
         except OWN_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, patience)
+    encoded = await _encode(engine, maps, masks, frames, deadline)
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
         if isinstance(outcome, Exception):
@@ -121,7 +121,7 @@ async def _encode(
     maps: dict[str, Map],
     masks: dict[str, list[Mask | None]],
     frames: Sequence[RigFrame],
-    patience: Patience,
+    deadline: RequestDeadline,
 ) -> dict[str, list[Encoded | Exception] | Exception]:
     """By map what became of each frame: those that share an encoder and a mask share the work."""
     wanted: dict[str, dict[tuple[int, str], Mask | None]] = {}
@@ -136,7 +136,7 @@ async def _encode(
         keys = list(wanted[identity])
         try:
             outcomes = await engine.encode_all(
-                identity, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
+                identity, [frames[index].data for index, _ in keys], deadline, list(wanted[identity].values())
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
         except OWN_ERRORS as error:

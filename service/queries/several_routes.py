@@ -19,8 +19,8 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation, request_problem
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
-    PatienceDep,
     PrincipalDep,
     milliseconds_since,
     rounded,
@@ -55,7 +55,7 @@ async def query_maps(
     engine: EngineDep,
     statistics: StatisticsDep,
     principal: PrincipalDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> SeveralAnswer:
     """Locate one moment's frames in several maps, ranked together by calibrated probability.
 
@@ -73,7 +73,7 @@ async def query_maps(
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
     with engine.queue.place():
-        reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
+        reports = await ask_maps(engine, map_ids, frames, options.k, selection, deadline)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None

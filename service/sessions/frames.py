@@ -11,7 +11,7 @@ from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.http.dependencies import rounded
 from service.places.schemas import PlaceView
@@ -39,7 +39,7 @@ async def take_in(
     session: Session,
     data: bytes,
     options: FrameParameters,
-    patience: Patience,
+    deadline: RequestDeadline,
     request_id: str | None,
 ) -> SessionAnswer:
     """Answer one frame of a session, in its turn.
@@ -62,7 +62,7 @@ async def take_in(
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
         mask = await camera_mask(map_, session.options.camera)
-        recognized = await engine.recognize(map_, data, patience, options.k, session.selection, mask)
+        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask)
         single = told_answer(engine, statistics, map_, recognized)
         try:
             return await in_thread(

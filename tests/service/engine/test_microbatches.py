@@ -25,7 +25,7 @@ from core.method.encoder import Encoder, Encoding
 from core.threads import cores
 from service.engine import microbatches
 from service.engine.microbatches import MOST_BULK, MOST_FRAMES, Encoded, MicroBatches, Turn
-from service.engine.queue import AHEAD, EncoderQueue, Outcomes, Patience
+from service.engine.queue import AHEAD, EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
@@ -283,16 +283,16 @@ def queue(catalogue: EncoderCatalogue) -> Iterator[EncoderQueue]:
     made.close()
 
 
-async def collected(queue: EncoderQueue, frames: Sequence[bytes], patience: Patience) -> Outcomes:
+async def collected(queue: EncoderQueue, frames: Sequence[bytes], deadline: RequestDeadline) -> Outcomes:
     identity = EncoderCatalogue().resolve(DEFAULT_ENCODER)
-    return [one async for some in queue.encode_many(identity, frames, patience) for one in some]
+    return [one async for some in queue.encode_many(identity, frames, deadline) for one in some]
 
 
 @pytest.mark.anyio
 async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
     frames = [jpeg(index % 6) for index in range(AHEAD + 10)]
     frames[4] = b"poison"
-    found = await collected(queue, frames, Patience(time.monotonic() + 60, stays))
+    found = await collected(queue, frames, RequestDeadline(time.monotonic() + 60, stays))
     assert sorted(index for index, _ in found) == list(range(len(frames)))
     for index, outcome in found:
         if index == 4:
@@ -300,7 +300,7 @@ async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder)
         else:
             assert not isinstance(outcome, Exception)
             assert cosine(outcome.encoding, default.encode(scene_of(index % 6))) > 0.9999
-    assert await collected(queue, [], Patience(time.monotonic() + 60, stays)) == []
+    assert await collected(queue, [], RequestDeadline(time.monotonic() + 60, stays)) == []
 
 
 @pytest.mark.anyio
@@ -312,13 +312,15 @@ async def test_what_is_left_of_a_request_is_given_up(queue: EncoderQueue, fault:
     await queue.load(EncoderCatalogue().resolve(DEFAULT_ENCODER))
     free = threading.Event()
     queue._batches.call(lambda: free.wait(30))
-    patience = Patience(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
+    deadline = RequestDeadline(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
     if fault is DeadlineExceeded:
-        patience = Patience(patience.deadline, stays)
+        deadline = RequestDeadline(deadline.at, stays)
     with pytest.raises(fault):
-        await collected(queue, [jpeg(0)] * (AHEAD + 5), patience)
+        await collected(queue, [jpeg(0)] * (AHEAD + 5), deadline)
     free.set()
-    await queue.encode(EncoderCatalogue().resolve(DEFAULT_ENCODER), jpeg(1), Patience(time.monotonic() + 60, stays))
+    await queue.encode(
+        EncoderCatalogue().resolve(DEFAULT_ENCODER), jpeg(1), RequestDeadline(time.monotonic() + 60, stays)
+    )
     count = queue._metrics.registry.get_sample_value("placerec_encoded_together_sum")
     assert count == 1, "nothing of the request was encoded"
 
