@@ -1,4 +1,4 @@
-"""The encoder's turn: bounded, timed, given up by those who leave, and never in the way of the event loop."""
+"""The encoder's queue: it is bounded, keeps deadlines, drops frames of clients that left, and never blocks the loop."""
 
 from __future__ import annotations
 
