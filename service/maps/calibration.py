@@ -10,13 +10,13 @@ from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import (
     TOGETHER,
-    Advance,
-    Questions,
-    calibrated,
-    labelled,
-    map_itself,
-    second_traverse,
-    warnings_on,
+    LabelledQueries,
+    ProgressCallback,
+    calibrate_map,
+    calibration_warnings,
+    queries_from_labels,
+    queries_from_map,
+    queries_from_traverse,
 )
 from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
@@ -29,7 +29,7 @@ KIND = "calibrate"
 
 
 def measured(
-    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: Advance
+    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
 ) -> CalibrationReport:
     """Ask a map, and report what follows; nothing is stored.
 
@@ -41,9 +41,9 @@ def measured(
         Others: what ``advance`` raises.
     """
     snapshot = map_.snapshot()
-    questions = _questions(map_, snapshot, order, encodings)
+    queries = _queries(map_, snapshot, order, encodings)
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = calibrated(map_, encoder, snapshot, questions, order.target, source, advance)
+    found = calibrate_map(map_, encoder, snapshot, queries, order.target, source, advance)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -53,7 +53,7 @@ def measured(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=warnings_on(found, order.method),
+        warnings=calibration_warnings(found, order.method),
     )
 
 
@@ -120,11 +120,11 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     return told
 
 
-def _questions(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> Questions:
+def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
     if order.method == "frames":
         assert order.labels is not None
-        return labelled(map_, snapshot, encodings, [label.place for label in order.labels])
+        return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
     if order.method == "sequence":
         assert order.sequence is not None
-        return second_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
-    return map_itself(map_, snapshot, order.most)
+        return queries_from_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
+    return queries_from_map(map_, snapshot, order.most)

@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from core.judgement.priors import Box, Constraint, Disc, Facing, Period
 from core.places import Pose, Sequence, Timestamp, microseconds
-from core.recognition.selection import TRUST, Knowledge, Recent, Selection
+from core.recognition.selection import TRUST, Conditions, RecentFrames, Selection
 from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
@@ -112,8 +112,8 @@ class FilterParameters(PlaceDescription):
         given = {*geometry, *(["sequences"] if sequences else []), *(["where"] if metadata else [])}
         soft = self._soft(given)
         made = Selection(
-            _knowledge(given - soft, geometry, sequences, metadata),
-            _knowledge(soft, geometry, sequences, metadata),
+            _conditions(given - soft, geometry, sequences, metadata),
+            _conditions(soft, geometry, sequences, metadata),
             TRUST if self.prior_trust is None else self.prior_trust,
             self._recent(),
         )
@@ -175,7 +175,7 @@ class FilterParameters(PlaceDescription):
             raise InvalidRequest(f"soft: nothing is said of {absent[0]}.")
         return names
 
-    def _recent(self) -> Recent | None:
+    def _recent(self) -> RecentFrames | None:
         if not self.exclude_frames and not self.exclude_seconds:
             return None
         if self.sequence is None:
@@ -183,16 +183,16 @@ class FilterParameters(PlaceDescription):
         if self.exclude_seconds and self.timestamp is None:
             raise InvalidRequest("exclude_seconds: it needs the frame's own timestamp.")
         moment = None if self.timestamp is None else microseconds(self.timestamp)
-        return Recent(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
+        return RecentFrames(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
 
 
-def _knowledge(
+def _conditions(
     names: set[str],
     geometry: Mapping[Kind, Constraint],
     sequences: tuple[str, ...] | None,
     metadata: Mapping[str, Scalar],
-) -> Knowledge:
-    return Knowledge(
+) -> Conditions:
+    return Conditions(
         tuple(constraint for name, constraint in geometry.items() if name in names),
         sequences if "sequences" in names else None,
         metadata if "where" in names else {},

@@ -77,7 +77,7 @@ def close_loop(
         if known is not None and known != digest:
             raise PlaceTaken(f"The place {candidate.id!r} has another frame; PUT replaces it.")
         if known is not None:
-            selection = replace(selection or Selection(), without=candidate.id)
+            selection = replace(selection or Selection(), excluded=candidate.id)
         (located,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
         if known is not None:
             return Closure(located, map_.place(candidate.id), created=False)

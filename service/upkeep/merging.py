@@ -20,7 +20,7 @@ from core.method.encoder import Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields, check_place_id
 from core.recognition.recognition import locate
-from core.recognition.self_queries import TOGETHER, spread
+from core.recognition.self_queries import TOGETHER, spread_order
 from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
@@ -342,7 +342,7 @@ def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[
     encoder = engine.load_encoder(map_)
     outline, snapshot = other.transfer.outline(), other.snapshot()
     outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
-    chosen = [outline[i] for i in spread(len(outline))[: context.arguments["sample"]]]
+    chosen = [outline[i] for i in spread_order(len(outline))[: context.arguments["sample"]]]
     verdicts = {"recognized": 0, "ambiguous": 0, "unknown": 0}
     pairs: list[dict[str, Any]] = []
     apart: list[float] = []
