@@ -72,7 +72,7 @@ class JobContext:
         """
         name = str(self.map_id) if map_id is None else map_id
         found = atlas.get(name)
-        if name in self.maps and self.maps[name] != born(found):
+        if name in self.maps and self.maps[name] != creation_time(found):
             raise UnknownMap(
                 f"The map {name!r} was deleted since the job was asked for; the one of that id now is another."
             )
@@ -136,7 +136,7 @@ class JobContext:
         self.check_cancelled()
 
 
-def born(map_: Map) -> str:
+def creation_time(map_: Map) -> str:
     """What tells a map from later ones of the same id: when it was created."""
     return map_.record.created_at.isoformat()
 
@@ -146,25 +146,25 @@ Result = TypeVar("Result")
 POLL_SECONDS = 0.2
 """A job that is to stop gives its frames up within this time."""
 
-STANDING_BACK_SECONDS = 1.0
+YIELD_SECONDS = 1.0
 """While requests wait for the encoder a job holds its frames back, but not for longer: it is to end some day."""
 
 LONGEST_SECONDS = 3600.0
 
 
-def stand_back(engine: Engine, context: JobContext) -> None:
+def yield_to_requests(engine: Engine, context: JobContext) -> None:
     """Wait while requests wait for the encoder, up to a bound.
 
     Raises:
         JobCancelled, JobInterrupted.
     """
-    until = time.monotonic() + STANDING_BACK_SECONDS
+    until = time.monotonic() + YIELD_SECONDS
     context.check_cancelled()
     while engine.queue.waiting and time.monotonic() < until:
         context.pause(0.01)
 
 
-def run_behind(
+def run_after_requests(
     engine: Engine, context: JobContext, work: Callable[[RequestDeadline], Coroutine[Any, Any, Result]]
 ) -> Result:
     """Run a coroutine that waits for the encoder, behind the requests that wait for it; blocks the job's thread.
@@ -180,7 +180,7 @@ def run_behind(
         while not context.is_to_stop:
             await asyncio.sleep(POLL_SECONDS)
 
-    stand_back(engine, context)
+    yield_to_requests(engine, context)
     deadline = RequestDeadline(time.monotonic() + LONGEST_SECONDS, stopped)
     try:
         return asyncio.run_coroutine_threadsafe(work(deadline), engine.loop).result()
@@ -189,7 +189,7 @@ def run_behind(
         raise
 
 
-def encode_behind(
+def encode_after_requests(
     engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
 ) -> list[Encoded | Exception]:
     """What becomes of frames, in their order, without their pixels; blocks the job's thread.
@@ -203,4 +203,4 @@ def encode_behind(
     async def encode(deadline: RequestDeadline) -> list[Encoded | Exception]:
         return await engine.encode_all(identity, frames, deadline, masks)
 
-    return run_behind(engine, context, encode)
+    return run_after_requests(engine, context, encode)

@@ -69,7 +69,7 @@ class Jobs:
         self._kinds: dict[str, Work] = {}
         self._discards: dict[str, Discard] = {}
         self._numbers = itertools.count(1)
-        self._gaveway: dict[str, tuple[int, int]] = {}  # behind whom a job waits that has given way
+        self._gave_way: dict[str, tuple[int, int]] = {}  # behind whom a job waits that has given way
         self._works: dict[str, Work] = {}
         self._jobs = {job.id: job for job in self._records.read()}
         self._last_number = self._records.last_number()
@@ -113,10 +113,10 @@ class Jobs:
             self._changed.notify_all()
         self._notify(None)
 
-    def close(self, patience: float = 10.0) -> None:
-        """Stop, and wait so many seconds for what runs: what has not stopped by then is found as it was killed."""
+    def close(self, timeout: float = 10.0) -> None:
+        """Stop, and wait at most ``timeout`` seconds for running jobs; those that go on count as killed."""
         self.stop_soon()
-        until = time.monotonic() + patience
+        until = time.monotonic() + timeout
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
             if thread.is_alive():
@@ -138,7 +138,7 @@ class Jobs:
         Args:
             work: what it does; without it the kind is a registered one, which survives a restart.
             arguments: for the work, as JSON.
-            maps: those that it is asked for, by id, and when each was created (``job_context.born``): the job fails
+            maps: those that it is asked for, by id, and when each was created (``creation_time``): the job fails
                 rather than to work on a later one of the same id.
 
         Raises:
@@ -206,7 +206,7 @@ class Jobs:
             job = self.get(job_id)
             if job.state in ("succeeded", "failed"):
                 raise JobEnded(f"The job {job_id} has {job.state} already.")
-            if ended := job.state == "queued" and (not job.attempt or job_id in self._gaveway):
+            if ended := job.state == "queued" and (not job.attempt or job_id in self._gave_way):
                 job = self._end(job_id, "cancelled")
             elif job.state != "cancelled" and not job.cancelling:
                 changed = replace(job, cancelling=True, change=job.change + 1)
@@ -238,7 +238,7 @@ class Jobs:
 
     def _work(self) -> None:
         while (job := self._take()) is not None:
-            if job.id not in self._gaveway:  # else that it began was told
+            if job.id not in self._gave_way:  # else that it began was told
                 note_job(job, "running")
             try:
                 self._do(job)
@@ -258,7 +258,7 @@ class Jobs:
         except JobInterrupted:
             ended = self._put_off(job)
         except JobGivesWay:
-            self._gaveway[job.id] = (self._last_number, next(self._numbers))
+            self._gave_way[job.id] = (self._last_number, next(self._numbers))
             ended = self._change(job.id, state="queued", message="waits for others to have their turn")
             with self._changed:
                 self._changed.notify_all()
@@ -296,7 +296,7 @@ class Jobs:
             and job.id in self._works
             and (job.map_id is None or first[job.map_id] == job.number)
         ]
-        return sorted(ready, key=lambda job: self._gaveway.get(job.id, (job.number, 0)))
+        return sorted(ready, key=lambda job: self._gave_way.get(job.id, (job.number, 0)))
 
     def others_wait(self, job_id: str) -> bool:
         """Whether jobs of other maps wait that could run if this one gave way."""
@@ -346,7 +346,7 @@ class Jobs:
             ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
             note_job(ended, state)
             self._works.pop(job_id, None)
-            self._gaveway.pop(job_id, None)
+            self._gave_way.pop(job_id, None)
             self._changed.notify_all()  # another one of the same map may run
             if past:
                 with suppress(PlacerecError):  # they are forgotten at another time

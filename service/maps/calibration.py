@@ -21,7 +21,7 @@ from core.recognition.calibration import (
 from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
 from service.engine.engine import Engine
-from service.jobs.context import stand_back
+from service.jobs.context import yield_to_requests
 from service.jobs.jobs import JobContext
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 
@@ -110,7 +110,7 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         context.progress(done, total)
         context.check_cancelled()
         if done % TOGETHER == 0:
-            stand_back(engine, context)
+            yield_to_requests(engine, context)
 
     report = measured(map_, engine.load_encoder(map_), order, [], advance)
     told = report.model_dump(mode="json")

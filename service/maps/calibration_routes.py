@@ -24,7 +24,7 @@ from service.http.bodies import json_size, parse_json
 from service.http.dependencies import DeadlineDep, EngineDep, IfMatch, MapId, expected_revision, single_values
 from service.http.parameters import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.calibration import KIND, arguments_of, measured, store
@@ -96,7 +96,7 @@ async def calibrate_map(
         raise EncoderNotInstalled(str(error)) from error
     request.state.noted = {"map": map_id, "method": order.method}
     if order.background:
-        arguments, maps = arguments_of(map_, order, expected), {map_id: born(map_)}
+        arguments, maps = arguments_of(map_, order, expected), {map_id: creation_time(map_)}
         job = await in_thread(jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
         return accepted(job, engine.settings)
 

@@ -9,7 +9,7 @@ from typing import Any
 from core.errors import MapQuarantined
 from core.storage.search.reindexing import rebuild as rebuild_index
 from service.engine.engine import Engine
-from service.jobs.context import born, stand_back
+from service.jobs.context import creation_time, yield_to_requests
 from service.jobs.jobs import JobContext
 
 REBUILD, VERIFY = "rebuild", "verify"
@@ -18,7 +18,7 @@ REBUILD, VERIFY = "rebuild", "verify"
 def _telling(engine: Engine, context: JobContext) -> Callable[[int, int], None]:
     def told(done: int, total: int) -> None:
         context.progress(done, total)
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
 
     return told
 
@@ -51,6 +51,6 @@ def incarnation(engine: Engine, map_id: str) -> dict[str, str]:
         UnknownMap, StorageFailure.
     """
     try:
-        return {map_id: born(engine.atlas.find(map_id))}
+        return {map_id: creation_time(engine.atlas.find(map_id))}
     except MapQuarantined:
         return {}

@@ -20,7 +20,7 @@ from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.context import JobContext, born, run_behind
+from service.jobs.context import JobContext, creation_time, run_after_requests
 from service.jobs.jobs import Jobs
 from service.jobs.records import Job
 from service.places.batches import candidate_of, check_batch, check_own, given_id
@@ -69,7 +69,7 @@ def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str) 
     """Let a job wait for a form, which is removed if there comes none."""
     try:
         count = len(_entries(engine, staging.open(name))[0])
-        maps = {map_.record.id: born(map_)}
+        maps = {map_.record.id: creation_time(map_)}
         return jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
     except BaseException:
         staging.remove(name)
@@ -181,7 +181,7 @@ class _BulkEnrolment:
         async def work(deadline: RequestDeadline) -> dict[int, Enrolled]:
             return await enrol(self.engine, self.map, candidates, deadline, reject, queued=False)
 
-        stored = run_behind(self.engine, self.context, work) if candidates else {}
+        stored = run_after_requests(self.engine, self.context, work) if candidates else {}
         for one in stored.values():
             self.told.changes[one.change] = self.told.changes.get(one.change, 0) + 1
         for position in sorted(failures):

@@ -25,7 +25,7 @@ from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
-from service.jobs.context import stand_back
+from service.jobs.context import yield_to_requests
 from service.jobs.jobs import JobContext, JobInterrupted
 
 KIND = "merge"
@@ -232,7 +232,7 @@ def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
                 map_.cameras.put(name, camera.mask)
         snapshot = other.snapshot()
         for first in range(0, len(due), CHUNK):
-            stand_back(engine, context)
+            yield_to_requests(engine, context)
             # No place may be enrolled under one of the ids between the look at them and the commit.
             with engine.writing(map_.record.id):
                 _adopt(context, map_, other, snapshot, _still_free(context, map_, due[first : first + CHUNK]))
@@ -347,7 +347,7 @@ def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[
     pairs: list[dict[str, Any]] = []
     apart: list[float] = []
     for first in range(0, len(chosen), TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         some = chosen[first : first + TOGETHER]
         rows = np.array([place.row for place in some], np.int64)
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)

@@ -15,7 +15,7 @@ from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
-from service.jobs.context import stand_back
+from service.jobs.context import yield_to_requests
 from service.jobs.jobs import JobContext
 
 KIND = "prune"
@@ -118,7 +118,7 @@ def _similarities(
 ) -> NDArray[np.float32]:
     found = [np.empty(0, np.float32)]
     for first in range(0, len(pairs), PAIRS_TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         found.append(own.first_stage_scores(pairs[first : first + PAIRS_TOGETHER]))
         context.progress(min(first + PAIRS_TOGETHER, len(pairs)), len(pairs), "compares neighbours")
     return np.concatenate(found)
@@ -139,7 +139,7 @@ def _try(
     found: list[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]] = []
     everything = np.flatnonzero(references)
     for first in range(0, len(chosen), TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         some = chosen[first : first + TOGETHER].tolist()
         for position, others, scores in own.search(some, references):
             if not own.near(position, everything[everything != position]).any():

@@ -20,7 +20,7 @@ from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.context import born, encode_behind
+from service.jobs.context import creation_time, encode_after_requests
 from service.jobs.jobs import JobContext, JobInterrupted
 
 KIND = "re-encode"
@@ -74,7 +74,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 def _is_published(engine: Engine, target: str, made: str) -> bool:
     try:
-        return born(engine.atlas.find(target)) == made
+        return creation_time(engine.atlas.find(target)) == made
     except UnknownMap:
         return False
 
@@ -156,7 +156,7 @@ class _Reencoding:
         ready = [place for place in new if place.id in fields and fields[place.id][1] == place.row]
         frames = [images[place.id] or b"" for place in ready]
         masks = [self._mask(place.camera) for place in ready]
-        outcomes = encode_behind(self.engine, self.context, self.identity, frames, masks) if ready else []
+        outcomes = encode_after_requests(self.engine, self.context, self.identity, frames, masks) if ready else []
         items: list[tuple[Enrolment, History]] = []
         for place, image, outcome in zip(ready, frames, outcomes, strict=True):
             try:
@@ -207,7 +207,7 @@ class _Reencoding:
             "places": self.made.count_places(),
             "left_out": {"count": len(self.left_out), "places": named},
         }
-        self.context.remember(result=result, made=born(self.made))
+        self.context.remember(result=result, made=creation_time(self.made))
         self.engine.atlas.publish(self.target)
         return result
 

@@ -26,7 +26,7 @@ from service.errors.problems import problem_documentation
 from service.http.bodies import StrictRoute
 from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
 from service.http.parameters import Parameters
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
@@ -68,7 +68,7 @@ def submit(
     Raises:
         JobQueueFull, StorageFull, StorageFailure.
     """
-    maps = {one.record.id: born(one) for one in (map_, *others)}
+    maps = {one.record.id: creation_time(one) for one in (map_, *others)}
     job = jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
     response.headers["Location"] = location_of(job, engine.settings)
     return JobView.of(job)

@@ -16,7 +16,7 @@ from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, MapSettings
 from core.storage.transfer import Transfer
 from service.engine.engine import Engine
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.upkeep import merging
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of
 
@@ -219,7 +219,7 @@ def test_it_does_not_go_on_into_another_map_of_the_same_id(
 ) -> None:
     with runtime_at(folder) as runtime:
         before = state_of(runtime.engine, "lab")
-        maps = {name: born(runtime.engine.atlas.get(name)) for name in ("lab", "hall")}
+        maps = {name: creation_time(runtime.engine.atlas.get(name)) for name in ("lab", "hall")}
         after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
         until = time.monotonic() + 20
