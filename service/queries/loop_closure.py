@@ -34,7 +34,7 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frame_body
 from service.http.uploads import parse_metadata
-from service.places.enrolment import Candidate, describe_candidate, digest_of
+from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
 from service.queries.parameters import ClosureParameters
@@ -55,7 +55,7 @@ class Closure:
 
 
 def close_loop(
-    engine: Engine, map_: Map, candidate: Candidate, encoded: Encoded, k: int, selection: Selection | None
+    engine: Engine, map_: Map, frame: FrameToEnrol, encoded: Encoded, k: int, selection: Selection | None
 ) -> Closure:
     """Locate a frame and, if the verdict is ``unknown``, enrol it: as one step, so that of two frames of one new place
     that come together the second finds the first.  Blocks; call it in a thread.
@@ -63,24 +63,24 @@ def close_loop(
     A repeated request finds the same as the first did: its own place is left out of the search.
 
     Args:
-        encoded: the candidate's frame, which has regions.
+        encoded: the frame's frame, which has regions.
         selection: what is known of the place asked for; None: nothing.
 
     Raises:
-        PlaceTaken: the candidate's id is that of a place with another frame.
+        PlaceTaken: the frame's id is that of a place with another frame.
         StorageFull, StorageFailure: nothing was enrolled.
     """
-    digest = digest_of(candidate)
-    enrolment = describe_candidate(engine, map_, candidate, digest, encoded)
+    digest = digest_of(frame)
+    enrolment = describe_frame(engine, map_, frame, digest, encoded)
     with engine.writing(map_.record.id):
-        known = map_.digest(candidate.id)
+        known = map_.digest(frame.id)
         if known is not None and known != digest:
-            raise PlaceTaken(f"The place {candidate.id!r} has another frame; PUT replaces it.")
+            raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
-            selection = replace(selection or Selection(), excluded=candidate.id)
+            selection = replace(selection or Selection(), excluded=frame.id)
         (located,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
         if known is not None:
-            return Closure(located, map_.place(candidate.id), created=False)
+            return Closure(located, map_.place(frame.id), created=False)
         if located.judgement.verdict != "unknown":
             return Closure(located, None, created=False)
         ((place, _),) = map_.enrol([enrolment])
@@ -137,8 +137,8 @@ async def query_or_enrol(
     if len(encoded.encoding.regions) == 0:
         answer = blank_answer(map_, encoded)
     else:
-        candidate = Candidate(options.id, fields, data, mask)
-        closure = await in_thread(close_loop, engine, map_, candidate, encoded, options.k, selection)
+        frame = FrameToEnrol(options.id, fields, data, mask)
+        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection)
         answer = answer_of(encoded, closure.located)
         enrolled = closure.enrolled
         if enrolled is not None:

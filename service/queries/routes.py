@@ -32,7 +32,7 @@ from service.http.dependencies import (
 from service.http.openapi import BINARY, form_body, frame_body
 from service.http.quick_route import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
-from service.places.batches import item_problem
+from service.places.batches import frame_problem
 from service.queries.answers import StatisticsDep, told_answer
 from service.queries.explanations import as_drawn, explained_match
 from service.queries.parameters import QueryParameters
@@ -124,7 +124,7 @@ async def query_batch(
                     raise outcome
                 encoded[index] = outcome
             except Exception as error:
-                problem = item_problem(request, error)
+                problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection)
     for index, one in zip(encoded, recognized, strict=True):

@@ -20,7 +20,7 @@ from service.engine.engine import Engine, camera_mask, in_thread
 from service.engine.queue import Encoded, RequestDeadline
 from service.errors.faults import EncoderNotInstalled
 
-OWN_ERRORS = (
+MAP_ERRORS = (
     errors.UnknownMap,
     errors.MapQuarantined,
     errors.StorageFailure,
@@ -62,7 +62,7 @@ class MapReport:
 
 
 @dataclass(frozen=True)
-class Together:
+class JointVerdict:
     """The verdict over all maps.
 
     best: the report of the map whose match is the most probable; None if none found any.
@@ -74,7 +74,7 @@ class Together:
     probability: float | None
 
 
-async def ask_maps(
+async def locate_in_maps(
     engine: Engine,
     map_ids: Sequence[str],
     frames: Sequence[RigFrame],
@@ -94,7 +94,7 @@ async def ask_maps(
         try:
             maps[map_id] = await engine.map(map_id)
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
-        except OWN_ERRORS as error:
+        except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
     encoded = await _encode(engine, maps, masks, frames, deadline)
     for map_id, map_ in maps.items():
@@ -103,14 +103,14 @@ async def ask_maps(
             reports[map_id] = MapReport(map_id, map_, error=outcome)
             continue
         seen = [one for one in outcome if isinstance(one, Encoded) and len(one.encoding.regions)]
-        amiss = next((one for one in outcome if isinstance(one, OWN_ERRORS)), None)
+        amiss = next((one for one in outcome if isinstance(one, MAP_ERRORS)), None)
         report = MapReport(map_id, map_, error=amiss, frames=tuple(outcome))
         if seen and amiss is None:
             encodings = [one.encoding for one in seen]
             try:
                 located = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection)
                 report = replace(report, located=located)
-            except OWN_ERRORS as error:
+            except MAP_ERRORS as error:
                 report = replace(report, error=error)
         reports[map_id] = report
     return [reports[map_id] for map_id in map_ids]
@@ -139,7 +139,7 @@ async def _encode(
                 identity, [frames[index].data for index, _ in keys], deadline, list(wanted[identity].values())
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
-        except OWN_ERRORS as error:
+        except MAP_ERRORS as error:
             made[identity] = error
     found: dict[str, list[Encoded | Exception] | Exception] = {}
     for map_id, map_ in maps.items():
@@ -155,12 +155,12 @@ def _key(mask: Mask | None) -> str:
     return "" if mask is None else mask.digest
 
 
-def judge_together(reports: Sequence[MapReport]) -> Together:
+def judge_together(reports: Sequence[MapReport]) -> JointVerdict:
     """The verdict over the maps that answered: that of the most probable match's own map, unless another map has a
     match of another place that is nearly as probable, which makes it ambiguous."""
     found = [report for report in reports if report.located is not None and report.located.matches]
     if not found:
-        return Together("unknown", None, None)
+        return JointVerdict("unknown", None, None)
     best, *others = sorted(found, key=lambda report: -report.log_odds)
     rivals = [report.log_odds for report in others if not _same_place(best, report)]
     assert best.located is not None
@@ -169,8 +169,8 @@ def judge_together(reports: Sequence[MapReport]) -> Together:
     if verdict == "recognized" and rivals and best.log_odds - rivals[0] < ALIKE:
         verdict = "ambiguous"
     if judgement.probability is None:
-        return Together(verdict, best, None)
-    return Together(verdict, best, float(joint_probabilities([best.log_odds, *rivals])[0]))
+        return JointVerdict(verdict, best, None)
+    return JointVerdict(verdict, best, float(joint_probabilities([best.log_odds, *rivals])[0]))
 
 
 def _same_place(a: MapReport, b: MapReport) -> bool:

@@ -29,12 +29,12 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frames_body
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
-from service.places.batches import item_problem
+from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
 from service.queries.parameters import SeveralParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
-from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
+from service.queries.several import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.statistics import QueryStatistics
 
 router = APIRouter(
@@ -73,7 +73,7 @@ async def query_maps(
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
     with engine.queue.place():
-        reports = await ask_maps(engine, map_ids, frames, options.k, selection, deadline)
+        reports = await locate_in_maps(engine, map_ids, frames, options.k, selection, deadline)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
@@ -127,7 +127,7 @@ async def _frames(
             check_part(part, engine.settings)
             frames.append(RigFrame(part.name, part.data, cameras.get(part.name)))
         except Exception as error:
-            problem = item_problem(request, error)
+            problem = frame_problem(request, error)
             first = first or error
             report = FrameReport(frame=part.name, camera=cameras.get(part.name), status=problem.status, problem=problem)
             broken.append(report)
@@ -145,7 +145,7 @@ def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequen
         outcome = outcomes[index] if outcomes else None
         if isinstance(outcome, Exception):
             first = first or outcome
-            problem = item_problem(request, outcome)
+            problem = frame_problem(request, outcome)
             found.append(FrameReport(frame=frame.name, camera=frame.camera, status=problem.status, problem=problem))
         else:
             regions = len(outcome.encoding.regions) if isinstance(outcome, Encoded) else None

@@ -12,8 +12,8 @@ import pytest
 
 from service.engine.queue import RequestDeadline
 from service.errors.faults import BatchOutOfOrder, ClientGone
-from service.places import batch_order as succession
-from service.places.batch_order import BatchOrder, Sequel, Stage
+from service.places import batch_order
+from service.places.batch_order import BatchOrder, BatchTurn, Stage
 from tests.service.places.test_batches import send
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -41,9 +41,9 @@ async def test_one_waits_until_the_other_has_come_so_far() -> None:
         storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
         with line.enter("lab", "a", None, deadline()) as first, line.enter("hall", "a", None, deadline()) as elsewhere:
             await begun(encoding)
-            elsewhere.reach(Stage.ENCODED)
+            elsewhere.report(Stage.ENCODED)
             await begun(encoding)
-            first.reach(Stage.ENCODED)
+            first.report(Stage.ENCODED)
             await asyncio.wait_for(encoding, 5)
             await begun(storing)
         await asyncio.wait_for(storing, 5)
@@ -54,7 +54,7 @@ async def test_one_waits_until_the_other_has_come_so_far() -> None:
 @pytest.mark.anyio
 async def test_what_fails_is_not_stored_and_may_come_again() -> None:
     line = BatchOrder()
-    second = Sequel(line, "lab", None, "a", deadline())
+    second = BatchTurn(line, "lab", None, "a", deadline())
     with pytest.raises(ValueError), line.enter("lab", "a", None, deadline()):
         raise ValueError
     storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
@@ -73,21 +73,21 @@ async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     line = BatchOrder()
     with line.enter("lab", "slow", None, deadline()):
         with pytest.raises(BatchOutOfOrder):
-            await Sequel(line, "lab", None, "slow", deadline(0.05)).wait_for(Stage.STORED)
+            await BatchTurn(line, "lab", None, "slow", deadline(0.05)).wait_for(Stage.STORED)
         gone = asyncio.Event()
-        storing = asyncio.ensure_future(Sequel(line, "lab", None, "slow", deadline(20, gone)).wait_for(Stage.STORED))
+        storing = asyncio.ensure_future(BatchTurn(line, "lab", None, "slow", deadline(20, gone)).wait_for(Stage.STORED))
         await begun(storing)
         gone.set()
         with pytest.raises(ClientGone):
             await asyncio.wait_for(storing, 5)
-    monkeypatch.setattr(succession, "GRACE", 0.05)
+    monkeypatch.setattr(batch_order, "GRACE", 0.05)
     with pytest.raises(BatchOutOfOrder):
-        await asyncio.wait_for(Sequel(line, "lab", None, "never", deadline()).wait_for(Stage.ENCODED), 5)
+        await asyncio.wait_for(BatchTurn(line, "lab", None, "never", deadline()).wait_for(Stage.ENCODED), 5)
 
 
 @pytest.mark.anyio
 async def test_so_many_names_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(succession, "KEPT", 3)
+    monkeypatch.setattr(batch_order, "KEPT", 3)
     line = BatchOrder()
     with line.enter("lab", "open", None, deadline()):
         for number in range(9):

@@ -16,7 +16,7 @@ from core.storage import Map, MapSettings
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
-from service.places.enrolment import Candidate, enrol
+from service.places.enrolment import FrameToEnrol, enrol
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
 from service.sessions.sessions import Session
@@ -48,7 +48,7 @@ async def walked(engine: Engine) -> Map:
     identity = engine.resolve(None)
     encoder = await engine.queue.load(identity)
     made = engine.atlas.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    await enrol(engine, made, [Candidate(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
+    await enrol(engine, made, [FrameToEnrol(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
     return made
 
 
