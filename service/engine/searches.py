@@ -36,10 +36,10 @@ MOST_AHEAD = 4000
 
 @dataclass(frozen=True)
 class Recognized:
-    """An encoded frame and the answer of the map; ``located`` is None for a frame without regions."""
+    """An encoded frame and the answer of the map, which is None for a frame without regions."""
 
     encoded: Encoded
-    located: Answer | None
+    answer: Answer | None
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ class Searches:
         """
         seen = [frame for frame in frames if len(frame.encoding.regions)]
         if len(seen) == 1 and seen[0].search_result is not None:
-            located: list[Answer] = seen[0].search_result
+            answers: list[Answer] = seen[0].search_result
         else:
             encodings = [frame.encoding for frame in seen]
-            located = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
-        remaining = iter(located)
+            answers = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+        remaining = iter(answers)
         return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]
 
     async def locate(
@@ -141,7 +141,7 @@ class Searches:
         if len(parts) == 1:
             return await parts[0].answer
         answers = await asyncio.gather(*(part.answer for part in parts))
-        return [located for answer in answers for located in answer]
+        return [answer for part in answers for answer in part]
 
     def _start(self, key: _SearchKey) -> None:
         task = asyncio.create_task(self._run(key))
@@ -174,7 +174,7 @@ class Searches:
     async def _answer(self, key: _SearchKey, together: Sequence[_Waiting]) -> None:
         encodings = [encoding for one in together for encoding in one.encodings]
         try:
-            located = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k)
+            answers = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k)
         except Exception as error:
             if len(together) > 1:  # search for each alone, so that only the faulty ones fail
                 for one in together:
@@ -182,7 +182,7 @@ class Searches:
             elif not together[0].answer.done():
                 together[0].answer.set_exception(error)
             return
-        remaining = iter(located)
+        remaining = iter(answers)
         for one in together:
             answer = [next(remaining) for _ in one.encodings]
             if not one.answer.done():

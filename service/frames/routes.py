@@ -1,4 +1,4 @@
-"""Frames without a map: their descriptor, their regions, the score of two."""
+"""Routes of frames without a map: the descriptor or the regions of a frame, and the score of two frames."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from service.http.negotiation import preferred
 from service.http.openapi import BINARY, form_body, frame_body
 from service.http.parameters import EncoderParameters, MatchParameters, RegionsParameters
 from service.http.uploads import read_frame, read_pair
-from service.queries.explanations import as_drawn, drawing, explained
+from service.queries.explanations import draw_explanation, explain_pair, scaled_for_drawing
 
 router = APIRouter(
     prefix="/v1",
@@ -148,13 +148,13 @@ async def match(
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
     with engine.queue.place():
-        a = await in_thread(as_drawn, await engine.queue.encode(identity, first, deadline))
+        a = await in_thread(scaled_for_drawing, await engine.queue.encode(identity, first, deadline))
         b = await engine.queue.encode(identity, second, deadline)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
-    explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None
+    explanation = await in_thread(explain_pair, a, b) if options.explain or wanted == "png" else None
     if explanation is not None and wanted == "png":
-        drawn = await in_thread(drawing, explanation, a.pixels, b.pixels)
+        drawn = await in_thread(draw_explanation, explanation, a.pixels, b.pixels)
         return Response(drawn, headers={"X-Encoder": identity, "X-Score": str(explanation.score)}, media_type=PNG)
     score = MatchScore(
         score=a.encoder.score(a.encoding, b.encoding),

@@ -1,4 +1,4 @@
-"""What callers know of where a frame was taken, as parameters: filters of what may be found, and soft priors."""
+"""The parameters of filters and priors: what a caller knows of the place where a frame was taken."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.errors.faults import InvalidRequest
 from service.http.parameters import PlaceDescription, validated
 
 MOST_NAMES = 100
-"""Sequences, and keys of metadata, that one query may name."""
+"""The most sequences, and the most keys of metadata, that one query may name."""
 
 Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
 KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
@@ -92,20 +92,20 @@ class FilterParameters(PlaceDescription):
     )
 
     def position(self) -> Pose | None:
-        """Where the frame was taken, without a heading; None if that is not said.
+        """The position of the frame, without a heading; None if no coordinate is given.
 
         Raises:
-            InvalidRequest: it is incomplete, or of both kinds.
+            InvalidRequest: the position is incomplete, or both metric and geographic.
         """
         names = ("x", "y", "z", "latitude", "longitude")
         given = {name: value for name in names if (value := getattr(self, name)) is not None}
         return validated(Pose, given) if given else None
 
     def selection(self) -> Selection | None:
-        """What the query is to choose from; None: everything.
+        """The filters and priors of the query; None if there are none.
 
         Raises:
-            InvalidRequest: the parameters do not go together, or one is malformed.
+            InvalidRequest: the parameters contradict each other, or one of them is malformed.
         """
         geometry = self._geometry()
         sequences, metadata = self._sequences(), self._metadata()
@@ -148,17 +148,17 @@ class FilterParameters(PlaceDescription):
         try:
             return tuple(_NAMES.validate_python(names, strict=True))
         except ValidationError as error:
-            raise InvalidRequest(f"sequences: they are no names of traverses, at most {MOST_NAMES}.") from error
+            raise InvalidRequest(f"sequences: give the names of 1 to {MOST_NAMES} traverses.") from error
 
     def _metadata(self) -> dict[str, Scalar]:
         if self.where is None:
             return {}
         found = parsed_json(self.where, "where")
         if not isinstance(found, dict) or not 0 < len(found) <= MOST_NAMES:
-            raise InvalidRequest(f"where: it is no JSON object with 1 to {MOST_NAMES} keys.")
+            raise InvalidRequest(f"where: the value is not a JSON object with 1 to {MOST_NAMES} keys.")
         for key, value in found.items():
             if isinstance(value, dict | list):
-                raise InvalidRequest(f"where: {key[:80]!r} has a value that is no text, number, true, false or null.")
+                raise InvalidRequest(f"where: the value of {key[:80]!r} must be a text, number, true, false or null.")
             if isinstance(value, str) and len(value) > LONGEST_INDEXED:
                 raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
         return found
@@ -166,13 +166,13 @@ class FilterParameters(PlaceDescription):
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
             if self.prior_trust is not None:
-                raise InvalidRequest("prior_trust: nothing is soft.")
+                raise InvalidRequest("prior_trust: it needs soft, which says what it is the trust in.")
             return set()
         names = set(self.soft.split(","))
         if unknown := sorted(names - set(KINDS)):
-            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is none of {', '.join(KINDS)}.")
+            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is not one of {', '.join(KINDS)}.")
         if absent := sorted(names - given):
-            raise InvalidRequest(f"soft: nothing is said of {absent[0]}.")
+            raise InvalidRequest(f"soft: the query has no parameter for {absent[0]}.")
         return names
 
     def _recent(self) -> RecentFrames | None:
@@ -200,17 +200,17 @@ def _conditions(
 
 
 def parse_box(text: str) -> Box:
-    """west,south,east,north in degrees.
+    """The box of a text ``west,south,east,north`` in degrees.
 
     Raises:
-        InvalidRequest: it is not.
+        InvalidRequest: the text is no such box.
     """
     parts = [part.strip() for part in text.split(",")]
     if len(parts) != 4 or not all(_DEGREES.fullmatch(part) for part in parts):
-        raise InvalidRequest("bbox: it is not four numbers, west,south,east,north.")
+        raise InvalidRequest("bbox: the value is not four numbers, west,south,east,north.")
     west, south, east, north = map(float, parts)
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
-        raise InvalidRequest("bbox: it needs -180 to 180 for west and east, and -90 <= south <= north <= 90.")
+        raise InvalidRequest("bbox: west and east must be -180 to 180, and -90 <= south <= north <= 90.")
     return Box(west, south, east, north)
 
 
@@ -218,7 +218,7 @@ def parsed_json(text: str, what: str) -> Any:
     """The value of JSON text in a parameter.
 
     Raises:
-        InvalidRequest: it is not JSON, or holds what cannot be stored.
+        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair).
     """
 
     def refuse(constant: str) -> Any:
@@ -229,4 +229,4 @@ def parsed_json(text: str, what: str) -> Any:
         json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
         return found
     except (ValueError, RecursionError):
-        raise InvalidRequest(f"{what}: it is not JSON.") from None
+        raise InvalidRequest(f"{what}: the value is not JSON.") from None

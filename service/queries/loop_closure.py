@@ -1,4 +1,4 @@
-"""Loop closure: look for a frame among the places of a map and, if nobody knows it, make it a place; no HTTP."""
+"""Loop closure: locate a frame in a map and, if its place is unknown, enrol it."""
 
 from __future__ import annotations
 
@@ -43,13 +43,14 @@ from service.queries.schemas import ClosureAnswer
 
 @dataclass(frozen=True)
 class Closure:
-    """What became of a frame.
+    """The result of a loop closure.
 
-    enrolled: its place; None if the frame is that of another place, or may be.
-    created: whether the place was made now.
+    answer: the answer of the map before the frame was enrolled.
+    enrolled: the frame's own place; None if the frame shows, or may show, another place.
+    created: whether the place was created by this request.
     """
 
-    located: Answer
+    answer: Answer
     enrolled: Place | None
     created: bool
 
@@ -57,17 +58,18 @@ class Closure:
 def close_loop(
     engine: Engine, map_: Map, frame: FrameToEnrol, encoded: Encoded, k: int, selection: Selection | None
 ) -> Closure:
-    """Locate a frame and, if the verdict is ``unknown``, enrol it: as one step, so that of two frames of one new place
-    that come together the second finds the first.  Blocks; call it in a thread.
+    """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
 
-    A repeated request finds the same as the first did: its own place is left out of the search.
+    The map is locked meanwhile: if two frames of one new place arrive together, the second finds the first.  A
+    repeated request gets the same answer as the first one, because its own place is left out of the search.
 
     Args:
-        encoded: the frame's frame, which has regions.
-        selection: what is known of the place asked for; None: nothing.
+        encoded: the frame, encoded; it has regions.
+        k: how many matches to list.
+        selection: what is known of the place; None: nothing.
 
     Raises:
-        PlaceTaken: the frame's id is that of a place with another frame.
+        PlaceTaken: a place of the frame's id exists, and has another frame.
         StorageFull, StorageFailure: nothing was enrolled.
     """
     digest = digest_of(frame)
@@ -78,13 +80,13 @@ def close_loop(
             raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
             selection = replace(selection or Selection(), excluded=frame.id)
-        (located,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
+        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
         if known is not None:
-            return Closure(located, map_.place(frame.id), created=False)
-        if located.judgement.verdict != "unknown":
-            return Closure(located, None, created=False)
+            return Closure(answer, map_.place(frame.id), created=False)
+        if answer.judgement.verdict != "unknown":
+            return Closure(answer, None, created=False)
         ((place, _),) = map_.enrol([enrolment])
-        return Closure(located, place, created=True)
+        return Closure(answer, place, created=True)
 
 
 router = APIRouter(
@@ -139,7 +141,7 @@ async def query_or_enrol(
     else:
         frame = FrameToEnrol(options.id, fields, data, mask)
         closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection)
-        answer = answer_of(encoded, closure.located)
+        answer = answer_of(encoded, closure.answer)
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"

@@ -1,4 +1,4 @@
-"""Queries: where was this frame taken?"""
+"""Routes of queries: one frame, many frames, and the pictures of explanations."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from service.http.openapi import BINARY, form_body, frame_body
 from service.http.quick_route import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
-from service.queries.answers import StatisticsDep, told_answer
-from service.queries.explanations import as_drawn, explained_match
+from service.queries.answers import StatisticsDep, counted_answer
+from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
-from service.queries.statistics import key_of
+from service.queries.statistics import map_key
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -76,10 +76,10 @@ async def query(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
     recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask)
-    answer = told_answer(engine, statistics, map_, recognized)
+    answer = counted_answer(engine, statistics, map_, recognized)
     if options.explain and answer.matches:
-        encoded, best = await in_thread(as_drawn, recognized.encoded), answer.matches[0].place.id
-        answer.explanation = await explained_match(engine, pictures, map_, encoded, best, deadline)
+        encoded, best = await in_thread(scaled_for_drawing, recognized.encoded), answer.matches[0].place.id
+        answer.explanation = await explain_match(engine, pictures, map_, encoded, best, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     return answer
@@ -106,7 +106,7 @@ async def query_batch(
     selection = options.selection()
     engine.assert_encoder(map_, options.encoder)
     if options.explain:
-        raise InvalidRequest("explain: frames are explained one by one, by a query of their own.")
+        raise InvalidRequest("explain: a batch cannot be explained; send the frame as a single query.")
     mask = await camera_mask(map_, options.camera)
     if not files:
         raise InvalidRequest("The form has no file part.")
@@ -128,7 +128,7 @@ async def query_batch(
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection)
     for index, one in zip(encoded, recognized, strict=True):
-        items[index].answer = told_answer(engine, statistics, map_, one)
+        items[index].answer = counted_answer(engine, statistics, map_, one)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)
@@ -152,5 +152,5 @@ def see_explanation(
 
     `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
     """
-    picture = pictures.fetch(key_of(engine.atlas.find(map_id)), name)
+    picture = pictures.fetch(map_key(engine.atlas.find(map_id)), name)
     return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})
