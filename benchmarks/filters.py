@@ -29,7 +29,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
-from core.recognition.selection import EVERYTHING, Selection
+from core.recognition.selection import WHOLE_MAP, Selection
 from core.storage import Atlas, Map
 from service.queries.filters import FilterParameters
 
@@ -94,11 +94,11 @@ def measured(map_: Map, encoder: Encoder, rounds: int) -> dict[str, dict[str, fl
         for _ in range(TRIES):
             for name, selection in kinds.items():
                 began = time.perf_counter()
-                choice = selection.choice(map_, snapshot) if selection else EVERYTHING
+                scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
                 chosen = time.perf_counter()
                 locate(map_, encoder, [encoding], 5, selection)
                 tries[name].append((1e3 * (time.perf_counter() - chosen), 1e3 * (chosen - began)))
-                shares[name] = 1.0 if choice.allowed is None else float(choice.allowed.mean())
+                shares[name] = 1.0 if scope.allowed is None else float(scope.allowed.mean())
         for name, found in tries.items():
             fastest, choosing_it = min(found[1:])  # the first one reads what is not in the system's cache
             times[name].append(fastest)

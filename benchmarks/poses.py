@@ -15,7 +15,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from core.recognition.localization import Located
 
 from benchmarks.frames import encode_folder
 from benchmarks.report import report
@@ -24,13 +23,13 @@ from core.frames.traverses import read_ground_truth
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.recognition import locate
+from core.recognition.recognition import Answer, locate
 from core.storage import Atlas
 
 REACH = 15
 
 
-def answers(encoder: Encoder, queries: list[Encoding], places: list[Encoding]) -> list[Located]:
+def answers(encoder: Encoder, queries: list[Encoding], places: list[Encoding]) -> list[Answer]:
     """The answers of a map on which place i stands at i metres."""
     with tempfile.TemporaryDirectory() as folder:
         described = ((place.descriptor, place.local) for place in places)

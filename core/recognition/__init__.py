@@ -1,4 +1,4 @@
-"""The whole path from a picture to an answer, without HTTP."""
+"""The whole path from a picture to an answer."""
 
 from core.recognition.recognition import Answer, enrol, locate, recognize
 from core.recognition.selection import Selection

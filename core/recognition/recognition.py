@@ -1,10 +1,10 @@
-"""The one way from a picture to an answer, and from a picture to a place; no HTTP.
+"""Place recognition as an algorithm: from a picture to an answer, and from a picture to a place of a map.
 
     answer = recognize(map_, picture, encoder)          # decode, encode, search, agree, judge
     place = enrol(map_, "p7", picture, encoder)         # decode, encode, store
 
-The service does the same steps: it decodes and encodes frames of many callers together, and calls :func:`locate`
-and :func:`describe` with what they give.
+The service takes the same steps.  It decodes and encodes the frames of several requests together, and then calls
+:func:`locate` and :func:`describe`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from core.judgement.priors import log_odds_per_score
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder, Encoding
 from core.places import Place, PlaceFields
-from core.recognition.selection import EVERYTHING, Selection
-from core.recognition.stages import Candidates, agree, calibration_of, neighborhood_of, search
+from core.recognition.selection import Selection
+from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
 from core.storage import Enrolment, Map
 
 ATTEMPTS = 3
-"""Snapshots that are tried while places are deleted during the search."""
+"""How often a query is searched for if places that it finds are deleted in the meantime."""
 
 THUMBNAIL_SIDE = 320
 """The longer side of a thumbnail, in pixels."""
@@ -40,13 +40,15 @@ THUMBNAIL_SIDE = 320
 class Answer:
     """The answer to one query.
 
-    matches: score and place, best first; at most k.
-    weights: of the matches, how much the prior speaks for each, in (0, 1]; None: nothing was known.
+    judgement: the verdict, with the values that it rests on.
+    matches: score and place of the best matches, best first; at most k.
+    weights: the prior weight of each match, in (0, 1]; None if the query had no prior.
     calibration: the calibration by which the query was judged.
-    search: milliseconds of search, second stage, judgement and look-up of the places.
-    pose: of the query, by the poses of the best match and of its neighbours; None without poses.
-    encoding: of the query.
-    candidates: the best of the ranking, from which the matches are taken.
+    search: milliseconds spent on both stages of the search, the judgement and the look-up of the places; for several
+        queries that were searched for together, the mean.
+    pose: the estimated pose of the query, from the poses of the best match and its neighbours; None if they have none.
+    encoding: the encoded query.
+    candidates: the best places of the ranking; the matches are the first of them.
     """
 
     judgement: Judgement
@@ -60,12 +62,12 @@ class Answer:
 
     @property
     def place(self) -> Place | None:
-        """The place that the query shows; None unless the verdict is ``recognized``."""
+        """The place that the query shows if the verdict is ``recognized``, else None."""
         return self.matches[0][1] if self.judgement.verdict == "recognized" else None
 
     @property
     def probability(self) -> float | None:
-        """The probability that the best match is right; None in an empty map or without a calibrated curve."""
+        """The probability that the best match is right; None if there is no match or the calibration has no curve."""
         return self.judgement.probability
 
 
@@ -84,16 +86,16 @@ def recognize(
         encoder: the map's encoder (``EncoderCatalogue().get(map_.record.encoder)``).
         k: how many matches to list.
         selection: what is known of the place; None: nothing.
-        camera: the camera of the map that took the picture, whose mask is applied; None: no mask.
+        camera: the name of the map's camera that took the picture, whose mask is applied; None: no mask.
 
     Raises:
         InvalidImage: the picture cannot be decoded.
-        NoRegions: it is blank, or nearly so.
+        NoRegions: the picture is blank, or nearly so.
         UnknownCamera: the map has no such camera.
         StorageFailure: the map's files cannot be read.
     """
-    pixels = decode(picture)  # H x W x 3
-    encoding = encoder.encode(pixels, _mask(map_, camera))  # regions, descriptor [V·K], cells [C, L]
+    pixels = decode(picture)  # uint8 [H, W, 3]
+    encoding = encoder.encode(pixels, _mask(map_, camera))  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
         raise NoRegions("The picture has no region of interest: it is blank, or nearly so.")
     (answer,) = locate(map_, encoder, [encoding], k, selection)
@@ -107,25 +109,26 @@ def enrol(
     encoder: Encoder,
     fields: PlaceFields | None = None,
 ) -> Place:
-    """Make a picture a place of a map; it is on disk, and found by every later search, when this returns.
+    """Store a picture as a place of a map.  When this returns, the place is on disk and every later search finds it.
 
     Args:
+        place_id: the id of the place; an existing place of this id is replaced.
         picture: the bytes of a JPEG, PNG or WebP file.
         encoder: the map's encoder.
         fields: pose, time, sequence, camera and metadata of the place.
 
     Raises:
         InvalidImage: the picture cannot be decoded.
-        NoRegions: it is blank, or nearly so.
+        NoRegions: the picture is blank, or nearly so.
         UnknownCamera: the map has no such camera.
-        StorageFull, StorageFailure: nothing was stored.
+        StorageFull, StorageFailure: the disk is full or refuses; nothing was stored.
     """
-    said = fields or PlaceFields()
-    mask = _mask(map_, said.camera)
+    fields = fields or PlaceFields()
+    mask = _mask(map_, fields.camera)
     pixels = decode(picture)
     encoding = encoder.encode(pixels, mask)
     digest = frame_digest(hashlib.sha256(picture).digest(), mask)
-    ((place, _change),) = map_.enrol([describe(map_, place_id, said, picture, digest, pixels, encoding)])
+    ((place, _change),) = map_.enrol([describe(map_, place_id, fields, picture, digest, pixels, encoding)])
     return place
 
 
@@ -134,7 +137,14 @@ def _mask(map_: Map, camera: str | None) -> Mask | None:
 
 
 def frame_digest(sha256: bytes, mask: Mask | None) -> bytes:
-    """By what a map knows a frame that it has encoded: the digest of its file and, if there is one, of its mask."""
+    """The digest by which a map recognizes a frame that it has already encoded: of its file and, if any, its mask.
+
+    Args:
+        sha256: the digest of the file, 32 bytes.
+
+    Returns:
+        32 bytes.
+    """
     return sha256 if mask is None else hashlib.sha256(sha256 + mask.digest.encode()).digest()
 
 
@@ -148,7 +158,13 @@ def describe(
     encoding: Encoding,
     thumbnail_side: int = THUMBNAIL_SIDE,
 ) -> Enrolment:
-    """What a map stores of a frame: its descriptors, its fields, and of the picture what the map keeps.
+    """The record that a map stores of an encoded frame: its descriptors, fields, and the picture that the map keeps.
+
+    Args:
+        picture: the bytes of the file; only needed if the map keeps images.
+        digest: the frame's ``frame_digest``.
+        pixels: uint8 [H, W, 3], BGR.
+        thumbnail_side: the longer side of the thumbnail, in pixels.
 
     Raises:
         NoRegions: the frame is blank, or nearly so.
@@ -175,52 +191,47 @@ def locate(
 
     Args:
         encoder: the map's encoder.
-        encodings: of the queries, made by it, with regions; at least one.
+        encodings: the queries, encoded by it, each with at least one region; at least one query.
         k: how many matches to list.
-        selection: what is known of the place; None: nothing.
+        selection: what is known of the places; None: nothing.
+
+    Returns:
+        One answer for each query, in order.
 
     Raises:
         StorageFailure: the map's files cannot be read.
     """
     began = time.perf_counter()
-    snapshot = map_.snapshot()
-    choice = selection.choice(map_, snapshot) if selection else EVERYTHING
-    rankings = search(snapshot, np.stack([encoding.descriptor for encoding in encodings]), choice)
-    share = 1e3 * (time.perf_counter() - began) / len(encodings)
-    answers = []
-    for encoding, ranking in zip(encodings, rankings, strict=True):
-        began = time.perf_counter()
-        candidates = agree(map_, encoder, snapshot, encoding.local, ranking, choice)
-        attempt = 1
-        while (answer := judged(map_, encoder, encoding, candidates, k, settle=attempt == ATTEMPTS)) is None:
-            candidates, attempt = _searched_again(map_, encoder, encoding, selection), attempt + 1
-        answers.append(replace(answer, search=share + 1e3 * (time.perf_counter() - began)))
-    return answers
+    ranked = rank_places(map_, encoder, encodings, selection)  # both stages of the search
+    answers = [
+        _answer(map_, encoder, encoding, candidates, k, selection)
+        for encoding, candidates in zip(encodings, ranked, strict=True)
+    ]
+    milliseconds = 1e3 * (time.perf_counter() - began) / len(encodings)
+    return [replace(answer, search=milliseconds) for answer in answers]
 
 
-def _searched_again(map_: Map, encoder: Encoder, encoding: Encoding, selection: Selection | None) -> Candidates:
-    """Both stages for one query, in the map as it is now."""
-    snapshot = map_.snapshot()
-    choice = selection.choice(map_, snapshot) if selection else EVERYTHING
-    (ranking,) = search(snapshot, encoding.descriptor[np.newaxis], choice)
-    return agree(map_, encoder, snapshot, encoding.local, ranking, choice)
+def _answer(
+    map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, k: int, selection: Selection | None
+) -> Answer:
+    """Look up the best places and judge the query; search again if one of them was deleted since the search."""
+    attempt = 1
+    while None in (places := _places(map_, candidates, k)) and attempt < ATTEMPTS:
+        (candidates,) = rank_places(map_, encoder, [encoding], selection)
+        attempt += 1
+    if None in places:  # places are being deleted all the time: go on without those that are gone
+        present = np.ones(len(candidates.rows), np.bool_)
+        present[: len(places)] = [place is not None for place in places]
+        candidates = candidates.take(np.flatnonzero(present))
+    return _judge(map_, encoder, encoding, candidates, [place for place in places if place is not None])
 
 
-def judged(
-    map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, k: int, settle: bool
-) -> Answer | None:
-    """The verdict on a query by its candidates, with the places that match.
+def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
+    return map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
 
-    Args:
-        settle: leave out places that were deleted since the snapshot; without it there is no answer then, but None.
-    """
-    places = map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
-    if None in places:
-        if not settle:
-            return None
-        kept = np.ones(len(candidates.rows), np.bool_)
-        kept[: len(places)] = [place is not None for place in places]
-        candidates = candidates.take(np.flatnonzero(kept))
+
+def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, places: list[Place]) -> Answer:
+    """The verdict on a query by its candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     judgement = judge(
         candidates.ordered,
@@ -230,12 +241,10 @@ def judged(
         candidates.examined,
         candidates.is_part,
     )
-    present = [place for place in places if place is not None]
-    matches = [(float(score), place) for score, place in zip(candidates.scores, present, strict=False)]
+    matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
     if matches:
         judgement = replace(judgement, score=matches[0][0])
-    steepness = log_odds_per_score(calibration, encoder.candidates > 0)
-    log_odds = steepness * candidates.ordered.astype(np.float64)
+    log_odds = log_odds_per_score(calibration, encoder.candidates > 0) * candidates.ordered.astype(np.float64)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates)

@@ -1,4 +1,4 @@
-"""Queries of a map by the frames of its own places, from what it stores of them: nothing is encoded."""
+"""Queries of a map by its own places, whose stored descriptors serve as queries: nothing is encoded."""
 
 from __future__ import annotations
 
@@ -9,35 +9,39 @@ from numpy.typing import NDArray
 
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
-from core.places import Neighborhood
+from core.recognition.stages import neighborhood_of
 from core.storage import Map
 from core.storage.transfer import Outline
 
 Positions = NDArray[np.int64]
 
 TOGETHER = 16
-"""Queries of one search."""
+"""The most queries of one search."""
 
 HEAD = 400
-"""So much of a ranking is looked at."""
+"""How many places of a ranking are returned."""
 
-_GOLDEN = (5**0.5 - 1) / 2
+_GOLDEN_RATIO = (5**0.5 - 1) / 2
 
 
-def spread(count: int) -> Positions:
-    """0 … count - 1 in an order of which every beginning is spread evenly over them."""
-    return np.argsort((np.arange(count) * _GOLDEN) % 1.0, kind="stable").astype(np.int64)
+def spread_order(count: int) -> Positions:
+    """A permutation of 0 … count - 1, int64 [count], of which every prefix is spread evenly over the whole range."""
+    return np.argsort((np.arange(count) * _GOLDEN_RATIO) % 1.0, kind="stable").astype(np.int64)
 
 
 class SelfQueries:
-    """The places of a map at one moment; positions count them in the order of their rows."""
+    """The places of a map at one moment as queries; a position is the index of a place in the order of the rows.
+
+    places: id, row and fields of each place.
+    rows: int64 [places], the rows of the places in ``snapshot``.
+    where: the poses and sequences of the places.
+    """
 
     def __init__(self, map_: Map, encoder: Encoder) -> None:
-        record = map_.record
-        self.encoder, self.neighborhood = encoder, Neighborhood(record.same_place_radius, record.same_place_frames)
+        self.encoder, self.neighborhood = encoder, neighborhood_of(map_)
         outline = map_.transfer.outline()
         self.snapshot = map_.snapshot()
-        # One that is being written in this very moment is listed before its row is in a snapshot.
+        # A place that is being stored at this moment is listed before its row is in a snapshot.
         there = (place for place in outline if place.row < self.snapshot.rows)
         self.places: list[Outline] = sorted(there, key=lambda place: place.row)
         self.rows = np.array([place.row for place in self.places], np.int64)
@@ -49,15 +53,15 @@ class SelfQueries:
         return len(self.places)
 
     def near(self, position: int, others: Positions) -> NDArray[np.bool_]:
-        """Which of ``others`` are the same place as one; bool [n]."""
+        """Which of the places at ``others``, int64 [n], are the same place as the one at ``position``; bool [n]."""
         return self.where.take(np.concatenate([[position], others])).near(0, self.neighborhood)[1:]
 
-    def local(self, positions: Positions) -> Cells:
-        """The local descriptors of places, int8 [k, C, L]."""
+    def local_descriptors(self, positions: Positions) -> Cells:
+        """The local descriptors of the places at some positions, int64 [k]; int8 [k, C, L]."""
         return self.snapshot.locals_at(self.rows[positions])
 
-    def alike(self, pairs: Positions) -> NDArray[np.float32]:
-        """Scores by the first stage of pairs of places, int64 [m, 2] to float32 [m]."""
+    def first_stage_scores(self, pairs: Positions) -> NDArray[np.float32]:
+        """The scores of the first stage for pairs of positions; int64 [m, 2] to float32 [m]."""
         wanted, inverse = np.unique(pairs, return_inverse=True)
         inverse = inverse.reshape(pairs.shape)
         descriptors = self.snapshot.descriptors_at(self.rows[wanted])
@@ -67,13 +71,15 @@ class SelfQueries:
     def search(
         self, positions: Sequence[int], references: NDArray[np.bool_] | None = None
     ) -> Iterator[tuple[int, Positions, NDArray[np.float32]]]:
-        """Hold some places' frames, sixteen at most, against the map.
+        """Search the map, by the first stage, for some of its own places.
 
         Args:
-            references: bool [places], those that are searched; None: all.
+            positions: the queries, at most ``TOGETHER``.
+            references: bool [places], the places that are searched; None: all.
 
         Yields:
-            Each position, with those of the best others, best first, and their scores by the first stage.
+            For each query its position, the positions of the best other places, int64 [n], best first, and their
+            scores, float32 [n].
         """
         allowed = None
         if references is not None:

@@ -1,4 +1,4 @@
-"""What every capability works with: the maps, the encoders, the queue in front of them, and the locks of maps."""
+"""The engine: maps, encoders, the queue in front of the encoders, searches, and one lock for each map."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.microbatches import Encoded, Then
-from service.engine.queue import EncoderQueue, Outcomes, Patience
+from service.engine.microbatches import AfterEncoding, Encoded
+from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.settings import Settings
@@ -36,7 +36,7 @@ class _Lock:
 
 
 class MapLocks:
-    """One reentrant lock for each map, which exists only while a thread holds it or waits for it.  Thread-safe."""
+    """One reentrant lock for each map; a lock exists only while a thread holds it or waits for it.  Thread-safe."""
 
     def __init__(self) -> None:
         self._locks: dict[str, _Lock] = {}
@@ -47,7 +47,7 @@ class MapLocks:
 
     @contextmanager
     def of(self, map_id: str) -> Iterator[None]:
-        """Hold the lock of a map; blocks.  A thread that holds it already may take it again."""
+        """Hold the lock of a map; blocks.  A thread that already holds the lock may take it again."""
         with self._lock:
             lock = self._locks.setdefault(map_id, _Lock())
             lock.users += 1
@@ -65,7 +65,7 @@ log = logging.getLogger("placerec.engine")
 
 
 async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
-    """The mask of one of a map's cameras, or None if no camera is named.
+    """The mask of one of a map's cameras; None if ``camera`` is None or the camera has no mask.
 
     Raises:
         UnknownCamera: the map has no camera of this name.
@@ -76,7 +76,7 @@ async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
 class Engine:
     """The maps of a data directory, the installed encoders, the queue in front of them, and a lock for each map.
 
-    Jobs, sessions, imports and whatever else works with maps are built on an engine; it knows none of them.
+    Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
@@ -97,18 +97,18 @@ class Engine:
         metrics.registry.register(self._map_collector)
 
     def start(self) -> None:
-        """Begin to load the default encoder on the running event loop, which goes on meanwhile."""
+        """Begin to load the default encoder in the background; call it from the event loop."""
         self.loop = asyncio.get_running_loop()
         self._loading = asyncio.create_task(self._load_default())
 
     def close(self) -> None:
-        """Drop the frames that wait, and give the data directory back; blocks."""
+        """Cancel the waiting frames and release the data directory; blocks."""
         self.metrics.registry.unregister(self._map_collector)
         self.queue.close()
         self.atlas.close()
 
     def stop_loading(self) -> None:
-        """Give up loading the default encoder; call it from the event loop."""
+        """Cancel the loading of the default encoder; call it from the event loop."""
         if self._loading is not None:
             self._loading.cancel()
 
@@ -125,7 +125,7 @@ class Engine:
             self.encoder_state = "it cannot be loaded; the log says why"
             log.exception("the default encoder cannot be loaded")
         else:
-            # What is loaded by now stays, so the collector need not walk over it again and again, which takes long.
+            # Objects that are loaded by now live as long as the process: the garbage collector can skip them.
             gc.collect()
             gc.freeze()
             self.encoder_state = "ok"
@@ -136,12 +136,12 @@ class Engine:
     def _count_places(self) -> dict[str, int]:
         counts: dict[str, int] = {}
         for record in self.all_records():
-            with suppress(UnknownMap, MapQuarantined):  # deleted, or found to be damaged, since it was listed
+            with suppress(UnknownMap, MapQuarantined):  # it was deleted or quarantined since it was listed
                 counts[record.id] = self.atlas.find(record.id).count_places()
         return counts
 
     def all_records(self) -> list[MapRecord]:
-        """The records of all maps in service."""
+        """The records of all maps that are in service (not quarantined)."""
         found, cursor = self.atlas.records(None, 1000)
         records = list(found)
         while cursor is not None:
@@ -151,24 +151,25 @@ class Engine:
 
     @contextmanager
     def writing(self, map_id: str) -> Iterator[None]:
-        """Hold a map's lock during a write that depends on what was read before; blocks, so call it in a thread."""
+        """Hold a map's lock during a read and the write that depends on it; blocks, so call it in a thread."""
         with self._locks.of(map_id):
             yield
 
     # Encoders
 
     def default_calibration(self, identity: str) -> Calibration | None:
-        """What an encoder ships with; None if it is not installed."""
+        """The calibration that an encoder ships with; None if the encoder is not installed."""
         for summary in self.catalogue.describe():
             if summary.identity == identity:
                 return summary.calibration
         return None
 
     def load_encoder(self, map_: Map) -> Encoder:
-        """The encoder of a map; blocks, so call it from a thread other than the event loop's.
+        """The encoder of a map; blocks, so call it in a thread, never on the event loop.
 
         Raises:
-            EncoderNotInstalled: it is not installed.
+            EncoderNotInstalled: the map's encoder is not installed.
+            InvalidModel: its files are damaged.
         """
         try:
             return asyncio.run_coroutine_threadsafe(self.queue.load(map_.record.encoder), self.loop).result()
@@ -176,20 +177,22 @@ class Engine:
             raise EncoderNotInstalled(str(error)) from error
 
     def resolve(self, name_or_identity: str | None) -> str:
-        """The identity of an encoder, of the default one for None.
+        """The identity of an encoder, given its name or identity; that of the default encoder for None.
 
         Raises:
-            UnknownEncoder, InvalidModel: it is not installed, or damaged.
+            UnknownEncoder: no such encoder is installed.
+            InvalidModel: its files are damaged.
         """
         return self.catalogue.resolve(name_or_identity or self.settings.encoder)
 
     async def map(self, map_id: str) -> Map:
-        """A map, opened if need be.
+        """A map, which is opened from disk if it is not open yet.
 
         Raises:
-            UnknownMap, MapQuarantined: it is not there, or damaged.
+            UnknownMap: there is no map of this id.
+            MapQuarantined: the map is damaged.
         """
-        # Nearly always it is open: no thread has to be asked for it.
+        # The map is nearly always open, and then no thread is needed.
         found = self.atlas.opened(map_id)
         return found if found is not None else await in_thread(self.atlas.get, map_id)
 
@@ -197,18 +200,18 @@ class Engine:
         self,
         map_: Map,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         mask: Mask | None = None,
-        then: Then | None = None,
+        after_encoding: AfterEncoding | None = None,
     ) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``queue.place``.
 
         Raises:
-            EncoderNotInstalled: the map's encoder is not here (any more).
-            Others: as for ``EncoderQueue.encode``.
+            EncoderNotInstalled: the map's encoder is not installed.
+            Others: see ``EncoderQueue.encode``.
         """
         try:
-            return await self.queue.encode(map_.record.encoder, data, patience, mask, then)
+            return await self.queue.encode(map_.record.encoder, data, deadline, mask, after_encoding)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -216,41 +219,45 @@ class Engine:
         self,
         map_: Map,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         k: int,
         selection: Selection | None = None,
         mask: Mask | None = None,
     ) -> Recognized:
-        """Find where one frame was taken: wait in the queue, decode, encode, search, examine, judge.
+        """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, judge.
 
         Args:
-            k: matches to list.
+            data: the bytes of a JPEG, PNG or WebP file.
+            k: how many matches to list.
             selection: what is known of the place; None: nothing.
-            mask: what of the frame is ignored.
+            mask: the part of the frame that is ignored.
 
         Raises:
-            QueueFull: too many requests wait.
+            QueueFull: too many requests are waiting.
             StorageFailure: the map's files cannot be read.
-            Others: as for ``encode_for``.
+            Others: see ``encode_for``.
         """
         with self.queue.place():
-            encoded = await self.encode_for(map_, data, patience, mask, search_ahead(map_, k, selection))
+            encoded = await self.encode_for(map_, data, deadline, mask, search_ahead(map_, k, selection))
         (recognized,) = await self.searches.recognize(map_, [encoded], k, selection)
         return recognized
 
     async def encode_many(
-        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+        self,
+        identity: str,
+        frames: Sequence[bytes],
+        deadline: RequestDeadline,
+        masks: Sequence[Mask | None] | None = None,
     ) -> AsyncGenerator[Outcomes]:
-        """Encode many frames, as ``EncoderQueue.encode_many`` does; close the generator (``contextlib.aclosing``).
+        """Encode many frames by ``EncoderQueue.encode_many``; close the generator (``contextlib.aclosing``).
 
         Args:
-            identity: of the encoder of the map that the frames are for.
+            identity: the identity of the map's encoder.
 
         Raises:
-            EncoderNotInstalled: the encoder is not installed (any more).
-            Others: as for ``EncoderQueue.encode_many``.
+            EncoderNotInstalled: the encoder is not installed.
         """
-        async with aclosing(self.queue.encode_many(identity, frames, patience, masks)) as outcomes:
+        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for _, outcome in some:
                     if isinstance(outcome, UnknownEncoder):
@@ -258,21 +265,29 @@ class Engine:
                 yield some
 
     async def encode_all(
-        self, identity: str, frames: Sequence[bytes], patience: Patience, masks: Sequence[Mask | None] | None = None
+        self,
+        identity: str,
+        frames: Sequence[bytes],
+        deadline: RequestDeadline,
+        masks: Sequence[Mask | None] | None = None,
     ) -> list[Encoded | Exception]:
-        """What became of each of many frames, in their order, without the pixels, which would fill the memory."""
+        """Encode many frames: each frame, without its pixels, or the error that kept it from being encoded.
+
+        Raises:
+            EncoderNotInstalled: the encoder is not installed.
+        """
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many(identity, frames, patience, masks)) as outcomes:
+        async with aclosing(self.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
         return [made[index] for index in range(len(frames))]
 
     def assert_encoder(self, map_: Map, asserted: str | None) -> None:
-        """See that the encoder that a caller names is the map's.
+        """Check that the encoder that a caller names, by name or identity, is the map's.
 
         Raises:
-            WrongEncoder: it is not.
+            WrongEncoder: the map is bound to another encoder.
         """
         identity = map_.record.encoder
         if asserted is None or asserted in (identity, identity.partition("@")[0]):

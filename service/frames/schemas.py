@@ -1,4 +1,4 @@
-"""What a frame gives without a map: descriptor, regions, a score against another."""
+"""Descriptors, regions and scores of frames as JSON."""
 
 from __future__ import annotations
 

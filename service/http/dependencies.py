@@ -13,7 +13,7 @@ from core.places import check_map_id, check_place_id
 from core.storage import Map
 from service.access.roles import Principal
 from service.engine.engine import Engine
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of
 from service.http.schemas import PageParameters
@@ -37,7 +37,7 @@ async def _principal(request: Request) -> Principal:
     return principal
 
 
-async def _patience(
+async def _request_deadline(
     request: Request,
     x_request_timeout: Annotated[
         float | None,
@@ -49,11 +49,11 @@ async def _patience(
             "service's own limit.",
         ),
     ] = None,
-) -> Patience:
+) -> RequestDeadline:
     intake = intake_of(request)
     if x_request_timeout is not None:
         intake.deadline = min(intake.deadline, request.state.started + x_request_timeout)
-    return Patience(intake.deadline, intake.hung_up)
+    return RequestDeadline(intake.deadline, intake.hung_up)
 
 
 async def single_values(request: Request) -> None:
@@ -128,7 +128,7 @@ def rounded(milliseconds: Mapping[str, float]) -> dict[str, float]:
 
 EngineDep = Annotated[Engine, Depends(FromState("engine"))]
 PrincipalDep = Annotated[Principal, Depends(_principal)]
-PatienceDep = Annotated[Patience, Depends(_patience)]
+DeadlineDep = Annotated[RequestDeadline, Depends(_request_deadline)]
 MapId = Annotated[str, Path(alias="map", description="Id of the map.", examples=["lab"]), AfterValidator(check_map_id)]
 PlaceId = Annotated[
     str, Path(alias="place", description="Id of the place.", examples=["p7"]), AfterValidator(check_place_id)

@@ -20,11 +20,11 @@ from starlette.responses import Response
 
 from core.errors import InvalidIdentifier
 from core.places import check_map_id
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.http.bodies import intake_of, json_size, parse_json
 from service.http.dependencies import FromState
 
-READ_HERE = {"map_id", "options", "request", "patience"}
+READ_HERE = {"map_id", "options", "request", "deadline"}
 """Parameters of a route that are read without the framework; all others must come from the application's state."""
 
 DEADLINE = "x-request-timeout"
@@ -36,7 +36,7 @@ LONGEST_KEPT = 256
 
 
 class QuickRoute(APIRoute):
-    """A route of the parameters ``map_id``, ``options`` (a frozen model), ``request``, ``patience`` and ``FromState``.
+    """A route of the parameters ``map_id``, ``options`` (a frozen model), ``request``, ``deadline`` and ``FromState``.
 
     The function returns a model.  Functions with other parameters get the framework's own route.
     """
@@ -57,9 +57,9 @@ class QuickRoute(APIRoute):
             if options is None or DEADLINE in request.headers or not _is_map_id(name):
                 return await careful(request)
             intake = intake_of(request)
-            patience = Patience(intake.deadline, intake.hung_up)
+            deadline = RequestDeadline(intake.deadline, intake.hung_up)
             given = {parameter: getattr(request.app.state, state) for parameter, state in kept.items()}
-            answer = await endpoint(map_id=name, options=options, request=request, patience=patience, **given)
+            answer = await endpoint(map_id=name, options=options, request=request, deadline=deadline, **given)
             return Response(answer.model_dump_json(exclude_unset=exclude_unset), media_type="application/json")
 
         return quick

@@ -1,4 +1,4 @@
-"""Long work as it is told and remembered: one record a job, in a small SQLite file beside the maps."""
+"""The records of jobs, in a small SQLite file in the data directory."""
 
 from __future__ import annotations
 
@@ -63,20 +63,20 @@ _SCHEMA = Schema(
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of long work, as of one moment.
+    """The state of a job at one moment.
 
-    number: grows from job to job.
-    arguments: what it was asked for, as JSON.
-    resumable: after a restart it is done again from ``arguments`` and ``notes``.
-    cancelling: it was asked to stop.
-    attempt: how often it was begun.
-    change: counts what became of it within the attempt.
-    done, total: of whatever it works through; the total may not be known yet.
-    notes: what it wrote down for its next attempt.
-    result: what it found, once it has succeeded.
-    problem: why it failed, as a problem object.
-    maps: the maps that it was asked for, by id, and when each was created: one of the same id that was created at
-        another time is another map.
+    number: counts the jobs; a later job has a larger number.
+    arguments: the arguments of the job, as JSON values.
+    resumable: whether the job is resumed from ``arguments`` and ``notes`` after a restart.
+    cancelling: whether the job was asked to stop.
+    attempt: how often the job was started.
+    change: counts the changes of the job within the attempt.
+    done, total: steps that are done, and all steps; the total is None while it is not known.
+    notes: what the job has stored for its next attempt.
+    result: the result of a job that has succeeded.
+    problem: why the job failed, as a problem object (RFC 9457).
+    maps: the ids of the maps that the job uses, with the time at which each was created: a map of the same id that was
+        created at another time is another map.
     asker: who asked for it, as ``service.access.audit.Asker`` has it; for the audit trail.
     """
 
@@ -104,34 +104,34 @@ class Job:
 
     @property
     def ended(self) -> bool:
-        """Nothing will become of it any more."""
+        """Whether the job has succeeded, failed or been cancelled."""
         return self.state in ENDED
 
     @property
     def version(self) -> str:
-        """Names this moment of the job; of two, the later one differs."""
+        """Identifies this state of the job; every change gives another version."""
         return f"{self.attempt}.{self.change}"
 
 
 class JobRecords:
-    """The file; from any thread.  What a method wrote is synced when it returns.
+    """The file of the jobs.  Thread-safe; what a method writes is synced when it returns.
 
-    Every method may raise StorageFull and StorageFailure: the disk refuses.
+    Every method may raise StorageFull and StorageFailure.
     """
 
     def __init__(self, directory: Path) -> None:
         """Open the file in a data directory that this process has locked.
 
-        A damaged file is put aside, because jobs can be submitted again and maps do not depend on them.  What can
-        still be read of it is kept as jobs that cannot go on.
+        A damaged file is renamed and replaced by a new one; the jobs that can still be read from it are kept as jobs
+        that cannot be resumed.
 
         Raises:
-            DataDirectoryTooNew: a later version of placerec wrote it.
-            StorageFull, StorageFailure.
+            DataDirectoryTooNew: a later version of placerec wrote the file.
+            StorageFull, StorageFailure: the file cannot be opened.
         """
         self._lock = threading.Lock()
         self.put_aside: str | None = None
-        """Under which name the file was put aside because it was damaged, if it was."""
+        """The new name of a damaged file; None if the file was not damaged."""
         readable = f"SELECT {', '.join(_NAMES)} FROM jobs"
         file = SqliteFile(directory / FILE, _SCHEMA, {**DURABLE, "journal_size_limit": 1 << 20}, [readable])
         with disk_errors(f"open {file.path}", FILE):
@@ -147,10 +147,10 @@ class JobRecords:
                 self._connection = file.open()
                 for job in salvaged:
                     with suppress(sqlite3.IntegrityError, sqlite3.ProgrammingError, ValueError, TypeError):
-                        self.put(job)  # unless nothing that a job can be is left of it
+                        self.put(job)  # a record that is no valid job is dropped
 
     def close(self) -> None:
-        """Nothing can be written from here on."""
+        """Close the file."""
         with self._lock:
             self._connection.close()
 
@@ -169,7 +169,7 @@ class JobRecords:
             self._connection.execute(f"INSERT OR REPLACE INTO jobs ({names}) VALUES ({marks})", tuple(columns.values()))
 
     def update(self, job: Job) -> None:
-        """Write what changes of a job as it goes on: all but its arguments and notes, which may be long."""
+        """Write a changed job, except its arguments and notes, which do not change here and may be long."""
         columns = {name: value for name, value in _columns(job).items() if name not in ("arguments", "notes")}
         assignments = ", ".join(f"{name} = ?" for name in columns)
         with self._lock, disk_errors("write down a job"):
@@ -183,7 +183,7 @@ class JobRecords:
             )
 
     def last_number(self) -> int:
-        """The largest number that a job ever had; 0 if there was none."""
+        """The largest number that a job ever had; 0 if there never was a job."""
         with self._lock, disk_errors("read the jobs"):
             found = self._connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'jobs'").fetchone()
         return 0 if found is None else int(found[0])
@@ -231,7 +231,7 @@ def _job(columns: dict[str, Any]) -> Job:
 
 
 def _readable(columns: dict[str, Any]) -> Job:
-    """A job; of one whose record makes no sense, what can be told of it: it cannot go on."""
+    """The job of a row; a damaged row gives a job without arguments, which cannot be resumed."""
     try:
         return _job(dict(columns))
     except (ValueError, TypeError, KeyError) as error:
@@ -243,7 +243,7 @@ def _readable(columns: dict[str, Any]) -> Job:
 
 
 def _salvaged(path: Path) -> list[Job]:
-    """The jobs of a damaged file, as far as it can be read; none of them can go on."""
+    """The jobs that can be read from a damaged file, none of which can be resumed."""
     found: dict[int, Job] = {}
     with (
         suppress(sqlite3.Error, UnicodeDecodeError, TypeError),

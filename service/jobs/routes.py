@@ -1,4 +1,4 @@
-"""Jobs: long work that goes on in the background, to be listed, followed and cancelled."""
+"""Routes of jobs: list, read, follow and cancel."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(singl
 
 EVENT_STREAM = "text/event-stream"
 HEARTBEAT_SECONDS = 10.0
-"""A stream says at least so often that it is alive."""
+"""A stream of events sends a comment at least so often, so that connections stay open."""
 
 LONGEST_WAIT = 60.0
-
+"""The longest time, in seconds, that a read of a job waits for its end."""
 
 JobsDep = Annotated[Jobs, Depends(FromState("jobs"))]
 
@@ -43,12 +43,12 @@ def location_of(job: Job, settings: Settings) -> str:
 
 
 def accepted(job: Job, settings: Settings) -> Response:
-    """The answer 202 with a job that was asked for."""
+    """The answer 202 with a job that was submitted, and its path in ``Location``."""
     return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location_of(job, settings)})
 
 
 class JobPageParameters(PageParameters):
-    """Which jobs."""
+    """The parameters of a list of jobs."""
 
     map: str | None = Field(default=None, max_length=64, description="Only the jobs of this map.")
     kind: str | None = Field(default=None, max_length=64, description="Only the jobs of this kind.")
@@ -124,9 +124,9 @@ async def follow_job(
     """
     job = _job_for(jobs, principal, job_id)
     if job.ended and last_event_id == job.version:
-        return Response(status_code=204)  # which tells a browser not to come again
+        return Response(status_code=204)  # this status stops a browser from reconnecting
     stream = _events(jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
-    first = await anext(stream)  # a refusal comes as a problem, not within the stream
+    first = await anext(stream)  # TooManyWatchers is answered as a problem, not within the stream
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(_after(first, stream), media_type=EVENT_STREAM, headers=headers)
 
@@ -148,16 +148,16 @@ def cancel_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep) -> JobView
 
 
 def maps_of(job: Job) -> set[str | None]:
-    """The maps that a job has to do with; None for one that has to do with none in particular."""
+    """The ids of the maps that a job uses; None is among them if the job works on no map in particular."""
     named = {job.arguments.get(name) for name in ("from", "to")}
     return {job.map_id, *job.maps, *(name for name in named if isinstance(name, str))}
 
 
 def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
-    """A job, if all its maps are the caller's; for any other it is not there.
+    """A job, if the caller may use all its maps.
 
     Raises:
-        UnknownJob.
+        UnknownJob: there is no such job, or the caller may not use one of its maps.
     """
     job = jobs.get(job_id)
     if not principal.may_use(*maps_of(job)):
@@ -166,7 +166,7 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
 
 
 async def _wait(changed: asyncio.Event, seconds: float) -> bool:
-    """Whether something changed within so many seconds."""
+    """Whether the event was set within some seconds; clears it."""
     try:
         async with asyncio.timeout(max(0.0, seconds)):
             await changed.wait()
@@ -177,14 +177,14 @@ async def _wait(changed: asyncio.Event, seconds: float) -> bool:
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
-    """The stream, from behind the event ``last`` to the end of the job, of the service, or of the caller's key."""
+    """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
     with jobs.watching(job_id) as changed:
         yield ": placerec\n\n"
         while True:
             try:
                 job = jobs.get(job_id)
             except UnknownJob:
-                return  # it ended and was forgotten, so long did the caller not read
+                return  # the job ended and was forgotten before the caller read on
             if job.version != last:
                 last = job.version
                 yield _event(job)

@@ -10,7 +10,7 @@ from core import errors
 from core.method.encoder import Encoding
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     DeadlineExceeded,
     EncoderNotInstalled,
@@ -21,7 +21,7 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import json_size, parse_json
-from service.http.dependencies import EngineDep, IfMatch, MapId, PatienceDep, single_values
+from service.http.dependencies import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.headers import expected_revision
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
@@ -77,7 +77,7 @@ BODY: dict[str, Any] = {
     responses={202: {"model": JobView, "description": "The job that does it, if `background` is asked for."}},
 )
 async def calibrate_map(
-    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, patience: PatienceDep, if_match: IfMatch = None
+    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, deadline: DeadlineDep, if_match: IfMatch = None
 ) -> CalibrationReport | Response:
     """Measure when a map's answers are to be believed, and make that its calibration.
 
@@ -89,7 +89,7 @@ async def calibrate_map(
     map_ = await engine.map(map_id)
     expected = expected_revision(if_match, map_.record.revision)
     if media_type(request) == FORM:
-        order, encodings = await _labelled_frames(engine, map_, request, patience)
+        order, encodings = await _labelled_frames(engine, map_, request, deadline)
     else:
         order, encodings = await _order(request), []
     try:
@@ -103,7 +103,7 @@ async def calibrate_map(
         return accepted(job, engine.settings)
 
     def advance(_done: int, _total: int) -> None:
-        if patience.left() <= 0:
+        if deadline.seconds_left() <= 0:
             raise DeadlineExceeded(
                 "The time was up before all was measured: ask in the background. Nothing was stored."
             )
@@ -133,7 +133,7 @@ async def _order(request: Request) -> CalibrationOrder:
 
 
 async def _labelled_frames(
-    engine: Engine, map_: Map, request: Request, patience: Patience
+    engine: Engine, map_: Map, request: Request, deadline: RequestDeadline
 ) -> tuple[CalibrationOrder, list[Encoding]]:
     """The order and the encoded frames of a form, in the order of its labels.
 
@@ -156,7 +156,7 @@ async def _labelled_frames(
         check_part(files[label], engine.settings)
     masks = [await camera_mask(map_, label.camera) for label in order.labels]
     with engine.queue.place(len(wanted)):
-        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in wanted], patience, masks)
+        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in wanted], deadline, masks)
     encodings = []
     for name, outcome in zip(wanted, outcomes, strict=True):
         if isinstance(outcome, Exception):

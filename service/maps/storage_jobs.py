@@ -8,7 +8,7 @@ from typing import Any
 
 from core.errors import MapQuarantined
 from service.engine.engine import Engine
-from service.jobs.context import JobContext, creation_time, stand_back
+from service.jobs.context import JobContext, creation_time, yield_to_requests
 
 REBUILD, VERIFY = "rebuild", "verify"
 
@@ -53,6 +53,6 @@ def _progress_callback(engine: Engine, context: JobContext) -> Callable[[int, in
 
     def advance(done: int, total: int) -> None:
         context.progress(done, total)
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
 
     return advance

@@ -1,4 +1,4 @@
-"""Places and traverses: enrol one frame or many, browse, read, edit, forget, see."""
+"""Routes of places and traverses: enrol one frame or many; list, read, edit and delete places; fetch thumbnails."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from starlette.responses import Response
 from core import errors
 from core.storage.records import merge_patch
 from service.engine.engine import Engine, camera_mask
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BatchOutOfOrder,
     EncoderNotInstalled,
@@ -23,11 +23,11 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     FromState,
     MapId,
     Page,
-    PatienceDep,
     PlaceId,
     SequenceName,
     frame_for_map,
@@ -44,9 +44,9 @@ from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.places import bulk_enrolment
-from service.places.batch_order import BatchOrder, Sequel
-from service.places.batches import candidate_of, check_batch, given_id, item_problem
-from service.places.enrolment import Candidate, enrol
+from service.places.batch_order import BatchOrder, BatchTurn
+from service.places.batches import check_batch, entry_id, frame_problem, read_entry
+from service.places.enrolment import FrameToEnrol, enrol
 from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
 from service.places.schemas import (
     BatchResult,
@@ -113,7 +113,7 @@ async def enrol_place(
     request: Request,
     response: Response,
     engine: EngineDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> EnrolledPlace:
     """Enrol one frame under an id of the caller's.
 
@@ -124,7 +124,7 @@ async def enrol_place(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = options.place_fields(engine.settings)
     mask = await camera_mask(map_, fields.camera)
-    stored = (await enrol(engine, map_, [Candidate(place_id, fields, data, mask)], patience))[0]
+    stored = (await enrol(engine, map_, [FrameToEnrol(place_id, fields, data, mask)], deadline))[0]
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "change": stored.change}
     return EnrolledPlace(
@@ -153,7 +153,7 @@ async def enrol_places(
     jobs: JobsDep,
     staging: StagingDep,
     batch_order: BatchOrderDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> BatchResults | Response:
     """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
 
@@ -168,47 +168,52 @@ async def enrol_places(
     """
     if options.background:
         return await _enrol_later(map_id, options, request, engine, jobs, staging)
-    with batch_order.enter(map_id, options.batch, options.after, patience) as sequel:
-        return await _enrol_now(map_id, options, request, engine, patience, sequel)
+    with batch_order.enter(map_id, options.batch, options.after, deadline) as batch_turn:
+        return await _enrol_now(map_id, options, request, engine, deadline, batch_turn)
 
 
 async def _enrol_now(
-    map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
+    map_id: str,
+    options: BatchParameters,
+    request: Request,
+    engine: Engine,
+    deadline: RequestDeadline,
+    batch_turn: BatchTurn,
 ) -> BatchResults:
     engine.queue.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)
     check_batch(entries, [part.name for part in files], engine.settings.max_batch_items)
-    await in_thread(map_.cameras.all)  # from disk, if they are not in memory yet
+    await in_thread(map_.cameras.all)  # so that the cameras are in memory
     engine.metrics.batches.labels("enrol").observe(len(entries))
 
     results: list[BatchResult | None] = [None] * len(entries)
 
     def reject(position: int, error: Exception) -> None:
-        problem = item_problem(request, error)
-        results[position] = BatchResult(id=given_id(entries[position]), status=problem.status, problem=problem)
+        problem = frame_problem(request, error)
+        results[position] = BatchResult(id=entry_id(entries[position]), status=problem.status, problem=problem)
 
     ids: set[str] = set()
-    candidates: dict[int, Candidate] = {}
+    frames: dict[int, FrameToEnrol] = {}
     by_name = {part.name: part for part in files}
     for position, entry in enumerate(entries):
         try:
-            candidate = candidate_of(entry, by_name, by_name.__getitem__, map_, engine.settings)
-            if candidate.id in ids:
-                raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
-            ids.add(candidate.id)
-            candidates[position] = candidate
+            frame = read_entry(entry, by_name, by_name.__getitem__, map_, engine.settings)
+            if frame.id in ids:
+                raise InvalidRequest(f"id: the batch has {frame.id} twice.")
+            ids.add(frame.id)
+            frames[position] = frame
         except Exception as error:
             reject(position, error)
-    positions = list(candidates)
+    positions = list(frames)
     stored = await enrol(
         engine,
         map_,
-        list(candidates.values()),
-        patience,
+        list(frames.values()),
+        deadline,
         lambda index, error: reject(positions[index], error),
-        sequel=sequel,
+        batch_turn=batch_turn,
     )
     for index, one in stored.items():
         results[positions[index]] = BatchResult(

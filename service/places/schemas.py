@@ -1,4 +1,4 @@
-"""Places: as they are shown, enrolled and edited."""
+"""Places and traverses as JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PLACE_EXAMPLE: dict[str, Any] = {
     "updated_at": "2026-11-20T10:00:01.250000Z",
 }
 
-# A pose shows the frame that it is in and nothing of the other.
+# A pose has either metric or geographic coordinates; those of the other kind are left out.
 ShownPose = Annotated[Pose, PlainSerializer(lambda pose: pose.model_dump(exclude_none=True))]
 
 
@@ -46,7 +46,7 @@ class PlaceView(BaseModel):
 
     @classmethod
     def of(cls, place: Place) -> PlaceView:
-        """A place as callers see it."""
+        """The JSON view of a place."""
         return cls.model_construct(**place.__dict__)
 
 

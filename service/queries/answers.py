@@ -1,4 +1,4 @@
-"""From what was located to what callers are told."""
+"""The JSON answer to a query, from the answer of :mod:`core.recognition`; answers are counted for the metrics."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from service.engine.searches import Recognized
 from service.http.dependencies import FromState, rounded
 from service.places.schemas import PlaceView
 from service.queries.schemas import EstimatedPose, Match, QueryAnswer
-from service.queries.statistics import QueryStatistics, key_of
+from service.queries.statistics import QueryStatistics, map_key
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
 
 
-def told_answer(engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized) -> QueryAnswer:
-    """The answer to a frame, counted in the service's metrics and in the statistics of its map."""
-    if recognized.located is None:
+def counted_answer(engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized) -> QueryAnswer:
+    """The JSON answer to a frame; it is counted in the service's metrics and in the statistics of the map."""
+    if recognized.answer is None:
         answer = blank_answer(map_, recognized.encoded)
     else:
-        answer = answer_of(recognized.encoded, recognized.located)
+        answer = answer_of(recognized.encoded, recognized.answer)
     count_answer(engine, statistics, map_, answer)
     return answer
 
@@ -43,40 +43,40 @@ def count_answer(engine: Engine, statistics: QueryStatistics, map_: Map, answer:
 
 
 def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer) -> None:
-    """Count an answer in the statistics of its map, which takes some tens of microseconds and fails no query."""
-    with suppress(PlacerecError):  # the map was deleted in between
-        key = key_of(engine.atlas.find(map_id))
+    """Count an answer in the statistics of its map, if the map still exists."""
+    with suppress(PlacerecError):  # the map was deleted in the meantime
+        key = map_key(engine.atlas.find(map_id))
         best = answer.matches[0].place.id if answer.matches else None
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
 
 
-def answer_of(encoded: Encoded, located: Answer) -> QueryAnswer:
-    """The answer to a frame that was searched for."""
-    judgement = located.judgement
-    weights: Sequence[float | None] = located.weights or [None] * len(located.matches)
+def answer_of(encoded: Encoded, found: Answer) -> QueryAnswer:
+    """The JSON answer to a frame that was searched for."""
+    judgement = found.judgement
+    weights: Sequence[float | None] = found.weights or [None] * len(found.matches)
     matches = [
         Match(rank=rank, score=score, weight=weight, place=PlaceView.of(place))
-        for rank, ((score, place), weight) in enumerate(zip(located.matches, weights, strict=True), start=1)
+        for rank, ((score, place), weight) in enumerate(zip(found.matches, weights, strict=True), start=1)
     ]
     recognized = judgement.verdict == "recognized"
     return QueryAnswer(
         verdict=judgement.verdict,
         place=matches[0].place if recognized else None,
         probability=judgement.probability,
-        pose=estimated_pose(located.pose, matches[0].place) if recognized else None,
+        pose=estimated_pose(found.pose, matches[0].place) if recognized else None,
         score=judgement.score,
         margin=judgement.margin,
         decision=judgement.decision,
-        threshold=located.calibration.threshold,
-        reason=None if matches else "no-place-allowed" if located.candidates.places else "empty-map",
+        threshold=found.calibration.threshold,
+        reason=None if matches else "no-place-allowed" if found.candidates.places else "empty-map",
         matches=matches,
         encoder=encoded.encoder.identity,
-        milliseconds=rounded({**encoded.milliseconds, "search": located.search}),
+        milliseconds=rounded({**encoded.milliseconds, "search": found.search}),
     )
 
 
 def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedPose | None:
-    """An estimate as callers see it; in the plane where the best match's pose is."""
+    """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none."""
     if estimate is None:
         return None
     pose = estimate.pose
@@ -91,7 +91,7 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedP
 
 
 def blank_answer(map_: Map, encoded: Encoded) -> QueryAnswer:
-    """The answer to a frame without regions: there is nothing to compare."""
+    """The JSON answer to a frame without regions, which cannot be searched for."""
     return QueryAnswer(
         verdict="unknown",
         place=None,

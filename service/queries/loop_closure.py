@@ -1,4 +1,4 @@
-"""Loop closure: look for a frame among the places of a map and, if nobody knows it, make it a place; no HTTP."""
+"""Loop closure: locate a frame in a map and, if its place is unknown, enrol it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     MapId,
-    PatienceDep,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -34,7 +34,7 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frame_body
 from service.http.uploads import parse_metadata
-from service.places.enrolment import Candidate, describe_candidate, digest_of
+from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
 from service.queries.parameters import ClosureParameters
@@ -44,48 +44,50 @@ from service.worker_threads import in_thread
 
 @dataclass(frozen=True)
 class Closure:
-    """What became of a frame.
+    """The result of a loop closure.
 
-    enrolled: its place; None if the frame is that of another place, or may be.
-    created: whether the place was made now.
+    answer: the answer of the map before the frame was enrolled.
+    enrolled: the frame's own place; None if the frame shows, or may show, another place.
+    created: whether the place was created by this request.
     """
 
-    located: Answer
+    answer: Answer
     enrolled: Place | None
     created: bool
 
 
 def close_loop(
-    engine: Engine, map_: Map, candidate: Candidate, encoded: Encoded, k: int, selection: Selection | None
+    engine: Engine, map_: Map, frame: FrameToEnrol, encoded: Encoded, k: int, selection: Selection | None
 ) -> Closure:
-    """Locate a frame and, if the verdict is ``unknown``, enrol it: as one step, so that of two frames of one new place
-    that come together the second finds the first.  Blocks; call it in a thread.
+    """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
 
-    A repeated request finds the same as the first did: its own place is left out of the search.
+    The map is locked meanwhile: if two frames of one new place arrive together, the second finds the first.  A
+    repeated request gets the same answer as the first one, because its own place is left out of the search.
 
     Args:
-        encoded: the candidate's frame, which has regions.
-        selection: what is known of the place asked for; None: nothing.
+        encoded: the frame, encoded; it has regions.
+        k: how many matches to list.
+        selection: what is known of the place; None: nothing.
 
     Raises:
-        PlaceTaken: the candidate's id is that of a place with another frame.
+        PlaceTaken: a place of the frame's id exists, and has another frame.
         StorageFull, StorageFailure: nothing was enrolled.
     """
-    digest = digest_of(candidate)
-    enrolment = describe_candidate(engine, map_, candidate, digest, encoded)
+    digest = digest_of(frame)
+    enrolment = describe_frame(engine, map_, frame, digest, encoded)
     with engine.writing(map_.record.id):
-        known = map_.digest(candidate.id)
+        known = map_.digest(frame.id)
         if known is not None and known != digest:
-            raise PlaceTaken(f"The place {candidate.id!r} has another frame; PUT replaces it.")
+            raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
-            selection = replace(selection or Selection(), without=candidate.id)
-        (located,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
+            selection = replace(selection or Selection(), excluded=frame.id)
+        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
         if known is not None:
-            return Closure(located, map_.place(candidate.id), created=False)
-        if located.judgement.verdict != "unknown":
-            return Closure(located, None, created=False)
+            return Closure(answer, map_.place(frame.id), created=False)
+        if answer.judgement.verdict != "unknown":
+            return Closure(answer, None, created=False)
         ((place, _),) = map_.enrol([enrolment])
-        return Closure(located, place, created=True)
+        return Closure(answer, place, created=True)
 
 
 router = APIRouter(
@@ -116,7 +118,7 @@ async def query_or_enrol(
     response: Response,
     engine: EngineDep,
     statistics: StatisticsDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> ClosureAnswer:
     """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
 
@@ -132,15 +134,15 @@ async def query_or_enrol(
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
     with engine.queue.place():
-        encoded = await engine.encode_for(map_, data, patience, mask)
+        encoded = await engine.encode_for(map_, data, deadline, mask)
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:
         answer = blank_answer(map_, encoded)
     else:
-        candidate = Candidate(options.id, fields, data, mask)
-        closure = await in_thread(close_loop, engine, map_, candidate, encoded, options.k, selection)
-        answer = answer_of(encoded, closure.located)
+        frame = FrameToEnrol(options.id, fields, data, mask)
+        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection)
+        answer = answer_of(encoded, closure.answer)
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"

@@ -1,4 +1,4 @@
-"""Queries: where was this frame taken?"""
+"""Routes of queries: one frame, many frames, and the pictures of explanations."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     FromState,
     MapId,
-    PatienceDep,
     frame_for_map,
     milliseconds_since,
     rounded,
@@ -32,13 +32,13 @@ from service.http.dependencies import (
 from service.http.openapi import BINARY, form_body, frame_body
 from service.http.route_classes import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
-from service.places.batches import item_problem
-from service.queries.answers import StatisticsDep, told_answer
-from service.queries.explanations import as_drawn, explained_match
+from service.places.batches import frame_problem
+from service.queries.answers import StatisticsDep, counted_answer
+from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
-from service.queries.statistics import key_of
+from service.queries.statistics import map_key
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -67,7 +67,7 @@ async def query(
     engine: EngineDep,
     statistics: StatisticsDep,
     pictures: PicturesDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> QueryAnswer:
     """Locate one frame in a map.
 
@@ -76,11 +76,11 @@ async def query(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
-    recognized = await engine.recognize(map_, data, patience, options.k, options.selection(), mask)
-    answer = told_answer(engine, statistics, map_, recognized)
+    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask)
+    answer = counted_answer(engine, statistics, map_, recognized)
     if options.explain and answer.matches:
-        encoded, best = await in_thread(as_drawn, recognized.encoded), answer.matches[0].place.id
-        answer.explanation = await explained_match(engine, pictures, map_, encoded, best, patience)
+        encoded, best = await in_thread(scaled_for_drawing, recognized.encoded), answer.matches[0].place.id
+        answer.explanation = await explain_match(engine, pictures, map_, encoded, best, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     return answer
@@ -97,7 +97,7 @@ async def query_batch(
     request: Request,
     engine: EngineDep,
     statistics: StatisticsDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> BatchAnswers:
     """Locate many frames in a map; one that is bad fails alone."""
     engine.queue.check_room()
@@ -107,7 +107,7 @@ async def query_batch(
     selection = options.selection()
     engine.assert_encoder(map_, options.encoder)
     if options.explain:
-        raise InvalidRequest("explain: frames are explained one by one, by a query of their own.")
+        raise InvalidRequest("explain: a batch cannot be explained; send the frame as a single query.")
     mask = await camera_mask(map_, options.camera)
     if not files:
         raise InvalidRequest("The form has no file part.")
@@ -116,7 +116,7 @@ async def query_batch(
     encoded: dict[int, Encoded] = {}
     with engine.queue.place(len(files)):
         outcomes = await engine.encode_all(
-            map_.record.encoder, [part.data for part in files], patience, [mask] * len(files)
+            map_.record.encoder, [part.data for part in files], deadline, [mask] * len(files)
         )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:
@@ -125,11 +125,11 @@ async def query_batch(
                     raise outcome
                 encoded[index] = outcome
             except Exception as error:
-                problem = item_problem(request, error)
+                problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
     recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection)
     for index, one in zip(encoded, recognized, strict=True):
-        items[index].answer = told_answer(engine, statistics, map_, one)
+        items[index].answer = counted_answer(engine, statistics, map_, one)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)
@@ -153,5 +153,5 @@ def see_explanation(
 
     `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
     """
-    picture = pictures.fetch(key_of(engine.atlas.find(map_id)), name)
+    picture = pictures.fetch(map_key(engine.atlas.find(map_id)), name)
     return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

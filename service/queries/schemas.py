@@ -1,4 +1,4 @@
-"""Answers to queries."""
+"""Answers to queries as JSON."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class EstimatedPose(BaseModel):
 
     @model_serializer(mode="wrap")
     def _one_frame(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A pose shows the frame that it is in and nothing of the other."""
+        """Leave out the coordinates that are not given: a pose is either metric or geographic."""
         shown: dict[str, Any] = handler(self)
         return {name: value for name, value in shown.items() if value is not None or name == "heading_spread"}
 

@@ -1,7 +1,7 @@
-"""What a map answered, counted: by place and by week, in a small SQLite file beside the maps.
+"""Statistics of the answers of each map, by place and by week, in a small SQLite file in the data directory.
 
-Answers are counted in memory and written down now and then, so that a query waits for no disk;
-a crash loses what was counted since.  What is kept is bounded: two numbers a place, one row a week.
+Answers are counted in memory and written at intervals, so that no query waits for the disk; a crash loses the counts
+since the last writing.  The file is bounded: it has one row for each place and each week of a map.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from service.engine.engine import Engine
 FILE = "statistics.sqlite"
 
 MOST_WEEKS = 260
-"""Of a map; older ones are forgotten."""
+"""How many weeks of a map are kept."""
 
 MOST_WAITING = 50_000
-"""Places whose counts wait in memory; when there are more, and the disk takes none, those of further ones are lost."""
+"""How many places may have counts that are not written yet; while the disk refuses, further counts are lost."""
 
 SPARE_PLACES = 1000
-"""So many more places may be counted than the map has, before those that are gone are looked for."""
+"""Counts of deleted places are removed once a map has so many more counted places than places."""
 
 MapKey = tuple[str, str]
-"""A map's id and when it was created, so that a new map of the same id begins with nothing."""
+"""The id of a map and the time of its creation: a new map of the same id has statistics of its own."""
 
 log = logging.getLogger("placerec.statistics")
 
 
-def key_of(map_: Map) -> MapKey:
-    """The key by which the statistics know a map."""
+def map_key(map_: Map) -> MapKey:
+    """The key of a map in the statistics."""
     return map_.record.id, map_.record.created_at.isoformat()
 
 
@@ -63,7 +63,12 @@ _SCHEMA = Schema(application_id=0, version=1, create=_TABLES)
 
 @dataclass(frozen=True)
 class PlaceCount:
-    """Of one place: how often it was the best match, how often it was recognized, and when it last was the best."""
+    """The counts of one place.
+
+    best: how often it was the best match.
+    recognized: how often it was recognized.
+    last: when it was last the best match, ISO 8601 in UTC.
+    """
 
     best: int = 0
     recognized: int = 0
@@ -75,11 +80,11 @@ class PlaceCount:
 
 @dataclass(frozen=True)
 class Statistics:
-    """All that was counted of a map.
+    """The statistics of a map.
 
     since: when the counting began; None if nothing was counted yet.
-    places: by id, those that were ever the best match.
-    weeks: in order, without those in which nobody asked.
+    places: the counts of the places that ever were the best match, by id.
+    weeks: the weeks with at least one query, in order.
     """
 
     since: datetime | None = None
@@ -89,7 +94,7 @@ class Statistics:
 
 @dataclass
 class _Counts:
-    """Of one map, not written down yet."""
+    """The counts of one map that are not written yet."""
 
     since: str
     places: dict[str, PlaceCount] = field(default_factory=dict)
@@ -103,14 +108,14 @@ class _Counts:
 
 
 class QueryStatistics:
-    """Counts the answers of all maps; from any thread.
+    """Counts the answers of all maps.  Thread-safe.
 
     Args:
-        directory: that of the data, held by this process.
-        seconds: between two writings.
-        sizes: gives the number of places of the maps that there are; the counts of others are forgotten.  None, if
-            that is not known at the moment.
-        present: gives the ids of a map's places.
+        directory: the data directory, which this process holds.
+        seconds: the interval between two writings.
+        sizes: returns the number of places of every map; the counts of other maps are deleted.  It returns None while
+            this is not known.
+        present: returns the ids of the places of a map.
     """
 
     def __init__(
@@ -128,8 +133,8 @@ class QueryStatistics:
         self._counts: dict[MapKey, _Counts] = {}
         self._waiting = 0
         self.lost = 0
-        """Counts of places that were given up because the disk took none."""
-        self._file = threading.Lock()  # held by the one who uses the connection
+        """How many counts were dropped because the disk refuses."""
+        self._file = threading.Lock()  # held while the connection is used
         self._connection: sqlite3.Connection | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="statistics", daemon=True)
@@ -140,16 +145,16 @@ class QueryStatistics:
 
         def sizes() -> dict[MapKey, int] | None:
             if engine.atlas.quarantined():
-                return None  # a map that is out of service now may come back
+                return None  # a map that is quarantined may come back
             found = {}
             for record in engine.all_records():
                 try:
                     map_ = engine.atlas.find(record.id)
                 except UnknownMap:
-                    continue  # it was deleted since it was listed
+                    continue  # the map was deleted since it was listed
                 except PlacerecError:
                     return None
-                found[key_of(map_)] = map_.count_places()
+                found[map_key(map_)] = map_.count_places()
             return found
 
         def present(map_id: str) -> set[str]:
@@ -158,11 +163,11 @@ class QueryStatistics:
         return cls(engine.settings.data_dir, engine.settings.statistics_seconds, sizes, present)
 
     def start(self) -> None:
-        """Write now and then from here on."""
+        """Begin to write the counts at intervals."""
         self._thread.start()
 
     def close(self) -> None:
-        """Write what is left, and end."""
+        """Write the remaining counts and close the file."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -179,7 +184,7 @@ class QueryStatistics:
         """Count one answer.
 
         Args:
-            best: the place of the best match; None if nothing was compared (a blank frame, an empty map).
+            best: the id of the best match; None if there is none (a blank frame, an empty map).
         """
         now = datetime.now(UTC)
         counted = Week.of(_monday(now.date()), verdict, score, decision)
@@ -197,13 +202,13 @@ class QueryStatistics:
             counts.places[best] = counts.places.get(best, PlaceCount()) + seen
 
     def read(self, key: MapKey) -> Statistics:
-        """What was counted of a map so far, what waits to be written included.
+        """The statistics of a map, including the counts that are not written yet.
 
         Raises:
-            StorageFull, StorageFailure.
+            StorageFull, StorageFailure: the file cannot be read or written.
         """
         self.flush()
-        with self._file, self._unspoilt():
+        with self._file, self._replacing_damage():
             connection = self._open()
             found = connection.execute("SELECT code, since FROM maps WHERE id = ? AND made = ?", key).fetchone()
             if found is None:
@@ -216,8 +221,8 @@ class QueryStatistics:
         return Statistics()
 
     @contextmanager
-    def _unspoilt(self) -> Iterator[None]:
-        """Put the file aside if it turns out to be damaged within: it holds nothing but counts."""
+    def _replacing_damage(self) -> Iterator[None]:
+        """If the file turns out to be damaged within the context, rename it, so that a new one is made."""
         try:
             with disk_errors("use the statistics of queries", FILE):
                 yield
@@ -228,10 +233,10 @@ class QueryStatistics:
             self._database.put_aside(damage)
 
     def flush(self) -> None:
-        """Write down what was counted.
+        """Write the counts.
 
         Raises:
-            StorageFull, StorageFailure: the counts go on waiting.
+            StorageFull, StorageFailure: the disk refuses; the counts stay in memory.
         """
         with self._file:
             with self._lock:
@@ -239,13 +244,13 @@ class QueryStatistics:
             if not taken:
                 return
             try:
-                with self._unspoilt():
+                with self._replacing_damage():
                     self._write(taken)
                     return
                 with disk_errors("write down the statistics of queries", FILE):
                     self._write(taken)  # into a new file
             except BaseException:
-                with self._lock:  # in front of what was counted since
+                with self._lock:  # add the counts of the meantime to those that could not be written
                     for key, newer in self._counts.items():
                         taken.setdefault(key, _Counts(newer.since)).add(newer)
                     self._counts = taken

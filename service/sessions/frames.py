@@ -11,11 +11,11 @@ from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
 from service.engine.engine import Engine, camera_mask
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.http.dependencies import rounded
 from service.places.schemas import PlaceView
-from service.queries.answers import told_answer
+from service.queries.answers import counted_answer
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -40,7 +40,7 @@ async def take_in(
     session: Session,
     data: bytes,
     options: FrameParameters,
-    patience: Patience,
+    deadline: RequestDeadline,
     request_id: str | None,
 ) -> SessionAnswer:
     """Answer one frame of a session, in its turn.
@@ -63,11 +63,11 @@ async def take_in(
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
         mask = await camera_mask(map_, session.options.camera)
-        recognized = await engine.recognize(map_, data, patience, options.k, session.selection, mask)
-        single = told_answer(engine, statistics, map_, recognized)
+        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask)
+        single = counted_answer(engine, statistics, map_, recognized)
         try:
             return await in_thread(
-                _advanced, sessions, map_, session, run, recognized.located, single, options, request_id, began
+                _advanced, sessions, map_, session, run, recognized.answer, single, options, request_id, began
             )
         except Exception:
             session.run = None  # it is taken up again as it was written down after the frame before
@@ -109,7 +109,7 @@ def _advanced(
     map_: Map,
     session: Session,
     run: Run,
-    located: Answer | None,
+    answered: Answer | None,
     single: QueryAnswer,
     options: FrameParameters,
     request_id: str | None,
@@ -118,7 +118,7 @@ def _advanced(
     """Move the belief on, write it down, and tell it."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    run.advance(_evidence(map_, located), step)
+    run.advance(_evidence(map_, answered), step)
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -176,17 +176,12 @@ def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, M
     return Step(odometry, reach, frames), motion
 
 
-def _evidence(map_: Map, located: Answer | None) -> Evidence:
-    if located is None:
+def _evidence(map_: Map, found: Answer | None) -> Evidence:
+    if found is None:
         return NOTHING
-    found = located.candidates
+    ranked = found.candidates
     return evidence(
-        found.rows,
-        found.scores,
-        found.whereabouts,
-        located.calibration,
-        neighborhood_of(map_),
-        found.examined,
+        ranked.rows, ranked.scores, ranked.whereabouts, found.calibration, neighborhood_of(map_), ranked.examined
     )
 
 

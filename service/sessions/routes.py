@@ -19,11 +19,11 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
     FromState,
     MapId,
     Page,
-    PatienceDep,
     frame_for_map,
     json_body,
     milliseconds_since,
@@ -129,7 +129,7 @@ async def send_frame(
     engine: EngineDep,
     sessions: SessionsDep,
     statistics: StatisticsDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> SessionAnswer:
     """Take in one frame of a run, and tell where the robot is.
 
@@ -142,7 +142,7 @@ async def send_frame(
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")
     given_id = given if REQUEST_ID.fullmatch(given) else None
-    answer = await take_in(engine, sessions, statistics, map_, session, data, options, patience, given_id)
+    answer = await take_in(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "session": session_id, "verdict": answer.verdict}
     return answer

@@ -22,7 +22,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from core.errors import PlacerecError
 from core.places import check_map_id
 from service.engine.engine import Engine
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BodyTooLarge,
     Fault,
@@ -119,8 +119,8 @@ async def _answer(state: State, map_id: str, session: Session, data: bytes, give
     check_frame(data, None)
     map_ = await engine.map(map_id)
     await in_thread(state.sessions.find, map_, session.id)
-    patience = Patience(time.monotonic() + engine.settings.request_timeout, _never)
-    answer = await take_in(engine, state.sessions, state.statistics, map_, session, data, options, patience, None)
+    deadline = RequestDeadline(time.monotonic() + engine.settings.request_timeout, _never)
+    answer = await take_in(engine, state.sessions, state.statistics, map_, session, data, options, deadline, None)
     return answer.model_dump_json()
 
 

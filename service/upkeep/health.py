@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.method.encoder import Encoder
-from core.recognition.self_queries import TOGETHER, SelfQueries, spread
+from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.storage import Map
 from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
@@ -146,7 +146,7 @@ def _silent(own: SelfQueries, statistics: Statistics, silent: list[int], limit: 
 def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
     """Which places are among the most alike others of many, and which look more like others than like their own."""
     k = min(hubness.NEIGHBOURS, max(1, len(own) // 10))
-    order = spread(len(own)).tolist()
+    order = spread_order(len(own)).tolist()
     lists: list[NDArray[np.int64]] = [np.empty((0, k), np.int64)]
     aliases: list[Alias] = []
     everything = np.arange(len(own))
@@ -220,7 +220,7 @@ def _similarities(own: SelfQueries, ordered: NDArray[np.int64], until: float) ->
     for first in range(0, len(pairs), STEPS_TOGETHER):
         if time.monotonic() > until:
             return found, False
-        found[first : first + STEPS_TOGETHER] = own.alike(pairs[first : first + STEPS_TOGETHER])
+        found[first : first + STEPS_TOGETHER] = own.first_stage_scores(pairs[first : first + STEPS_TOGETHER])
     return found, True
 
 

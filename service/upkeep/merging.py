@@ -20,12 +20,12 @@ from core.method.encoder import Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields, check_place_id
 from core.recognition.recognition import locate
-from core.recognition.self_queries import TOGETHER, spread
+from core.recognition.self_queries import TOGETHER, spread_order
 from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
-from service.jobs.context import JobContext, JobInterrupted, stand_back
+from service.jobs.context import JobContext, JobInterrupted, yield_to_requests
 
 KIND = "merge"
 
@@ -231,7 +231,7 @@ def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
                 map_.cameras.put(name, camera.mask)
         snapshot = other.snapshot()
         for first in range(0, len(due), CHUNK):
-            stand_back(engine, context)
+            yield_to_requests(engine, context)
             # No place may be enrolled under one of the ids between the look at them and the commit.
             with engine.writing(map_.record.id):
                 _adopt(context, map_, other, snapshot, _still_free(context, map_, due[first : first + CHUNK]))
@@ -341,12 +341,12 @@ def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[
     encoder = engine.load_encoder(map_)
     outline, snapshot = other.transfer.outline(), other.snapshot()
     outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
-    chosen = [outline[i] for i in spread(len(outline))[: context.arguments["sample"]]]
+    chosen = [outline[i] for i in spread_order(len(outline))[: context.arguments["sample"]]]
     verdicts = {"recognized": 0, "ambiguous": 0, "unknown": 0}
     pairs: list[dict[str, Any]] = []
     apart: list[float] = []
     for first in range(0, len(chosen), TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         some = chosen[first : first + TOGETHER]
         rows = np.array([place.row for place in some], np.int64)
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.reliability import wilson
-from core.recognition.self_queries import TOGETHER, SelfQueries, spread
+from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
-from service.jobs.context import JobContext, stand_back
+from service.jobs.context import JobContext, yield_to_requests
 
 KIND = "prune"
 
@@ -117,8 +117,8 @@ def _similarities(
 ) -> NDArray[np.float32]:
     found = [np.empty(0, np.float32)]
     for first in range(0, len(pairs), PAIRS_TOGETHER):
-        stand_back(engine, context)
-        found.append(own.alike(pairs[first : first + PAIRS_TOGETHER]))
+        yield_to_requests(engine, context)
+        found.append(own.first_stage_scores(pairs[first : first + PAIRS_TOGETHER]))
         context.progress(min(first + PAIRS_TOGETHER, len(pairs)), len(pairs), "compares neighbours")
     return np.concatenate(found)
 
@@ -133,12 +133,12 @@ def _try(
 ) -> Trial:
     """Hold the frames that ask against the others, each without itself."""
     candidates = np.flatnonzero(asking)
-    chosen = candidates[spread(len(candidates))[: wanted["sample"]]]
+    chosen = candidates[spread_order(len(candidates))[: wanted["sample"]]]
     depth, stage = min(DEPTH, max(1, len(own))), own.encoder.candidates
     found: list[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]] = []
     everything = np.flatnonzero(references)
     for first in range(0, len(chosen), TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         some = chosen[first : first + TOGETHER].tolist()
         for position, others, scores in own.search(some, references):
             if not own.near(position, everything[everything != position]).any():
@@ -146,7 +146,9 @@ def _try(
             best = others[:depth]
             gains = np.zeros(len(best), np.float32)
             if stage:
-                gains = own.encoder.agreement(own.local(np.array([position]))[0], own.local(best))
+                gains = own.encoder.agreement(
+                    own.local_descriptors(np.array([position]))[0], own.local_descriptors(best)
+                )
             right = own.near(position, best)
             padding = (0, depth - len(best))
             found.append((

@@ -20,7 +20,7 @@ from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_behind
+from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_after_requests
 
 KIND = "re-encode"
 
@@ -155,7 +155,7 @@ class _Reencoding:
         ready = [place for place in new if place.id in fields and fields[place.id][1] == place.row]
         frames = [images[place.id] or b"" for place in ready]
         masks = [self._mask(place.camera) for place in ready]
-        outcomes = encode_behind(self.engine, self.context, self.identity, frames, masks) if ready else []
+        outcomes = encode_after_requests(self.engine, self.context, self.identity, frames, masks) if ready else []
         items: list[tuple[Enrolment, History]] = []
         for place, image, outcome in zip(ready, frames, outcomes, strict=True):
             try:

@@ -33,7 +33,7 @@ from service.jobs.schemas import JobView
 from service.maps import storage_jobs
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
-from service.queries.statistics import key_of
+from service.queries.statistics import map_key
 from service.upkeep import merging, pruning, reencoding
 from service.upkeep.health import examine_health
 from service.upkeep.schemas import MapHealth, Merging, Pruning, Reencoding
@@ -130,7 +130,7 @@ async def check_health(
         encoder = await engine.queue.load(map_.record.encoder)
     except errors.UnknownEncoder as error:
         raise EncoderNotInstalled(str(error)) from error
-    counted = await in_thread(statistics.read, key_of(map_))
+    counted = await in_thread(statistics.read, map_key(map_))
     examine = partial(examine_health, map_, encoder, counted, options.seconds, options.limit)
     return await to_thread.run_sync(examine, limiter=one_at_a_time)
 

@@ -1,4 +1,4 @@
-"""The encoder's turn: bounded, timed, given up by those who leave, and never in the way of the event loop."""
+"""The encoder's queue: it is bounded, keeps deadlines, drops frames of clients that left, and never blocks the loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from core.errors import NotAnImage, UnknownEncoder
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from service.engine.queue import EncoderQueue, Patience
+from service.engine.queue import EncoderQueue, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
 from tests.service.scenes import encoded, jpeg, scene
@@ -29,8 +29,8 @@ async def stays() -> None:
     await asyncio.Event().wait()
 
 
-def patience(seconds: float = 30) -> Patience:
-    return Patience(time.monotonic() + seconds, stays)
+def deadline(seconds: float = 30) -> RequestDeadline:
+    return RequestDeadline(time.monotonic() + seconds, stays)
 
 
 @pytest.fixture
@@ -61,14 +61,14 @@ def frames_encoded(queue: EncoderQueue) -> float:
 
 
 async def test_a_frame_is_decoded_and_encoded(queue: EncoderQueue) -> None:
-    encoded = await queue.encode(IDENTITY, jpeg(1), patience())
+    encoded = await queue.encode(IDENTITY, jpeg(1), deadline())
     assert encoded.pixels.shape == (240, 320, 3) and len(encoded.encoding.regions) > 0
     assert set(encoded.milliseconds) == {"wait", "decode", "forward", "regions", "vlad"}
     assert frames_encoded(queue) == 1
 
 
 async def test_the_event_loop_goes_on(queue: EncoderQueue, busy: threading.Event) -> None:
-    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), patience()))
+    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
     start = time.monotonic()
     for _ in range(100):
         await asyncio.sleep(0)
@@ -90,12 +90,12 @@ async def test_a_full_queue_refuses(queue: EncoderQueue) -> None:
 async def test_a_late_frame_is_dropped_before_it_is_encoded(queue: EncoderQueue, busy: threading.Event) -> None:
     start = time.monotonic()
     with pytest.raises(DeadlineExceeded):
-        await queue.encode(IDENTITY, jpeg(1), patience(0.2))
+        await queue.encode(IDENTITY, jpeg(1), deadline(0.2))
     assert time.monotonic() - start < 5, "told at the deadline, not when the encoder is free"
     with pytest.raises(DeadlineExceeded):
-        await queue.encode(IDENTITY, jpeg(1), patience(-1))
+        await queue.encode(IDENTITY, jpeg(1), deadline(-1))
     busy.set()
-    await queue.encode(IDENTITY, jpeg(2), patience())
+    await queue.encode(IDENTITY, jpeg(2), deadline())
     assert frames_encoded(queue) == 1
 
 
@@ -104,27 +104,27 @@ async def test_who_hangs_up_is_dropped(queue: EncoderQueue, busy: threading.Even
         await asyncio.sleep(0.05)
 
     with pytest.raises(ClientGone):
-        await queue.encode(IDENTITY, jpeg(1), Patience(time.monotonic() + 30, leaves))
+        await queue.encode(IDENTITY, jpeg(1), RequestDeadline(time.monotonic() + 30, leaves))
     busy.set()
-    await queue.encode(IDENTITY, jpeg(2), patience())
+    await queue.encode(IDENTITY, jpeg(2), deadline())
     assert frames_encoded(queue) == 1
 
 
 async def test_a_cancelled_request_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
-    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), patience()))
+    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
     await asyncio.sleep(0.05)
     waiting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting
     busy.set()
-    await queue.encode(IDENTITY, jpeg(2), patience())
+    await queue.encode(IDENTITY, jpeg(2), deadline())
     assert frames_encoded(queue) == 1
 
 
 async def test_a_poisoned_frame_fails_alone(queue: EncoderQueue) -> None:
     frames = [jpeg(1), b"poison", jpeg(2)]
     results = await asyncio.gather(
-        *(queue.encode(IDENTITY, data, patience()) for data in frames), return_exceptions=True
+        *(queue.encode(IDENTITY, data, deadline()) for data in frames), return_exceptions=True
     )
     assert isinstance(results[1], NotAnImage)
     assert not isinstance(results[0], BaseException) and not isinstance(results[2], BaseException)
@@ -134,14 +134,14 @@ async def test_an_encoder_that_is_not_there(queue: EncoderQueue) -> None:
     with pytest.raises(UnknownEncoder):
         await queue.load("absent")
     with pytest.raises(UnknownEncoder):
-        await queue.encode("absent", jpeg(1), patience())
+        await queue.encode("absent", jpeg(1), deadline())
 
 
 async def test_turns_are_taken_in_order(queue: EncoderQueue, busy: threading.Event) -> None:
     order: list[int] = []
 
     async def one(number: int) -> None:
-        await queue.encode(IDENTITY, jpeg(number), patience())
+        await queue.encode(IDENTITY, jpeg(number), deadline())
         order.append(number)
 
     waiting = []

@@ -1,4 +1,4 @@
-"""Frames are searched for where they were encoded, and found as they are by the searches of all."""
+"""Frames of small maps are searched for in the encoder's thread, with the same answers as other searches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage import Map
 from service.engine import searches
-from service.engine.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then, Turn
+from service.engine.microbatches import MOST_FRAMES, AfterEncoding, Encoded, MicroBatches, QueuedFrame
 from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes
@@ -60,7 +60,9 @@ async def test_searched_ahead_as_searched_for(map_: Map, encoder: Encoder, toget
         assert ahead.matches[0][1].id == f"p{seed}"
 
 
-def test_what_may_take_long_is_not(map_: Map, encoder: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_searches_that_may_take_long_are_not_done_ahead(
+    map_: Map, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert search_ahead(map_, 3, QueryParameters(sequences="monday").selection()) is None
     search, now = search_ahead(map_, 3, None), map_.snapshot()
     assert search is not None
@@ -77,49 +79,52 @@ def test_what_may_take_long_is_not(map_: Map, encoder: Encoder, monkeypatch: pyt
 @pytest.fixture
 def batches(encoder: Encoder) -> Iterator[MicroBatches]:
     made = MicroBatches(lambda _: encoder, Limits(), lambda _: None)
-    made.put([first := Turn("", jpeg(0), None, time.monotonic() + 60)])
+    made.put([first := QueuedFrame("", jpeg(0), None, time.monotonic() + 60)])
     first.result.result(60)
     yield made
     made.close()
 
 
-def followed(batches: MicroBatches, count: int, *thens: Then) -> list[object]:
-    """What came after the encoding of frames that waited together, for which ``thens`` come next in turn."""
+def search_results(batches: MicroBatches, count: int, *callbacks: AfterEncoding) -> list[object]:
+    """The search results of ``count`` frames that waited together, which have the callbacks in turn."""
     free = threading.Event()
     batches.call(lambda: free.wait(30))
-    kinds = [thens[index % len(thens)] for index in range(count)]
-    turns = [Turn("", jpeg(seed), None, time.monotonic() + 60, then=then) for seed, then in enumerate(kinds)]
-    batches.put(turns)
+    kinds = [callbacks[index % len(callbacks)] for index in range(count)]
+    frames = [
+        QueuedFrame("", jpeg(seed), None, time.monotonic() + 60, after_encoding=callback)
+        for seed, callback in enumerate(kinds)
+    ]
+    batches.put(frames)
     free.set()
-    return [turn.result.result(60).followed for turn in turns]
+    return [frame.result.result(60).search_result for frame in frames]
 
 
-def test_what_comes_next_is_done_where_frames_are_encoded(batches: MicroBatches) -> None:
-    def then(together: Sequence[Encoded]) -> list[str]:
+def test_after_encoding_runs_in_the_encoders_thread(batches: MicroBatches) -> None:
+    def callback(together: Sequence[Encoded]) -> list[str]:
         return [threading.current_thread().name for _ in together]
 
-    assert followed(batches, 1, then) == ["encoder"]
-    names = followed(batches, 2 * MOST_FRAMES, then)
+    assert search_results(batches, 1, callback) == ["encoder"]
+    names = search_results(batches, 2 * MOST_FRAMES, callback)
     assert None not in names
     if torch.get_num_threads() > 1:
         assert "encoder" not in names, "several frames are taken by threads that have a core each"
 
 
-def test_what_comes_next_is_done_together(batches: MicroBatches) -> None:
+def test_frames_with_equal_callbacks_share_a_call(batches: MicroBatches) -> None:
     def one(together: Sequence[Encoded]) -> list[object]:
         return [("one", len(together), encoded.encoding.descriptor.sum()) for encoded in together]
 
     def other(together: Sequence[Encoded]) -> list[object]:
         return [("other", len(together), encoded.encoding.descriptor.sum()) for encoded in together]
 
-    alone = [followed(batches, seed + 1, one)[seed][2] for seed in range(4)]  # type: ignore[index]
-    found: list[Any] = followed(batches, 4, one, other)
+    alone = [search_results(batches, seed + 1, one)[seed][2] for seed in range(4)]  # type: ignore[index]
+    found: list[Any] = search_results(batches, 4, one, other)
     assert [name for name, _, _ in found] == ["one", "other", "one", "other"]
-    assert sum(1 / count for _, count, _ in found) >= 2, "each of theirs by itself"
+    assert sum(1 / count for _, count, _ in found) >= 2, "each callback has its own frames"
     assert [total for _, _, total in found] == pytest.approx(alone, rel=1e-4)
 
 
-def test_a_frame_alone_does_not_keep_all_cores_from_who_waits(batches: MicroBatches) -> None:
+def test_a_single_frame_is_not_searched_for_on_all_cores_while_others_wait(batches: MicroBatches) -> None:
     began, free = threading.Event(), threading.Event()
 
     def slow(_: str) -> Encoder:
@@ -128,22 +133,25 @@ def test_a_frame_alone_does_not_keep_all_cores_from_who_waits(batches: MicroBatc
         return load("")
 
     load, batches._load = batches._load, slow
-    turns = [Turn("", jpeg(seed), None, time.monotonic() + 60, then=lambda many: [1] * len(many)) for seed in range(2)]
-    batches.put(turns[:1])
+    frames = [
+        QueuedFrame("", jpeg(seed), None, time.monotonic() + 60, after_encoding=lambda many: [1] * len(many))
+        for seed in range(2)
+    ]
+    batches.put(frames[:1])
     assert began.wait(30)
-    batches.put(turns[1:])
+    batches.put(frames[1:])
     free.set()
-    found = [turn.result.result(60).followed for turn in turns]
+    found = [frame.result.result(60).search_result for frame in frames]
     assert found == ([None, 1] if torch.get_num_threads() > 1 else [1, 1])
 
 
-def test_what_comes_next_may_fail(batches: MicroBatches) -> None:
+def test_a_callback_may_fail(batches: MicroBatches) -> None:
     def breaks(_: Sequence[Encoded]) -> list[object]:
         raise ArithmeticError
 
     def too_few(_: Sequence[Encoded]) -> list[object]:
         return []
 
-    for then in (breaks, too_few):
+    for callback in (breaks, too_few):
         for count in (1, 4):
-            assert followed(batches, count, then) == [None] * count
+            assert search_results(batches, count, callback) == [None] * count

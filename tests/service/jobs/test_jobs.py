@@ -30,7 +30,7 @@ def running(folder: Path, kinds: Kinds | None = None, **limits: int) -> Iterator
     try:
         yield jobs
     finally:
-        jobs.close(patience=5)
+        jobs.close(timeout=5)
 
 
 def end_of(jobs: Jobs, job: Job) -> Job:

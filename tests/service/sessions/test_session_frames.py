@@ -15,8 +15,8 @@ from core.places import PlaceFields
 from core.storage import Map, MapSettings
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
-from service.engine.queue import Patience
-from service.places.enrolment import Candidate, enrol
+from service.engine.queue import RequestDeadline
+from service.places.enrolment import FrameToEnrol, enrol
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
 from service.sessions.sessions import Session
@@ -39,8 +39,8 @@ def runtime(tmp_path: Path) -> Iterator[Runtime]:
     running.engine.close()
 
 
-def patience() -> Patience:
-    return Patience(time.monotonic() + 60, asyncio.Event().wait)  # type: ignore[arg-type]
+def deadline() -> RequestDeadline:
+    return RequestDeadline(time.monotonic() + 60, asyncio.Event().wait)  # type: ignore[arg-type]
 
 
 async def walked(engine: Engine) -> Map:
@@ -48,14 +48,14 @@ async def walked(engine: Engine) -> Map:
     identity = engine.resolve(None)
     encoder = await engine.queue.load(identity)
     made = engine.atlas.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    await enrol(engine, made, [Candidate(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], patience())
+    await enrol(engine, made, [FrameToEnrol(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
     return made
 
 
 async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> SessionAnswer:
     options = FrameParameters(frame=number)
     parts = runtime.engine, runtime.sessions, runtime.statistics
-    return await take_in(*parts, map_, session, jpeg(number), options, patience(), None)
+    return await take_in(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
 @pytest.mark.parametrize("kind", ["bayes", "path"])
