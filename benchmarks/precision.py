@@ -22,6 +22,7 @@ from core.frames.traverses import Truth, read_ground_truth
 from core.judgement.curves import auc_pr
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.recognition.stages import score_matrix
 from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
 
 Side = tuple[NDArray[np.float32], NDArray[np.int8]]
@@ -71,8 +72,9 @@ def main(
     exact_first = exact_best = None
     for precision in get_args(Precision):
         back, size = at_rest(known, precision)
-        first = chosen.scores_from_inner_products(asked[0] @ back[0].T)
-        both = chosen.with_agreement(first, asked[1], back[1])
+        products = asked[0] @ back[0].T
+        first = chosen.scores_from_inner_products(products)
+        both = score_matrix(chosen, products, asked[1], back[1])
         if exact_first is None or exact_best is None:
             exact_first, exact_best = first, both.argmax(axis=1)
         figures[precision] = {

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from core.frames.preprocessing import Pixels
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
+from core.recognition.stages import score_matrix
 from training.ground_truth import corrected_truth
 from training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs
 
@@ -137,8 +138,7 @@ def describe(encoder: Encoder, frames: Sequence[Pixels]) -> Encodings:
 
 def scores(encoder: Encoder, queries: Encodings, references: Encodings) -> Array:
     """The scores that a map of all the references gives, second stage included; float32 [Q, R]."""
-    first = encoder.scores_from_inner_products(queries.descriptors @ references.descriptors.T)
-    return encoder.with_agreement(first, queries.local, references.local)
+    return score_matrix(encoder, queries.descriptors @ references.descriptors.T, queries.local, references.local)
 
 
 def camera_scores(encoder: Encoder, pictures: Encodings, distractors: Encodings) -> tuple[Array, Array]:

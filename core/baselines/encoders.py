@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.baselines.system import About, Array, Description, Index, InnerProducts, stack
 from core.frames.preprocessing import Pixels
+from core.recognition.stages import score_matrix
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderSummary
@@ -92,23 +93,22 @@ class EncoderSystem:
         return [(left, top, right, bottom) for left, top, right, bottom in boxes.tolist()]
 
     def index(self, references: Sequence[Description]) -> Index:
-        first = InnerProducts(stack(references), finish=self.encoder.scores_from_inner_products)
+        vectors = stack(references)
         if not self.encoder.candidates:
-            return first
-        return TwoStages(first, local_of(references), self.encoder)
+            return InnerProducts(vectors, finish=self.encoder.scores_from_inner_products)
+        return TwoStages(InnerProducts(vectors), local_of(references), self.encoder)
 
 
 @dataclass(frozen=True)
 class TwoStages:
-    """An index whose best candidates by inner product are compared cell by cell; local: int8 [R, C, L]."""
+    """An index that scores as the service does: by inner product, then cell by cell; local: int8 [R, C, L]."""
 
     first: InnerProducts
     local: NDArray[np.int8]
     encoder: Encoder
 
     def score(self, queries: Sequence[Description]) -> Array:
-        ranked = self.first.score(queries)
-        return self.encoder.with_agreement(ranked, local_of(queries), self.local)
+        return score_matrix(self.encoder, self.first.score(queries), local_of(queries), self.local)
 
 
 def local_of(descriptions: Sequence[Description]) -> NDArray[np.int8]:

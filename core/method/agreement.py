@@ -191,21 +191,3 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
     asked = np.require(query, np.int8, ["C", "W"])  # numba would compile the loop again for a read-only array
     sums: Array = squared_sums(asked, lying.addresses(), columns, *definition.reach, np.float32(1 / RESOLUTION**2))
     return sums * np.float32(definition.share / len(query))
-
-
-def reranked(scores: Array, gains: Array) -> tuple[NDArray[np.int64], Array]:
-    """Sort a ranking again after its first places have gained.
-
-    Args:
-        scores: float32 [n], best first.
-        gains: float32 [k], k <= n, at least 0, of the first k.
-
-    Returns:
-        int64 [n], positions in the old ranking, and float32 [n], their scores, best first; equal scores keep their
-        order.
-    """
-    raised = scores.copy()
-    raised[: len(gains)] += gains
-    order = np.arange(len(scores))
-    order[: len(gains)] = np.argsort(-raised[: len(gains)], kind="stable")
-    return order, raised[order]

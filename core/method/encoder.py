@@ -229,25 +229,6 @@ class Encoder:
         product = np.array(a.descriptor @ b.descriptor, np.float32)
         return float(self.scores_from_inner_products(product) + self.agreement(a.local, b.local[np.newaxis])[0])
 
-    def with_agreement(self, scores: Array, queries: Cells, references: Cells) -> Array:
-        """Apply the second stage to the best ``candidates`` of each query; without one, return the scores.
-
-        Args:
-            scores: float32 [Q, R].
-            queries: int8 [Q, C, L], their local descriptors.
-            references: int8 [R, C, L].
-
-        Returns:
-            float32 [Q, R].
-        """
-        if not self.candidates:
-            return scores
-        raised = scores.copy()
-        for row, query in zip(raised, queries, strict=True):
-            best = np.argsort(-row, kind="stable")[: self.candidates]
-            row[best] += self.agreement(query, references[best])
-        return raised
-
     def layer_grids(self) -> dict[str, tuple[int, int]]:
         """Rows and columns of the maps of each layer in use."""
         return self.extractor.layer_grids()

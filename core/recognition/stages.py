@@ -23,7 +23,7 @@ from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import Neighborhood, Whereabouts
 from core.recognition.selection import WHOLE_MAP, SearchScope, Selection
-from core.storage import Map, Ranking, Snapshot
+from core.storage import Map, MapSettings, Ranking, Snapshot
 
 Array = NDArray[np.float32]
 Positions = NDArray[np.int64]
@@ -235,3 +235,34 @@ def examine(
         ahead = np.flatnonzero(elsewhere & ~done)[:missing]
     order = np.argsort(-raised, kind="stable")
     return Examined(order, raised[order], done[order])
+
+
+def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, references: Cells) -> Array:
+    """Both stages for every query against every frame of one traverse, as a map of that traverse would score them.
+
+    It is what the evaluation compares: the frames of the references are the places of one sequence without poses.
+
+    Args:
+        inner_products: of the descriptors, float32 [Q, R].
+        queries, references: local descriptors, int8 [Q, C, L] and [R, C, L].
+
+    Returns:
+        Scores, float32 [Q, R].
+    """
+    scores = encoder.scores_from_inner_products(inner_products)
+    if not encoder.candidates:
+        return scores
+    count = len(references)
+    zeros = np.zeros(count, np.int64)
+    places = Whereabouts(zeros.astype(np.int8), np.zeros((count, 3)), zeros.astype(np.int32), np.arange(count))
+    settings = MapSettings()
+    neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
+    for row, query in zip(scores, queries, strict=True):
+        order = np.argsort(-row, kind="stable")
+
+        def gains(positions: Positions, query: Cells = query, order: Positions = order) -> Array:
+            return encoder.agreement(query, references[order[positions]])
+
+        found = examine(row[order], places.take(order), neighborhood, encoder.candidates, gains)
+        row[order[found.order]] = found.scores
+    return scores

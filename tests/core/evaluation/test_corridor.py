@@ -16,6 +16,7 @@ from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import Neighborhood, Whereabouts
+from core.recognition.stages import score_matrix
 
 CORRIDOR = Path(__file__).parents[4] / "shared/datasets/eval/corridor"
 MAP_DEFAULTS = Neighborhood(radius=5.0, frames=3)
@@ -57,7 +58,7 @@ def answers(encoder: Encoder, queries: list[Encoding], references: list[Encoding
     """The scores of both stages, Q x R."""
     products = np.stack([one.descriptor for one in queries]) @ np.stack([one.descriptor for one in references]).T
     asked, known = (np.stack([one.local for one in side]) for side in (queries, references))
-    return encoder.with_agreement(encoder.scores_from_inner_products(products), asked, known)
+    return score_matrix(encoder, products, asked, known)
 
 
 def test_the_default_is_ahead_of_every_published_technique(

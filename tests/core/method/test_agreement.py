@@ -15,7 +15,6 @@ from core.method.agreement import (
     correspondences,
     in_one_block,
     local_descriptors,
-    reranked,
 )
 
 ROWS, COLUMNS = 4, 6
@@ -77,14 +76,6 @@ def test_layers_count_by_their_weights() -> None:
     scaled = query.astype(int) @ half[0].astype(int) / RESOLUTION**2
     assert scaled[0] == pytest.approx(0.75, abs=0.01)
     assert query.shape == (1, 8)
-
-
-def test_a_ranking_is_sorted_again_and_ties_keep_their_order() -> None:
-    order, scores = reranked(np.array([0.5, 0.4, 0.3, 0.2], np.float32), np.array([0.0, 0.1, 0.3], np.float32))
-    assert order.tolist() == [2, 0, 1, 3]
-    np.testing.assert_allclose(scores, [0.6, 0.5, 0.5, 0.2], atol=1e-6)
-    order, scores = reranked(np.array([0.5, 0.4], np.float32), np.zeros(0, np.float32))
-    assert order.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(

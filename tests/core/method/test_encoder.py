@@ -223,16 +223,6 @@ def test_layers_of_different_grids_cannot_be_compared_cell_by_cell(encoder: Enco
         Encoder("uneven", extractor, definition, vocabulary, CALIBRATION)
 
 
-def test_only_the_best_candidates_are_examined() -> None:
-    encoder = EncoderCatalogue().get("m-region-vlad")
-    query = encoder.encode(random_frame(1)).local
-    references = np.stack([query] * (encoder.candidates + 3))
-    scores = np.linspace(0.2, 0.1, len(references)).astype(np.float32)
-    gained = encoder.with_agreement(scores[np.newaxis], query[np.newaxis], references)[0] - scores
-    assert (gained[: encoder.candidates] > 0.5).all()
-    assert (gained[encoder.candidates :] == 0).all()
-
-
 @pytest.mark.parametrize(
     "change",
     [{"regions": 51}, {"steps": (0.05, 0.06)}, {"unit_features": False}, {"layers": ("conv4", "conv3")}],

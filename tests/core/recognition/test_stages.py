@@ -7,9 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from core.judgement.verdict import Calibration, judge
+from core.method.catalogue import EncoderCatalogue
 from core.places import Neighborhood, Whereabouts
-from core.recognition.stages import examine
+from core.recognition.stages import examine, score_matrix
 from tests.core.judgement.test_verdict import in_sequence
+from tests.service.scenes import scene
 
 SAME = Neighborhood(radius=5.0, frames=60)
 CALIBRATION = Calibration(
@@ -74,3 +76,23 @@ def test_without_a_second_stage_nothing_is_examined() -> None:
     found = examine(scores, places, SAME, 0, lambda rows: gains[rows])
     assert not found.examined.any()
     assert np.array_equal(found.scores, scores)
+
+
+def test_all_queries_of_a_traverse_are_scored_as_a_map_scores_them() -> None:
+    encoder = EncoderCatalogue().get("m-region-vlad")
+    cells = encoder.encode(scene(1)).local
+    count = encoder.candidates + 20
+    products = np.linspace(2.0, 1.0, count).astype(np.float32)[np.newaxis]
+    first = encoder.scores_from_inner_products(products)
+    gained = score_matrix(encoder, products, cells[np.newaxis], np.stack([cells] * count)) - first
+    assert (gained[0, : encoder.candidates] > 0.5).all()
+    np.testing.assert_allclose(gained[0, encoder.candidates :], 0, atol=1e-6)
+
+
+def test_without_a_second_stage_the_matrix_is_that_of_the_first() -> None:
+    encoder = EncoderCatalogue().get("region-vlad")
+    products = np.linspace(-1, 1, 12, dtype=np.float32).reshape(3, 4)
+    none = np.zeros((0, 0), np.int8)
+    np.testing.assert_array_equal(
+        score_matrix(encoder, products, none, none), encoder.scores_from_inner_products(products)
+    )
