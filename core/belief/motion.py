@@ -324,11 +324,11 @@ def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) 
     moves: list[Move] = []
     if step.frames > FARTHEST_STEPS:
         return Transition((), jumps=True)
-    told = graph.posed.any() and (step.odometry is not None or step.reach is not None)
-    along = ~graph.posed if told else np.ones(len(graph), np.bool_)
+    by_pose = graph.posed.any() and (step.odometry is not None or step.reach is not None)
+    along = ~graph.posed if by_pose else np.ones(len(graph), np.bool_)
     if along.any():
         moves += [AlongSequences(graph, stride.kernel(), along)] * step.frames
-    if told:
+    if by_pose:
         further = _by_pose(graph, step, pending)
         if further is None:
             return Transition((), jumps=True)

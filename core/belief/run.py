@@ -27,12 +27,13 @@ KEPT = 512
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is followed.
+    """How the belief of a run is computed.
 
     filter: ``bayes``, the hidden Markov model, or ``path``, the search for straight paths.
-    stride: the usual pace along the sequence, where neither odometry nor a speed limit says more.
-    lag: frames after which a place is told once more, in the light of the frames since; 0: never.  ``bayes`` alone.
-    path_frames: frames of a path.  ``path`` alone.
+    stride: the usual advance along the sequence, used if neither odometry nor a speed limit is known.
+    lag: after this many frames, the place of a frame is estimated again, given the frames since; 0: never.  Only for
+        ``bayes``.
+    path_frames: frames of a path.  Only for ``path``.
     """
 
     filter: Literal["bayes", "path"] = "bayes"
@@ -48,7 +49,7 @@ class RunState:
     rows, masses: int64 [k] and float32 [k], the likeliest places and their probabilities if the robot sees the map.
     unknown: the probability that the robot does not see the map.
     frames, unrecognized: as of the :class:`Run`.
-    odometry, reach: motion told and not yet applied.
+    odometry, reach: motion that was reported but not yet applied.
     seen: the evidence that the path search still uses.
     """
 
@@ -131,7 +132,7 @@ class Run:
             count: how many candidates to list.
             alive: bool [rows of the map]; places that were removed since the graph was made are not listed.
         """
-        found = self._told(self.belief, count, alive)
+        found = self._estimate(self.belief, count, alive)
         if found.verdict == "recognized":
             self.unrecognized = 0
         elif self.unrecognized is not None:
@@ -140,14 +141,14 @@ class Run:
 
     def look(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
         """Where the robot is, without counting: for calls between two frames."""
-        return self._told(self.belief, count, alive)
+        return self._estimate(self.belief, count, alive)
 
     def earlier(self, count: int, alive: NDArray[np.bool_]) -> Estimate | None:
         """Where the robot was ``lag`` frames ago, given all frames since; None if that is not known."""
         smoothed = self._smoother.smoothed(self.graph) if self.options.lag else None
-        return None if smoothed is None else self._told(smoothed, count, alive)
+        return None if smoothed is None else self._estimate(smoothed, count, alive)
 
-    def _told(self, belief: Belief, count: int, alive: NDArray[np.bool_]) -> Estimate:
+    def _estimate(self, belief: Belief, count: int, alive: NDArray[np.bool_]) -> Estimate:
         rows = self.graph.rows
         there = (rows < len(alive)) & alive[np.minimum(rows, max(len(alive) - 1, 0))] if len(alive) else rows < 0
         if not there.all():

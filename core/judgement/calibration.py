@@ -114,7 +114,7 @@ def fit_encoder_calibration(unknown: Scores, known: Scores, neighbours: int, sou
     trials = joined([strangers, looks], same_frames=True)
     try:
         curve = fit_curve(trials.decision, trials.right)
-    except ValueError:  # the frames are all alike: no probability can be told
+    except ValueError:  # the frames are all alike, so that no curve can be fitted
         curve = None
     return start.model_copy(update={"threshold": threshold, "margin": margin, "curve": curve})
 
@@ -314,7 +314,7 @@ def _fitted(trials: Trials, base: Calibration, target: Target) -> Calibration:
     try:
         curve = fit_curve(trials.decision, trials.right)
     except ValueError as error:
-        raise CalibrationImpossible(f"No probability can be told: {error}.") from error
+        raise CalibrationImpossible(f"No curve of probabilities can be fitted: {error}.") from error
     margin, threshold = _margin(trials.margin[trials.right], "lower"), _threshold(trials, curve, target)
     return base.model_copy(update={"curve": curve, "margin": margin, "threshold": threshold})
 

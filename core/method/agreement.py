@@ -181,7 +181,7 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
     """
     if query.shape != candidates.shape[1:] or len(query) % columns:
         shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
-        raise ValueError(f"cells of {shapes} in {columns} columns cannot be held against each other")
+        raise ValueError(f"cells of {shapes} in {columns} columns cannot be compared")
     if missing := -query.shape[1] % WHOLE_WORDS:
         if isinstance(candidates, ScatteredCells):
             candidates = candidates.together()

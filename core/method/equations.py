@@ -46,7 +46,6 @@ def labelled_regions(levels: Array) -> NDArray[np.int64]:
         int64 [X, Y, K], the number h of each cell's region, from 1 in the order of the regions' first cells (map by
         map, then row by row); 0 for background.
     """
-    from scipy import ndimage  # slow to import, and not needed to encode
 
     within_a_map = np.zeros((3, 3, 3), np.bool_)
     within_a_map[:, :, 1] = True
@@ -71,9 +70,8 @@ def energies(activations: Array, regions: NDArray[np.int64]) -> NDArray[np.float
     Returns:
         float64 [H].
     """
-    from scipy import ndimage  # slow to import, and not needed to encode
-
-    return np.asarray(ndimage.mean(activations, regions, np.arange(1, regions.max(initial=0) + 1)), np.float64)
+    sums = np.bincount(regions.ravel(), activations.ravel(), minlength=1)
+    return sums[1:] / np.bincount(regions.ravel(), minlength=1)[1:]
 
 
 def strongest_regions(energies: Array, count: int) -> NDArray[np.int64]:
@@ -96,11 +94,12 @@ def bounding_boxes(regions: NDArray[np.int64], chosen: NDArray[np.int64]) -> NDA
         regions: int64 [X, Y, K], as :func:`labelled_regions` numbers them.
         chosen: int64 [T], numbers of regions.
     """
-    from scipy import ndimage  # slow to import, and not needed to encode
-
-    slices = ndimage.find_objects(regions)
-    boxes = [(rows.start, columns.start, rows.stop, columns.stop) for rows, columns, _ in slices]
-    return np.array(boxes, np.int64).reshape(-1, 4)[chosen - 1]
+    cells, numbers = np.argwhere(regions)[:, :2], regions[regions > 0] - 1
+    boxes = np.zeros((regions.max(initial=0), 4), np.int64)
+    boxes[:, :2] = regions.shape[:2]
+    np.minimum.at(boxes[:, :2], numbers, cells)
+    np.maximum.at(boxes[:, 2:], numbers, cells + 1)
+    return boxes[chosen - 1]
 
 
 def regional_features(activations: Array, boxes: NDArray[np.integer[Any]]) -> NDArray[np.float64]:

@@ -2,8 +2,8 @@
 
 The score of an encoder with two stages is the sum of two sums: the first over the words of the vocabulary (equations
 3.13 and 4.13), the second over the corresponding cells (``agreement.py``).  A region has no share of its own, since
-its residual passes through a power and a norm with the others of its word; for a region it is told how much the score
-would lose without it.
+its residual passes through a power and a norm with the others of its word; its contribution is what the score would
+lose without it.
 """
 
 from __future__ import annotations

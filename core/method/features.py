@@ -112,7 +112,9 @@ class FeatureExtractor:
                 raise InvalidModel(f"this build of torch cannot compute {network.definition.name} in {precision}.")
             self.forward = made or network
         elif (precision, device) != ("float32", "cpu"):
-            raise InvalidModel("a plugged network runs on the CPU in float32, unless it takes itself elsewhere.")
+            raise InvalidModel(
+                "a plugged network runs on the CPU in float32, unless it moves itself to another device."
+            )
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
         """Of each frame the rectified maps of each output, float32 [X, Y, K]; see :meth:`maps`."""

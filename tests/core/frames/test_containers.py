@@ -109,10 +109,10 @@ def test_a_header_can_be_read_before_the_file_is_whole(extension: str) -> None:
 @pytest.mark.parametrize("start", [b"\xff\xd8\xff\xe0\0\4ab", b"\x89PNG\r\n\x1a\n", b"RIFF\0\0\0\1WEBPVP8X"])
 def test_hostile_bytes_are_refused_at_once(start: bytes, filling: bytes) -> None:
     data = start + filling * (2**24 // len(filling))
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InvalidImage):
         check_structure(data, read_header(data))
-    assert time.perf_counter() - began < 0.05
+    assert time.process_time() - began < 1  # a loop over all bytes would take many seconds
 
 
 @pytest.mark.parametrize(

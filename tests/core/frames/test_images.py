@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
 import tracemalloc
 import zlib
 from typing import Any
@@ -194,16 +193,14 @@ def test_more_pixels_than_the_limit(name: str) -> None:
 
 
 @pytest.mark.parametrize("side", [7_000, 60_000, 2**31 - 1])
-def test_a_decompression_bomb_costs_nothing(side: int) -> None:
+def test_a_decompression_bomb_is_not_decoded(side: int, monkeypatch: pytest.MonkeyPatch) -> None:
     data = png_bomb(side)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     tracemalloc.start()
-    began = time.perf_counter()
     with pytest.raises(TooManyPixels):
         decode(data)
-    spent = time.perf_counter() - began
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert spent < 0.02
     assert peak < 100_000
 
 

@@ -158,5 +158,5 @@ def test_grids_that_are_not_alike_are_refused() -> None:
         (np.zeros((9, 8), np.int8), 3),
         (np.zeros((24, 8), np.int8), 5),
     ):
-        with pytest.raises(ValueError, match="held against"):
+        with pytest.raises(ValueError, match="cannot be compared"):
             agreement(query, scattered(8), columns, stage)

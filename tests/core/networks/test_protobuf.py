@@ -104,10 +104,10 @@ def test_values_of_another_kind_are_refused() -> None:
 )
 def test_a_message_of_millions_of_fields_is_refused_soon(content: bytes) -> None:
     assert len(content) // 5 > MAX_FIELDS
-    began = time.perf_counter()
+    began = time.process_time()
     with pytest.raises(InvalidModel, match="fields"):
         message(content)
-    assert time.perf_counter() - began < 5
+    assert time.process_time() - began < 5
 
 
 def test_millions_of_unpacked_numbers_take_little_more_memory_than_they_are() -> None:

@@ -58,7 +58,7 @@ def graphs(draw: st.DrawFn) -> Graph:
 
 
 @given(graphs())
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 def test_whatever_goes_has_a_stand_in_that_stays(graph: Graph) -> None:
     places, pairs, similarity, least = graph
     kept = thinned(places, pairs, similarity, least)
