@@ -35,7 +35,7 @@ from core.storage.database.schema import (
 )
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
-from core.storage.files.arrays import StaleArrays
+from core.storage.files.array_files import StaleArrays
 from core.storage.files.row_formats import HALF
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout

@@ -263,5 +263,5 @@ def _check_locations(connection: sqlite3.Connection, snapshot: Snapshot, finding
     for row in columns.rows[~same].tolist():
         findings.problems.append(f"row {row} differs between what is searched and {FILE}")
     if snapshot.rows != findings.rows or len(snapshot) != len(columns.rows):
-        told = f"{len(snapshot)} places in {snapshot.rows} rows are searched"
-        findings.problems.append(f"{told}, {len(columns.rows)} in {findings.rows} are stored")
+        searched_now = f"{len(snapshot)} places in {snapshot.rows} rows are searched"
+        findings.problems.append(f"{searched_now}, {len(columns.rows)} in {findings.rows} are stored")

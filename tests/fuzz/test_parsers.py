@@ -25,7 +25,7 @@ from core.networks.matfiles import read_mat
 from core.networks.network import load_network, read_definition
 from core.storage.archives.manifest import read_manifest
 from core.storage.archives.tar_layout import manifest_size
-from core.storage.files.arrays import StaleArrays, read_arrays, write_arrays
+from core.storage.files.array_files import StaleArrays, read_arrays, write_arrays
 from core.storage.pagination import decode_name, decode_number, encode_cursor
 from service.errors.faults import Fault
 from service.http.multipart import FormReader

@@ -225,8 +225,8 @@ def stale_metadata_index(connection: sqlite3.Connection, limit: int = 10) -> lis
     """Where the index of metadata does not match the places; :func:`rebuild_metadata_index` repairs it."""
     problems = []
     found, due = "SELECT key, kind, value, row FROM place_values", _values_of("p").format(source="places p, ")
-    for some, others in ((found, due), (due, found)):
-        query = f"SELECT row, key FROM ({some} EXCEPT {others}) LIMIT {limit}"
+    for first, second in ((found, due), (due, found)):
+        query = f"SELECT row, key FROM ({first} EXCEPT {second}) LIMIT {limit}"
         for row, key in connection.execute(query).fetchall():
             problems.append(f"row {row} is not indexed correctly by its metadata {key!r}")
     return problems

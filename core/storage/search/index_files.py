@@ -18,7 +18,7 @@ import numpy as np
 
 from core.index import Coder, Codes, InvertedLists
 from core.storage.database.ledger import SegmentEntry
-from core.storage.files.arrays import Arrays, StaleArrays, check_arrays, read_arrays, write_arrays
+from core.storage.files.array_files import Arrays, StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
 from core.storage.search.tiers import Recall, Tier
 

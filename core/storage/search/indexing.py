@@ -21,7 +21,7 @@ from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, CodeTable, InvertedLists
 from core.storage.database.ledger import SegmentEntry
-from core.storage.files.arrays import StaleArrays
+from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.rebuilding import codes_of, fitted_coder, rebuilt
 from core.storage.search.recall import measure_recall
@@ -210,17 +210,17 @@ class Indexer:
             Damage, OSError, MapQuarantined: a descriptor cannot be read.
         """
 
-        def told(done: int, total: int) -> None:
+        def report(done: int, total: int) -> None:
             progress(done, total)
             if self._stopping.is_set():
                 raise Stopped
 
         while not self._building.acquire(timeout=_PATIENCE_SECONDS):
-            told(0, self._map.snapshot().rows)
+            report(0, self._map.snapshot().rows)
         try:
             if (wanted := self._wanted(self._map.snapshot())) == "exact":
                 return
-            made = rebuilt(self._map.snapshot, wanted == "inverted", told)
+            made = rebuilt(self._map.snapshot, wanted == "inverted", report)
             self._publish(made.put_into)
             self._files.write_coder(made.table.coder)
             self._written.clear()

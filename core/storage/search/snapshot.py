@@ -351,9 +351,9 @@ class Snapshot:
         while done < len(descriptors):
             if not segments or len(segments[-1]) == self.rows_per_segment:
                 row = sum(len(segment) for segment in segments)
-                nobody, nothing = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
+                alive, no_sums = np.empty(0, dtype=np.bool_), np.empty(0, dtype=np.uint32)
                 held = Held.nothing(self.dimension, self.local_shape, self.halves) if self.holds else None
-                segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
+                segments.append(Segment(held, row, whereabouts_of([]), alive, no_sums))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
                 descriptors[done:stop], locations[done:stop], local[done:stop], sums[done:stop], self.rows_per_segment

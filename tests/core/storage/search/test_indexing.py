@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, InvertedLists
 from core.storage import Atlas, IndexStatus, Map, MapSettings
-from core.storage.files import arrays
+from core.storage.files import array_files
 from core.storage.files.segment_files import HEADER_BYTES
 from core.storage.search import indexing, recall, snapshot, tiers
 from core.storage.search.snapshot import Snapshot
@@ -277,7 +277,7 @@ def test_a_disk_that_is_full_for_codes_leaves_the_map_serving(
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched, caplog.at_level(logging.WARNING):
-        patched.setattr(arrays, "_written", full)
+        patched.setattr(array_files, "_written", full)
         lab = make(atlas, index="compact")
         assert settled(lab).tier == "compact"
         assert all(finds(lab, f"p{i}") for i in (0, PLACES - 1))

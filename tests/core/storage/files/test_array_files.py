@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.storage.files.arrays import StaleArrays, check_arrays, read_arrays, write_arrays
+from core.storage.files.array_files import StaleArrays, check_arrays, read_arrays, write_arrays
 
 ARRAYS = {
     "codes": np.arange(24, dtype="<u8").reshape(4, 6),
