@@ -46,6 +46,7 @@ def labelled_regions(levels: Array) -> NDArray[np.int64]:
         int64 [X, Y, K], the number h of each cell's region, from 1 in the order of the regions' first cells (map by
         map, then row by row); 0 for background.
     """
+    from scipy import ndimage  # here, as it takes long to import and only this function needs it
 
     within_a_map = np.zeros((3, 3, 3), np.bool_)
     within_a_map[:, :, 1] = True

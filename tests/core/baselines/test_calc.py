@@ -14,7 +14,7 @@ from core.errors import InvalidModel
 from tests.core.networks.caffe_writer import Layer, caffemodel, field, layer, prototxt, relu
 
 SHAPES = {"conv1": (64, 1, 5, 5), "conv2": (128, 64, 4, 4), "conv3": (4, 128, 3, 3)}
-PICTURE = np.random.default_rng(0).integers(0, 256, (90, 130, 3), np.uint8)
+FRAME = np.random.default_rng(0).integers(0, 256, (90, 130, 3), np.uint8)
 
 
 def written(weights: dict[str, NDArray[np.float32]], biases: dict[str, NDArray[np.float32]]) -> list[Layer]:
@@ -74,9 +74,9 @@ def test_one_channel_by_hand(tmp_path: Path) -> None:
     biases = zeros(biases=True)
     biases["conv3"][:] = [0, 0, -50, 3]
     system = Calc(ABOUT, load_calc(save(tmp_path / "calc.caffemodel", written(weights, biases))))
-    found = system.describe(PICTURE)
+    found = system.describe(FRAME)
 
-    seen = np.pad(grey_input(PICTURE).astype(np.float64), 4)
+    seen = np.pad(grey_input(FRAME).astype(np.float64), 4)
     first = shrunk(100 * seen[2::2, 2::2][:62, :82])  # 62 x 82 to 31 x 41
     second = shrunk(np.pad(first, 2)[1:, 2:][:32, :42])  # a 4 x 4 window sees the place one up of it; to 16 x 21
     middle = second[1:-1, 1:-1]
@@ -92,9 +92,9 @@ def test_it_is_what_opencv_makes_of_the_file(tmp_path: Path, generation: str, fo
     network = load_calc(path)
     text = prototxt(layers, (1, 1, 120, 160)).replace(b'"data"', b'"X1"')
     net = cv2.dnn.readNetFromCaffe(np.frombuffer(text, np.uint8), np.frombuffer(caffemodel(layers), np.uint8))
-    net.setInput(grey_input(PICTURE)[None, None])
+    net.setInput(grey_input(FRAME)[None, None])
     wanted = net.forward("relu3").reshape(-1)
-    found = np.asarray(Calc(ABOUT, network).describe(PICTURE).arrays["descriptor"])
+    found = np.asarray(Calc(ABOUT, network).describe(FRAME).arrays["descriptor"])
     np.testing.assert_allclose(found, wanted / np.linalg.norm(wanted), atol=1e-5)
 
 

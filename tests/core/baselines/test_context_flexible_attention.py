@@ -75,7 +75,7 @@ def test_context_flexible_attention_of_a_file(tmp_path: Path) -> None:
     torch.save({name: torch.from_numpy(tensor) for name, tensor in tensors.items()}, tmp_path / "a.pth")
     again = build(tmp_path / "a.pth")
     assert again.identity == system.identity
-    np.testing.assert_array_equal(vector(again, frame), found)
+    np.testing.assert_allclose(vector(again, frame), found, atol=1e-6)
 
 
 def test_the_mask_uses_each_layer() -> None:

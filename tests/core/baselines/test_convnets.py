@@ -20,8 +20,8 @@ from tests.core.networks.caffe_writer import Layer, caffemodel, field, layer, re
 
 Array = NDArray[Any]
 MEAN = (10.0, 20.0, 30.0)
-PICTURE = np.random.default_rng(0).integers(0, 256, (227, 227, 3), np.uint8)
-SEEN = np.maximum(PICTURE.astype(np.float64) - MEAN, 0)  # 227 x 227 x 3
+FRAME = np.random.default_rng(0).integers(0, 256, (227, 227, 3), np.uint8)
+SEEN = np.maximum(FRAME.astype(np.float64) - MEAN, 0)  # 227 x 227 x 3
 
 
 def plain(name: str, bottom: str, factor: float = 1) -> list[Layer]:
@@ -64,18 +64,18 @@ def unit(vector: Array) -> Array:
 def test_alexnet_is_conv3_by_the_cosine(tmp_path: Path, generation: str) -> None:
     path = write(tmp_path / "bvlc_alexnet.caffemodel", trunk(), "ilsvrc_2012_mean.npy", generation=generation)
     system = build("alexnet", path)
-    found = system.describe(PICTURE)
+    found = system.describe(FRAME)
     np.testing.assert_allclose(np.asarray(found.arrays["descriptor"]), unit(SEEN.reshape(-1)), atol=1e-6)
-    darker = system.describe(np.asarray(PICTURE // 2, np.uint8))
+    darker = system.describe(np.asarray(FRAME // 2, np.uint8))
     scores: Array = system.index([found, darker]).score([found])
-    half = unit(np.maximum(PICTURE // 2 - np.array(MEAN), 0).reshape(-1))
+    half = unit(np.maximum(FRAME // 2 - np.array(MEAN), 0).reshape(-1))
     assert scores.tolist() == [[pytest.approx(1), pytest.approx(unit(SEEN.reshape(-1)) @ half, abs=1e-5)]]
 
 
 def test_alexnet_takes_imagenets_mean_where_no_file_says_another(tmp_path: Path) -> None:
     system = build("alexnet", write(tmp_path / "bvlc_alexnet.caffemodel", trunk()))
-    wanted = np.maximum(PICTURE - np.array([104.00699, 116.66877, 122.67892]), 0)
-    np.testing.assert_allclose(vector(system, PICTURE), unit(wanted.reshape(-1)), atol=1e-6)
+    wanted = np.maximum(FRAME - np.array([104.00699, 116.66877, 122.67892]), 0)
+    np.testing.assert_allclose(vector(system, FRAME), unit(wanted.reshape(-1)), atol=1e-6)
 
 
 def test_a_network_file_that_was_imported_before_is_taken_too(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_network_file_that_was_imported_before_is_taken_too(tmp_path: Path) ->
     definition, weights = import_caffe(path, MEAN, input_size=(227, 227))
     save_network(tmp_path / "a.network.safetensors", definition, weights)
     ours, theirs = (build("alexnet", tmp_path / name) for name in ("a.network.safetensors", "a.caffemodel"))
-    np.testing.assert_array_equal(vector(ours, PICTURE), vector(theirs, PICTURE))
+    np.testing.assert_allclose(vector(ours, FRAME), vector(theirs, FRAME), atol=1e-6)
     assert ours.identity == theirs.identity
 
 
@@ -93,7 +93,7 @@ def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
         system = build(name, path)
         blank = system.describe(np.full((50, 60, 3), 200, np.uint8))
         assert not blank.arrays["descriptor"].any()
-        assert np.isfinite(system.index([blank]).score([blank, system.describe(PICTURE)])).all()
+        assert np.isfinite(system.index([blank]).score([blank, system.describe(FRAME)])).all()
 
 
 # AMOSNet and HybridNet
@@ -109,7 +109,7 @@ def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
 )
 def test_a_spatial_pyramid_of_conv5(tmp_path: Path, name: str, model: str, mean: str) -> None:
     system = build(name, write(tmp_path / model, trunk(6), mean))
-    found = vector(system, PICTURE)
+    found = vector(system, FRAME)
     maps = 2 * SEEN
     wanted = [maps.max((0, 1))]
     for level in (2, 3, 4):
@@ -135,7 +135,7 @@ def test_a_missing_mean_is_named(tmp_path: Path, name: str) -> None:
 def test_a_mean_that_the_model_names_itself(tmp_path: Path) -> None:
     data = layer("data", "Data", top="data label", transform_param={"mean_value": list(MEAN)})
     system = build("hybridnet", write(tmp_path / "Net.caffemodel", [data, *trunk()]))
-    assert vector(system, PICTURE)[0] == pytest.approx(2 * SEEN[:, :, 0].max())
+    assert vector(system, FRAME)[0] == pytest.approx(2 * SEEN[:, :, 0].max())
 
 
 def test_networks_without_the_layer(tmp_path: Path) -> None:
@@ -174,15 +174,13 @@ def test_places365_is_fc7_by_the_cosine(tmp_path: Path, generation: str, form: s
     write(path, trunk() + fully_connected(), "places365CNN_mean.npy", generation=generation, form=form)
     (tmp_path / "places365CNN_mean.npy").rename(tmp_path / "alexnet_places365_mean.npy")
     system = build("places365", path)
-    found = vector(system, PICTURE)
+    found = vector(system, FRAME)
     maps = 2 * SEEN
     blue, green, red = ([maps[y, x, k].max() for y in HALVES for x in HALVES] for k in range(3))
     fc6 = [blue[0], green[1] + 1, 2 * red[3], 0]  # cells row by row, channel by channel: 5 is green's second
     fc7 = [fc6[0], max(fc6[1] - fc6[2], 0), sum(fc6) - 7]
     np.testing.assert_allclose(found, unit(np.array(fc7)), atol=1e-6)
-    assert system.index([Description({"descriptor": found})]).score([system.describe(PICTURE)])[0, 0] == pytest.approx(
-        1
-    )
+    assert system.index([Description({"descriptor": found})]).score([system.describe(FRAME)])[0, 0] == pytest.approx(1)
 
 
 HALVES = (slice(0, 114), slice(114, 227))

@@ -114,7 +114,7 @@ CENTERS = RANDOM.standard_normal((WORDS, DEPTH)).astype(np.float32)
 BIASES = RANDOM.standard_normal(WORDS).astype(np.float32)
 WHITENING = RANDOM.standard_normal((VALUES, WORDS, DEPTH)).astype(np.float32)
 WHITENED = RANDOM.standard_normal(VALUES).astype(np.float32)
-PICTURE = blocks(480, 640)
+FRAME = blocks(480, 640)
 
 MATCONVNET_MEAN = (123.68, 116.779, 103.939)
 
@@ -125,8 +125,8 @@ def told_by_hand(
     biases: Array | None = None,
     whitened: bool = False,
 ) -> Array:
-    """The vector of ``PICTURE`` by a network that hands its maps on, with the sign of conv5_3 changed."""
-    maps = plain_maps(PICTURE[:, :, ::-1], mean, last=-1)
+    """The vector of ``FRAME`` by a network that hands its maps on, with the sign of conv5_3 changed."""
+    maps = plain_maps(FRAME[:, :, ::-1], mean, last=-1)
     if deviation is not None:
         maps /= np.array(deviation, np.float32)[:, None, None]
     features = maps.reshape(DEPTH, -1).T.astype(np.float64)
@@ -183,7 +183,7 @@ def vlad_core(biased: bool = False) -> dict[str, Any]:
 
 def describe(path: Path) -> Array:
     system = NetVlad(ABOUT, *load_netvlad(path))
-    description = system.describe(PICTURE)
+    description = system.describe(FRAME)
     assert set(description.milliseconds) == {"forward", "vlad"}
     assert system.identity.startswith("netvlad@")
     return np.asarray(description.arrays["descriptor"])

@@ -20,17 +20,20 @@ def encoder() -> Encoder:
     return EncoderCatalogue().get("region-vlad")
 
 
-def test_runs_take_turns_and_the_warm_up_does_not_count() -> None:
+def test_runs_take_turns_and_the_warm_up_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
+    now = 0.0
 
-    def first() -> None:
-        order.append("a")
-        time.sleep(0.2 if len(order) == 1 else 0.02)
+    def takes(name: str, seconds: float) -> None:
+        nonlocal now
+        order.append(name)
+        now += 10 * seconds if len(order) <= 2 else seconds
 
-    times = medians({"a": first, "b": lambda: order.append("b")}, rounds=3, warm_up=1)
-    assert order == ["a", "b"] * 4
-    assert 20 <= times["a"] < 190
-    assert times["b"] < times["a"]
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    times = medians({"a": lambda: takes("a", 2), "b": lambda: takes("b", 1)}, rounds=1, warm_up=1)
+    monkeypatch.undo()
+    assert order == ["a", "b"] * 2
+    assert times == pytest.approx({"a": 2000, "b": 1000})
 
 
 def test_the_bare_passes_compute_what_the_encoder_computes(encoder: Encoder) -> None:
