@@ -24,13 +24,12 @@ needs_strace = pytest.mark.skipif(strace() is None, reason="strace is not instal
 
 @pytest.fixture(scope="module")
 def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StorageProcesses]:
-    with StorageProcesses(tmp_path_factory.mktemp("processes")) as processes:
+    with StorageProcesses(tmp_path_factory.mktemp("processes"), WORKERS) as processes:
         yield processes
 
 
-def test_storage_killed_at_random_moments_loses_nothing(tmp_path: Path) -> None:
-    with StorageProcesses(tmp_path, WORKERS) as processes:
-        tally = StorageKills(tmp_path, SEED).run(processes, 8)
+def test_storage_killed_at_random_moments_loses_nothing(tmp_path: Path, processes: StorageProcesses) -> None:
+    tally = StorageKills(tmp_path, SEED).run(processes, 8)
     assert tally.kills == 8
     assert tally.operations > 40
 
