@@ -1,4 +1,4 @@
-"""Who is let in: every way in, with every kind of key, in this process and over the wire."""
+"""Access control: every route with every kind of key, in this process and over the network."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> 
         await service.request("POST", "/v1/maps", json={"id": "lab"})
 
 
-# Web pages, where there are no keys
+# Web pages, while there are no keys
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> 
         ({"Host": "localhost:8000", "Origin": "http://localhost:3000"}, 403),
     ],
 )
-def test_pages_of_elsewhere_are_refused_without_keys(
+def test_pages_of_other_sites_are_refused_without_keys(
     client: httpx.Client, headers: dict[str, str], status: int
 ) -> None:
     response = client.get("/v1/maps?limit=1", headers=headers)
@@ -194,7 +194,7 @@ def test_pages_of_elsewhere_are_refused_without_keys(
         assert client.get("/livez", headers=headers).status_code == 200
 
 
-def test_a_page_of_elsewhere_gets_no_stream(server: Server, traverse: str) -> None:
+def test_a_page_of_another_site_gets_no_stream(server: Server, traverse: str) -> None:
     there = f"ws://127.0.0.1:{server.port}/v1/maps/{traverse}/sessions/s-0/stream"
     with pytest.raises(InvalidStatus) as refused, connect(there, origin=Origin("http://evil.example")):
         pass
