@@ -1,25 +1,25 @@
-"""What asking for a key costs each request.
+"""How much time the check of keys adds to each request.
 
     python -m benchmarks.access
 
 The layer of ``service.access.gate`` alone, around an application that does nothing: the time of a request through it
-less that of one without it, with the headers that a robot sends.  Who asks, the rate, the role and the map are
+less that of one without it, with the headers that a robot sends.  The key, the rate, the role and the map are
 all checked.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+import typer
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from benchmarks.report import report
 from service.access.gate import Access, endpoints_of
 from service.access.keys import KeyStore
 from service.app.application import create_app
@@ -96,16 +96,17 @@ async def measure(folder: Path) -> dict[str, float]:
 
 
 def main() -> None:
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--json", type=Path, help="write the figures")
-    given = words.parse_args()
+    """Measure, print a table and write JSON."""
     with tempfile.TemporaryDirectory() as folder:
         found = asyncio.run(measure(Path(folder)))
-    for name, microseconds in found.items():
-        print(f"{name:35} {microseconds:6.1f} µs")
-    if given.json is not None:
-        given.json.write_text(json.dumps(found, indent=2) + "\n")
+    report(
+        "access",
+        "What the access layer adds to a request",
+        ["request", "µs"],
+        list(found.items()),
+        {"microseconds": found},
+    )
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -13,7 +13,8 @@ import torch
 import typer
 
 from benchmarks.report import report, verdict
-from core.evaluation.timing import better_forward, encoding_runs, jpeg, medians, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
+from core.evaluation.timing import better_forward, encoding_runs, medians
 from core.frames.images import decode
 from core.frames.preprocessing import contrast, prepare
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -56,16 +57,16 @@ def stage_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], object]]
 
 def main(
     encoder: str = DEFAULT_ENCODER,
-    image: Annotated[Path | None, typer.Option(help="Default: a picture made here.")] = None,
+    image: Annotated[Path | None, typer.Option(help="Default: a sample frame.")] = None,
     rounds: Annotated[int, typer.Option(min=3)] = 60,
     threads: Annotated[int, typer.Option(min=0, help="0: every core.")] = 0,
 ) -> None:
     """Medians of interleaved runs."""
     configure_malloc()  # as the service does
     share_cores(threads or cores())
-    data = jpeg(sample_picture()) if image is None else image.read_bytes()
+    data = jpeg(sample_frame()) if image is None else image.read_bytes()
     chosen = EncoderCatalogue().get(encoder)
-    frames = [sample_picture(seed) for seed in range(TOGETHER)]
+    frames = [sample_frame(seed) for seed in range(TOGETHER)]
     together = f"encode_batch, each of {TOGETHER}"
     runs = encoding_runs(chosen, data)
     passes = {name: run for name, run in runs.items() if name not in ("encode", "decode", "regions")}

@@ -27,10 +27,10 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.fleet import Fleet, Picture, Plan, Seen
+from benchmarks.fleet import Fleet, Plan, Scene, Seen
 from benchmarks.process import service
 from benchmarks.report import report, verdict
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 
 MAP = "endurance"
 SAMPLE_SECONDS = 5.0
@@ -89,21 +89,21 @@ def size_of(path: Path) -> int:
         return 0
 
 
-def draw(number: int) -> Picture:
-    """A picture, and the same a little darker and as another file."""
-    drawn = sample_picture(number)
+def draw(number: int) -> Scene:
+    """A sample frame, and the same a little darker and as another file."""
+    drawn = sample_frame(number)
     darker: NDArray[np.uint8] = cv2.convertScaleAbs(drawn, alpha=0.85)  # type: ignore[assignment]
-    return Picture(jpeg(drawn, 85), jpeg(darker, 75))
+    return Scene(jpeg(drawn, 85), jpeg(darker, 75))
 
 
-def enrol_fixed(client: httpx.Client, pictures: list[Picture]) -> None:
+def enrol_fixed(client: httpx.Client, scenes: list[Scene]) -> None:
     """The places that stay, one multipart form after the other."""
-    for start in range(0, len(pictures), 32):
-        names = [f"fixed-{start + offset:05d}" for offset in range(len(pictures[start : start + 32]))]
+    for start in range(0, len(scenes), 32):
+        names = [f"fixed-{start + offset:05d}" for offset in range(len(scenes[start : start + 32]))]
         entries = json.dumps([{"id": name, "file": name, "sequence": "fixed"} for name in names]).encode()
         files: list[tuple[str, Any]] = [("places", (None, entries, "application/json"))]
         for offset, name in enumerate(names):
-            files.append((name, (name, pictures[start + offset].enrolled, "image/jpeg")))
+            files.append((name, (name, scenes[start + offset].enrolled, "image/jpeg")))
         response = client.post(f"/v1/maps/{MAP}/places", files=files)
         response.raise_for_status()
         assert all(item["status"] == 201 for item in response.json()["items"])
@@ -184,7 +184,7 @@ def main(
     places: Annotated[int, typer.Option(min=16, help="That stay; those that come and go are about 400 more.")] = 500,
 ) -> None:
     """Measure, and end with 1 if a bar is missed."""
-    pictures = [draw(number) for number in range(places + 300 * operators)]
+    scenes = [draw(number) for number in range(places + 300 * operators)]
     strangers = [draw(100_000 + number).seen for number in range(60)]
     fixed = {f"fixed-{number:05d}": number for number in range(places)}
     settings = {"EXPORT_SECONDS": 30}  # a moment that was exported keeps its files for so long
@@ -194,9 +194,9 @@ def main(
     ):
         client = process.client
         client.post("/v1/maps", json={"id": MAP}).raise_for_status()
-        enrol_fixed(client, pictures[:places])
+        enrol_fixed(client, scenes[:places])
         exports = "/v1/maps/{map}/export" in client.get("/openapi.json").json()["paths"]
-        plan = Plan(str(client.base_url), MAP, pictures, strangers, fixed, robots, operators, rate, enrol_rate)
+        plan = Plan(str(client.base_url), MAP, scenes, strangers, fixed, robots, operators, rate, enrol_rate)
         fleet = Fleet(plan)
         watch = Watch(process.pid, Path(text) / "data", fleet)
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.filters [--places 100000] [--rounds 15] [--keep FOLDER]
 
-The map is written through the storage, of descriptors mixed from those of real pictures (``benchmarks.process``), and
+The map is written through the storage, of descriptors mixed from those of sample frames, and
 every place has a pose, a heading, a time, a sequence and metadata.  Measured is all that a query takes after its
 encoding (what may be found, search, second stage, verdict, look-up), for every kind of filter in turn, so that all see
 the same machine; told are medians, and that of the ratio to the same query unfiltered.  ``--keep`` is where the map
@@ -22,14 +22,14 @@ import numpy as np
 import typer
 
 from benchmarks.opening import built
-from benchmarks.process import descriptors, fill_map, median
+from benchmarks.process import median
 from benchmarks.report import report, verdict
-from core.evaluation.timing import sample_picture
+from core.evaluation.samples import fill_map, sample_descriptors, sample_frame
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
-from core.recognition.localization import locate
-from core.recognition.selection import EVERYTHING, Selection
+from core.recognition.recognition import locate
+from core.recognition.selection import WHOLE_MAP, Selection
 from core.storage import Atlas, Map
 from service.queries.filters import FilterParameters
 
@@ -77,9 +77,9 @@ def selections(places: int) -> dict[str, Selection | None]:
 
 
 def queries(encoder: Encoder, count: int) -> list[Encoding]:
-    """Of mixed pictures that are in no map."""
-    template = encoder.encode(sample_picture(0))
-    made = list(descriptors(encoder, 61 + count, seed=99))[-count:]
+    """Encodings of mixed frames that are in no map."""
+    template = encoder.encode(sample_frame(0))
+    made = list(sample_descriptors(encoder, 61 + count, seed=99))[-count:]
     return [Encoding(descriptor, local, template.regions, template.milliseconds) for descriptor, local in made]
 
 
@@ -94,11 +94,11 @@ def measured(map_: Map, encoder: Encoder, rounds: int) -> dict[str, dict[str, fl
         for _ in range(TRIES):
             for name, selection in kinds.items():
                 began = time.perf_counter()
-                choice = selection.choice(map_, snapshot) if selection else EVERYTHING
+                scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
                 chosen = time.perf_counter()
                 locate(map_, encoder, [encoding], 5, selection)
                 tries[name].append((1e3 * (time.perf_counter() - chosen), 1e3 * (chosen - began)))
-                shares[name] = 1.0 if choice.allowed is None else float(choice.allowed.mean())
+                shares[name] = 1.0 if scope.allowed is None else float(scope.allowed.mean())
         for name, found in tries.items():
             fastest, choosing_it = min(found[1:])  # the first one reads what is not in the system's cache
             times[name].append(fastest)

@@ -2,7 +2,7 @@
 
 Standard library and bytes made beforehand, like :mod:`service.commands.load`, but every answer is read and judged: a
 place that was enrolled before a frame was sent, and whose deletion was not begun before the answer came, must be the
-best match of its own picture; one whose deletion was acknowledged before the frame was sent must not occur at all.
+best match of its own scene; one whose deletion was acknowledged before the frame was sent must not occur at all.
 
 Robots keep to a timetable.  What an answer took counts from the moment when its frame was due, so that a robot that had
 to wait for the answer before does not hide the wait.
@@ -33,7 +33,7 @@ NEVER = float("inf")
 class Enrolled:
     """What is known of one place: when its enrolment was acknowledged, its deletion begun and acknowledged."""
 
-    picture: int
+    scene: int
     since: float = NEVER
     leaving: float = NEVER
     gone: float = NEVER
@@ -49,8 +49,8 @@ class Traverse:
 
 
 @dataclass
-class Picture:
-    """A picture to enrol, and how a robot sees the same place later."""
+class Scene:
+    """Two JPEG files of one place: the one to enrol, and how a robot sees it later."""
 
     enrolled: bytes
     seen: bytes
@@ -62,12 +62,12 @@ class Plan:
 
     rate: frames a second of each robot; 0: the next as soon as the last is answered.
     enrol_rate: frames a second of each operator.
-    fixed: places that are never deleted, by id, with the number of their picture.
+    fixed: places that are never deleted, by id, with the number of their scene.
     """
 
     url: str
     map_id: str
-    pictures: list[Picture]
+    scenes: list[Scene]
     strangers: list[bytes]
     fixed: dict[str, int]
     robots: int = 16
@@ -165,12 +165,12 @@ class Fleet:
     def __init__(self, plan: Plan) -> None:
         """Nobody works yet."""
         self.plan, self.seen = plan, Seen()
-        self.places = {place: Enrolled(picture, since=0.0) for place, picture in plan.fixed.items()}
-        self.of_picture: dict[int, str] = {picture: place for place, picture in plan.fixed.items()}
+        self.places = {place: Enrolled(scene, since=0.0) for place, scene in plan.fixed.items()}
+        self.of_scene: dict[int, str] = {scene: place for place, scene in plan.fixed.items()}
         self.until = NEVER
         self.unsent = 0
         """Frames that were due and could not be sent in time."""
-        self._free = deque(n for n in range(len(plan.pictures)) if n not in self.of_picture)
+        self._free = deque(n for n in range(len(plan.scenes)) if n not in self.of_scene)
         self._traverses: dict[int, list[Traverse]] = {n: [] for n in range(plan.operators)}
         self._serial = count()
         self._root = f"/v1/maps/{plan.map_id}"
@@ -223,21 +223,21 @@ class Fleet:
                 if plan.rate:
                     self.unsent += round(max(0.0, self.until - due) * plan.rate)
                 return
-            choice = (turn * 7 + number * 13) % (len(plan.pictures) + len(plan.strangers))
-            if choice < len(plan.pictures):
-                await self._ask(line, due, choice, plan.pictures[choice].seen)
+            choice = (turn * 7 + number * 13) % (len(plan.scenes) + len(plan.strangers))
+            if choice < len(plan.scenes):
+                await self._ask(line, due, choice, plan.scenes[choice].seen)
             else:
-                await self._ask(line, due, None, plan.strangers[choice - len(plan.pictures)])
+                await self._ask(line, due, None, plan.strangers[choice - len(plan.scenes)])
 
-    async def _ask(self, line: Connection, due: float, picture: int | None, data: bytes) -> None:
+    async def _ask(self, line: Connection, due: float, scene: int | None, data: bytes) -> None:
         sent = time.perf_counter()
-        wanted = None if picture is None else self.of_picture.get(picture)
+        wanted = None if scene is None else self.of_scene.get(scene)
         status, body = await line.request("POST", f"{self._root}/query?k=5", data)
         if not self.seen.note("query", due, status, (200,), body):
             return
         answer, now = json.loads(body), time.perf_counter()
         matches = [match["place"]["id"] for match in answer["matches"]]
-        self.seen.verdicts[("stranger " if picture is None else "place ") + answer["verdict"]] += 1
+        self.seen.verdicts[("stranger " if scene is None else "place ") + answer["verdict"]] += 1
         for found in matches:
             if found not in self.places:
                 self.seen.complaints[f"query: {found} was never enrolled"] += 1
@@ -246,7 +246,7 @@ class Fleet:
         if wanted is not None and self.places[wanted].since < sent and now < self.places[wanted].leaving:
             self.seen.verdicts["known places"] += 1
             if matches[:1] != [wanted]:
-                self.seen.complaints["query: an enrolled place is not the best match of its picture"] += 1
+                self.seen.complaints["query: an enrolled place is not the best match of its scene"] += 1
 
     # Operators
 
@@ -271,19 +271,19 @@ class Fleet:
         traverses[-1].places.append(place)
         return place, traverses[-1].name
 
-    def _picture_of(self, place: str) -> bytes:
-        data = self.plan.pictures[self.places[place].picture].enrolled
+    def _scene_of(self, place: str) -> bytes:
+        data = self.plan.scenes[self.places[place].scene].enrolled
         # A comment behind the first marker makes it another file each time.
         return data[:2] + b"\xff\xfe" + (2 + len(place)).to_bytes(2) + place.encode() + data[2:]
 
     def _is_in(self, place: str) -> None:
         self.places[place].since = time.perf_counter()
-        self.of_picture[self.places[place].picture] = place
+        self.of_scene[self.places[place].scene] = place
 
     async def _enrol_one(self, line: Connection, number: int, due: float) -> None:
         place, sequence = self._next_place(number)
         status, body = await line.request(
-            "PUT", f"{self._root}/places/{place}?sequence={sequence}", self._picture_of(place)
+            "PUT", f"{self._root}/places/{place}?sequence={sequence}", self._scene_of(place)
         )
         if self.seen.note("enrol one", due, status, (201,), body):
             self._is_in(place)
@@ -292,7 +292,7 @@ class Fleet:
         new = [self._next_place(number) for _ in range(size)]
         entries = [{"id": place, "file": place, "sequence": sequence} for place, sequence in new]
         parts = [_part("places", "application/json", json.dumps(entries).encode())]
-        parts += [_part(place, "image/jpeg", self._picture_of(place), place) for place, _ in new]
+        parts += [_part(place, "image/jpeg", self._scene_of(place), place) for place, _ in new]
         form = b"".join(parts) + b"--fleet--\r\n"
         kind = "multipart/form-data; boundary=fleet"
         status, body = await line.request("POST", f"{self._root}/places", form, kind)
@@ -329,7 +329,7 @@ class Fleet:
         if self.seen.note(kind, due, status, (200, 204), body):
             for one in known:
                 one.gone = time.perf_counter()
-                self._free.append(one.picture)
+                self._free.append(one.scene)
 
     # Housekeeping
 
@@ -339,7 +339,7 @@ class Fleet:
             ("list", "GET", "places?limit=500", b"", (200,)),
             ("read", "GET", "", b"", (200,)),
             ("verify", "POST", "verify", b"", (200,)),
-            ("no picture", "POST", "query", b"\xff\xd8 no picture", (415, 422)),
+            ("no image", "POST", "query", b"\xff\xd8 no image", (415, 422)),
             ("no place", "GET", "places/nobody", b"", (404,)),
             ("no place to delete", "DELETE", "places/nobody", b"", (404,)),
         ]

@@ -1,4 +1,4 @@
-"""The frames that the service is measured with, in the size of a robot's camera."""
+"""Frames to measure with: those of a robot's camera, and folders of them encoded."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.frames.traverses import find_images
+from core.method.encoder import Encoder, Encoding
 
 WIDTH, HEIGHT = 640, 480
+BATCH = 8
 REAL = Path(__file__).parents[2] / "shared" / "datasets" / "eval" / "lip6_outdoor"
 
 
@@ -19,12 +21,12 @@ def camera_frames(count: int, traverse: str = "query") -> tuple[list[bytes], str
     """So many JPEG files of 640 x 480, and what they are: those of lip6_outdoor enlarged, or drawn where it is not.
 
     Args:
-        traverse: ``query`` or ``reference``; drawn pictures differ between the two as well.
+        traverse: ``query`` or ``reference``; sample frames differ between the two as well.
     """
     folder = REAL / traverse
     if not folder.is_dir():
         first = 0 if traverse == "query" else 10_000
-        return [jpeg(sample_picture(first + index, WIDTH, HEIGHT)) for index in range(count)], "drawn pictures"
+        return [jpeg(sample_frame(first + index, WIDTH, HEIGHT)) for index in range(count)], "sample frames"
     paths = find_images(folder)
     made = []
     for index in range(count):
@@ -32,3 +34,10 @@ def camera_frames(count: int, traverse: str = "query") -> tuple[list[bytes], str
         large = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
         made.append(jpeg(np.asarray(large, np.uint8)))
     return made, "lip6_outdoor, enlarged"
+
+
+def encode_folder(encoder: Encoder, folder: Path) -> list[Encoding]:
+    """The encodings of all images of a folder, in natural order."""
+    frames = [decode(path.read_bytes()) for path in find_images(folder)]
+    batches = (frames[start : start + BATCH] for start in range(0, len(frames), BATCH))
+    return [encoding for batch in batches for encoding in encoder.encode_batch(batch)]

@@ -2,7 +2,7 @@
 
     python -m benchmarks.opening [--places 100000] [--precision half] [--keep FOLDER]
 
-The map is written through the storage, of descriptors mixed from those of real pictures (``benchmarks.process``), and
+The map is written through the storage, of descriptors mixed from those of sample frames, and
 what it is searched by is built as the service would.  Then a service is started on it and asked once, from a cold
 cache of the system as far as it lets us; and a process of its own opens it and searches, with and without a filter.
 ``--keep`` is where the map lies, used again when it is there already.
@@ -23,9 +23,9 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.process import ROOT, fill_map, median, service
+from benchmarks.process import ROOT, median, memory, service
 from benchmarks.report import report, verdict
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import fill_map, jpeg, sample_frame
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.storage import Atlas, Map, NewPrecision
 
@@ -70,24 +70,19 @@ def forget_cached(folder: Path) -> None:
 
 def first_query(folder: Path) -> dict[str, float]:
     """Seconds from the start of a service to its first answer from the map."""
-    picture = jpeg(sample_picture(3))
+    frame = jpeg(sample_frame(3))
     with service(folder) as process:
         began = time.monotonic()
-        answer = process.client.post(f"/v1/maps/{MAP}/query", content=picture, headers={"Content-Type": "image/jpeg"})
+        answer = process.client.post(f"/v1/maps/{MAP}/query", content=frame, headers={"Content-Type": "image/jpeg"})
         answer.raise_for_status()
         asked = time.monotonic() - began
         return {"ready": process.ready, "query": asked, "together": process.ready + asked}
 
 
-def resident() -> int:
-    """Bytes of this process in memory."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
 def searched(folder: Path) -> dict[str, float]:
     """Open the map in this process and search it."""
     atlas = Atlas(folder)
-    before, began = resident(), time.monotonic()
+    before, began = memory(os.getpid()), time.monotonic()
     map_ = atlas.get(MAP)
     opened = time.monotonic() - began
     snapshot, random = map_.snapshot(), np.random.default_rng(1)
@@ -100,7 +95,7 @@ def searched(folder: Path) -> dict[str, float]:
             began = time.perf_counter()
             snapshot.search(query, mask)
             times[name].append(1e3 * (time.perf_counter() - began))
-    taken = (resident() - before) / len(snapshot)
+    taken = 1e6 * (memory(os.getpid()) - before) / len(snapshot)
     built(map_)
     atlas.close()
     found = {f"search_{name}": median(values) for name, values in times.items()}

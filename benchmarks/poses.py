@@ -9,83 +9,55 @@ that are recognized within REACH metres of that: a wrong place is not the estima
 
 from __future__ import annotations
 
-import csv
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
+from benchmarks.frames import encode_folder
 from benchmarks.report import report
-from core.frames.images import decode
-from core.frames.traverses import find_images
-from core.judgement.examination import examine
-from core.judgement.position import PoseEstimate, estimate_pose
-from core.judgement.priors import log_odds_per_score
-from core.judgement.verdict import METRIC, Neighborhood, Whereabouts, judge
+from core.evaluation.samples import write_map
+from core.frames.traverses import read_ground_truth
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
+from core.places import PlaceFields, Pose
+from core.recognition.recognition import Answer, locate
+from core.storage import Atlas
 
 REACH = 15
-NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
-BATCH = 8
 
 
-def encode(encoder: Encoder, folder: Path) -> list[Encoding]:
-    """The frames of a folder in order."""
-    frames = [decode(path.read_bytes()) for path in find_images(folder)]
-    return [
-        one for start in range(0, len(frames), BATCH) for one in encoder.encode_batch(frames[start : start + BATCH])
-    ]
-
-
-def true_references(path: Path) -> dict[int, list[int]]:
-    """By query."""
-    found: dict[int, list[int]] = {}
-    with path.open() as file:
-        for row in csv.DictReader(file):
-            found.setdefault(int(row["query"]), []).append(int(row["reference"]))
+def answers(encoder: Encoder, queries: list[Encoding], places: list[Encoding]) -> list[Answer]:
+    """The answers of a map on which place i stands at i metres."""
+    with tempfile.TemporaryDirectory() as folder:
+        described = ((place.descriptor, place.local) for place in places)
+        write_map(Path(folder), "poses", encoder, described, fields=lambda index: PlaceFields(pose=Pose(x=index, y=0)))
+        atlas = Atlas(Path(folder))
+        found = locate(atlas.get("poses"), encoder, queries, 1)
+        atlas.close()
     return found
-
-
-def answered(encoder: Encoder, query: Encoding, places: list[Encoding]) -> tuple[int, PoseEstimate] | None:
-    """The best match and the estimate; None unless the query is recognized."""
-    n = len(places)
-    along = np.column_stack([np.arange(n), np.zeros((n, 2))]).astype(np.float64)
-    whereabouts = Whereabouts(np.full(n, METRIC, np.int8), along, np.zeros(n, np.int32), np.arange(n))
-    products = np.stack([place.descriptor for place in places]) @ query.descriptor
-    scores = encoder.scores_from_inner_products(products)
-    first = np.argsort(-scores, kind="stable")
-    found = examine(
-        scores[first],
-        whereabouts.take(first),
-        NEIGHBORHOOD,
-        encoder.candidates,
-        lambda ahead: encoder.agreement(query.local, np.stack([places[row].local for row in first[ahead]])),
-    )
-    ranked = whereabouts.take(first[found.order])
-    calibration = encoder.calibration
-    if judge(found.scores, ranked, calibration, NEIGHBORHOOD, found.examined).verdict != "recognized":
-        return None
-    steepness = log_odds_per_score(calibration, encoder.candidates > 0)
-    estimate = estimate_pose(ranked, steepness * found.scores.astype(np.float64), NEIGHBORHOOD.radius)
-    assert estimate is not None
-    return int(first[found.order[0]]), estimate
 
 
 def main(folder: Annotated[Path, typer.Argument()]) -> None:
     """Measure, print a table and write JSON."""
     encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
-    queries, places = (encode(encoder, folder / name) for name in ("query", "ref"))
+    queries, places = (encode_folder(encoder, folder / name) for name in ("query", "ref"))
     errors: dict[str, list[float]] = {"best match": [], "estimate": []}
     spreads: list[float] = []
-    for index, references in true_references(folder / "ground_truth.csv").items():
-        found = answered(encoder, queries[index], places)
-        if found is None or abs(found[0] - (middle := float(np.mean(references)))) > REACH:
+    truth = read_ground_truth(folder / "ground_truth.csv", len(queries), len(places))
+    for found, references in zip(answers(encoder, queries, places), truth, strict=True):
+        if not len(references) or found.judgement.verdict != "recognized" or found.pose is None:
             continue
-        errors["best match"].append(abs(found[0] - middle))
-        errors["estimate"].append(abs((found[1].pose.x or 0.0) - middle))
-        spreads.append(found[1].spread)
+        middle = float(np.mean(references))
+        best = found.matches[0][1].pose
+        assert best is not None and best.x is not None
+        if abs(best.x - middle) > REACH:
+            continue
+        errors["best match"].append(abs(best.x - middle))
+        errors["estimate"].append(abs((found.pose.pose.x or 0.0) - middle))
+        spreads.append(found.pose.spread)
     within = np.array(errors["estimate"]) <= 2 * np.array(spreads)
     figures = {
         name: {"rms": float(np.sqrt(np.mean(np.square(values)))), "mean": float(np.mean(values))}

@@ -1,6 +1,6 @@
 """What keeping descriptors in fewer bits costs: AUC-PR of both stages, by how a map keeps what it searches.
 
-    python -m benchmarks.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz] [--json OUT.json]
+    python -m benchmarks.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz]
 
 Queries are never kept and stay float32; references go through the storage's own packing and back.  ``first`` is
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another
@@ -9,17 +9,17 @@ reference is the best, and ``deviation`` by how much a first-stage score differs
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
-from typing import get_args
+from typing import Annotated, get_args
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from core.evaluation import auc_pr
-from core.frames.images import decode
-from core.frames.traverses import find_images, read_ground_truth
+from benchmarks.frames import encode_folder
+from benchmarks.report import report
+from core.frames.traverses import Truth, read_ground_truth
+from core.judgement.curves import auc_pr
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
@@ -27,15 +27,10 @@ from core.storage.files.row_formats import Precision, pack_descriptors, pack_loc
 Side = tuple[NDArray[np.float32], NDArray[np.int8]]
 """Descriptors float32 [n, D] and local descriptors int8 [n, C, L]."""
 
-_BATCH = 8
-
 
 def encoded(encoder: Encoder, folder: Path) -> Side:
     """All frames of a folder."""
-    paths = find_images(folder)
-    encodings = []
-    for start in range(0, len(paths), _BATCH):
-        encodings += encoder.encode_batch([decode(path.read_bytes()) for path in paths[start : start + _BATCH]])
+    encodings = encode_folder(encoder, folder)
     return np.stack([one.descriptor for one in encodings]), np.stack([one.local for one in encodings])
 
 
@@ -61,44 +56,46 @@ def at_rest(side: Side, precision: Precision) -> tuple[Side, int]:
     return back, kept[0].nbytes + kept_local[0].nbytes
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("queries", type=Path)
-    parser.add_argument("references", type=Path)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("--encoder", default=DEFAULT_ENCODER)
-    parser.add_argument("--cache", type=Path)
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    encoder = EncoderCatalogue().get(options.encoder)
-    asked, known = sides(encoder, options.queries, options.references, options.cache)
-    truth = read_ground_truth(options.truth, len(asked[0]), len(known[0]))
+def main(
+    queries: Path,
+    references: Path,
+    truth_file: Annotated[Path, typer.Argument(metavar="TRUTH.csv")],
+    encoder: str = DEFAULT_ENCODER,
+    cache: Annotated[Path | None, typer.Option(help="Where encoded frames are kept, .npz.")] = None,
+) -> None:
+    """Measure, print a table and write JSON."""
+    chosen = EncoderCatalogue().get(encoder)
+    asked, known = sides(chosen, queries, references, cache)
+    truth = read_ground_truth(truth_file, len(asked[0]), len(known[0]))
     figures: dict[str, dict[str, float]] = {}
     exact_first = exact_best = None
-    print(f"{'precision':12} {'bytes':>7} {'first':>8} {'both':>8} {'changed':>8} {'deviation':>10}")
     for precision in get_args(Precision):
         back, size = at_rest(known, precision)
-        first = encoder.scores_from_inner_products(asked[0] @ back[0].T)
-        both = encoder.with_agreement(first, asked[1], back[1])
-        areas = []
-        for scores in (first, both):
-            best = scores.argmax(axis=1)
-            right = [int(place) in set(true.tolist()) for place, true in zip(best, truth, strict=True)]
-            areas.append(auc_pr(scores.max(axis=1), right))
+        first = chosen.scores_from_inner_products(asked[0] @ back[0].T)
+        both = chosen.with_agreement(first, asked[1], back[1])
         if exact_first is None or exact_best is None:
             exact_first, exact_best = first, both.argmax(axis=1)
         figures[precision] = {
             "bytes": size,
-            "first": areas[0],
-            "both": areas[1],
+            "first": area(first, truth),
+            "both": area(both, truth),
             "changed": int((both.argmax(axis=1) != exact_best).sum()),
             "deviation": float(np.abs(first - exact_first).max()),
         }
-        print(f"{precision:12} {size:7d} {areas[0]:8.4f} {areas[1]:8.4f} ", end="")
-        print(f"{figures[precision]['changed']:8d} {figures[precision]['deviation']:10.6f}")
-    if options.json is not None:
-        options.json.write_text(json.dumps({"encoder": encoder.identity, "precisions": figures}, indent=2) + "\n")
+    rows = [
+        (name, one["bytes"], f"{one['first']:.4f}", f"{one['both']:.4f}", one["changed"], f"{one['deviation']:.6f}")
+        for name, one in figures.items()
+    ]
+    columns = ["precision", "bytes a place", "first, AUC-PR", "both, AUC-PR", "changed", "deviation"]
+    more = {"encoder": chosen.identity, "precisions": figures}
+    report("precision", f"{len(asked[0])} queries, {len(known[0])} references", columns, rows, more)
+
+
+def area(scores: NDArray[np.float32], truth: Truth) -> float:
+    """AUC-PR of the best matches; scores [Q, R]."""
+    right = [bool(np.isin(place, true)) for place, true in zip(scores.argmax(axis=1), truth, strict=True)]
+    return auc_pr(scores.max(axis=1), right)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -12,7 +12,8 @@ import typer
 
 from benchmarks.reference_regions import reference_regions
 from benchmarks.report import report, verdict
-from core.evaluation.timing import medians, sample_picture
+from core.evaluation.samples import sample_frame
+from core.evaluation.timing import medians
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.features import FeatureExtractor
 from core.method.regions import extract_regions
@@ -29,7 +30,7 @@ def main(
     extractor: FeatureExtractor = EncoderCatalogue().get(encoder).extractor
     definition = extractor.definition
     # What the encoder's second stage alone compares stands behind the layers that regions come from.
-    layers = extractor.activations([sample_picture()])[0][: len(definition.layers)]
+    layers = extractor.activations([sample_frame()])[0][: len(definition.layers)]
     planes = [np.ascontiguousarray(layer.transpose(2, 0, 1)) for layer in layers]
     steps = definition.steps if step is None else (step,) * len(layers)
 

@@ -1,6 +1,6 @@
 """How long one query takes against a map, and what it finds, by the number of places and the tier.
 
-    python -m benchmarks.search [--places 1000 10000 100000] [--rounds 30] [--queries 1040] [--keep FOLDER]
+    python -m benchmarks.search [--places 1000 --places 10000] [--rounds 30] [--queries 1040] [--keep FOLDER]
     python -m benchmarks.search --million --keep FOLDER    # up to 1M places: a long run, 20 GB of disk
 
 Maps are written through the storage (``core.storage``), of real places and distractors synthesized from real

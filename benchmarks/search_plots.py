@@ -1,6 +1,6 @@
 """Figures for the documents: cost against map size, and how like real places the distractors are.
 
-    python -m benchmarks.search_plots [--output docs]
+    python -m benchmarks.search_plots [--output docs/figures]
 
 ``search-cost.png`` shows what ``benchmarks.search`` measured last, with and without ``--million``; the times of the
 second are scaled by the flat search that both runs timed.  ``distractors.png`` is computed: of every
@@ -97,7 +97,7 @@ def histogram(path: Path, of: Material) -> dict[str, list[float]]:
 
 
 def main(
-    output: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("docs"),
+    output: Annotated[Path, typer.Option(help="Folder of the figures.")] = Path("docs/figures"),
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
 ) -> None:

@@ -3,7 +3,7 @@
     python -m benchmarks.sequences --data ../shared/datasets/eval
 
 Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
-training/alignment.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
+training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the
 bar is a recall@1 of 0.9) and corridor.  Every run is causal: a frame's answer knows only the frames before it.
 Nothing is told of the motion, and no map has poses.  Beside it, over 5 000 places with poses, the time that one
 frame's belief takes, against encoding a frame in the same minute.
@@ -21,16 +21,17 @@ from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
 from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, evidence, place_graph
-from core.evaluation.timing import jpeg, medians, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
+from core.evaluation.timing import medians
 from core.frames.images import decode
-from core.judgement.examination import examine
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.recognition.stages import examine
 from core.storage import MapSettings
-from training.alignment import aligned_truth
+from training.ground_truth import corrected_truth
 from training.photographs import find_photographs, read
-from training.validation import Shown, describe
+from training.validation import Encodings, describe
 
 Truth = NDArray[np.bool_]
 
@@ -56,7 +57,7 @@ def walked(count: int) -> Whereabouts:
 
 
 def evidences(
-    encoder: Encoder, queries: Shown, references: Shown, where: Whereabouts
+    encoder: Encoder, queries: Encodings, references: Encodings, where: Whereabouts
 ) -> Iterator[tuple[int, Evidence]]:
     """Of each query in turn: its best reference alone, and what it says of all, both stages as the service has them."""
     for descriptor, local in zip(queries.descriptors, queries.local, strict=True):
@@ -91,7 +92,7 @@ def truths(name: str, folder: Path, queries: list[Any], references: list[Any]) -
     stated[rows[:, 0], rows[:, 1]] = True
     if name != "lip6_outdoor":
         return {"stated": stated}
-    return {"put right": aligned_truth(queries, references, stated), "stated": stated}
+    return {"put right": corrected_truth(queries, references, stated), "stated": stated}
 
 
 def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) -> dict[str, dict[str, Any]]:
@@ -136,7 +137,7 @@ def costs(encoder: Encoder, places: int, rounds: int) -> dict[str, float]:
         "odometry, lag 5": (RunOptions(lag=5), Step(odometry=Odometry(2.0, variance=0.04))),
         "path": (FILTERS["path"], Step()),
     }
-    data = jpeg(sample_picture(7))
+    data = jpeg(sample_frame(7))
     runs: dict[str, Any] = {"encode": lambda: encoder.encode(decode(data))}
     for name, (options, step) in steps.items():
         run, turns = Run(options, graph), iter(range(len(scores)))

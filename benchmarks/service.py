@@ -23,13 +23,14 @@ import torch
 import typer
 
 from benchmarks.frames import camera_frames
-from benchmarks.process import fill_map, median, service
+from benchmarks.process import median, service
 from benchmarks.report import report, verdict
+from core.evaluation.samples import fill_map
 from core.evaluation.timing import encode_batch
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from core.recognition.localization import locate
+from core.recognition.recognition import locate
 from core.storage import Atlas, Map
 from core.threads import cores, share_cores
 from service.commands.load import measure

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from benchmarks.report import report
 from core.evaluation.timing import medians
 from core.index.exact import compare
-from core.judgement.verdict import NO_POSE
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.places import NO_POSE
 from core.storage.files.segment_files import ROWS_PER_SEGMENT
+from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.spots import Spot
 from core.threads import share_cores
 
 Array = NDArray[np.float32]
@@ -40,7 +40,7 @@ def runs(kept: Array, queries: Array) -> dict[str, Callable[[], object]]:
         index.add(kept)
     halves, every = kept.astype(np.float16), np.arange(places)
     empty = Snapshot(dimension, ROWS_PER_SEGMENT, halves=True)
-    snapshot = empty.appended(list(kept), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places)
+    snapshot = empty.appended(list(kept), [Location(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places)
     return {
         "FAISS, float32": lambda: flat.search(queries, places),
         "FAISS, half": lambda: halved.search(queries, places),

@@ -17,7 +17,7 @@ import typer
 
 from benchmarks.process import Process, service
 from benchmarks.report import report, verdict
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 
 READY_LIMIT = 6.0
 MEMORY_LIMIT = 1200.0
@@ -25,14 +25,14 @@ SENDERS = 4
 
 
 def frame(index: int) -> bytes:
-    """A picture for each place: one of 50 scenes, mirrored, cropped and lit in its own way."""
-    picture = sample_picture(index % 50)
+    """The JPEG file of a place: one of 50 sample frames, mirrored, cropped and lit in its own way."""
+    drawn = sample_frame(index % 50)
     random = np.random.default_rng(index)
     top, left = random.integers(0, 100, 2)
-    picture = picture[top : top + 360, left : left + 480]
+    drawn = drawn[top : top + 360, left : left + 480]
     if random.random() < 0.5:
-        picture = picture[:, ::-1]
-    return jpeg(np.asarray(cv2.convertScaleAbs(picture, alpha=float(random.uniform(0.7, 1.2))), np.uint8))
+        drawn = drawn[:, ::-1]
+    return jpeg(np.asarray(cv2.convertScaleAbs(drawn, alpha=float(random.uniform(0.7, 1.2))), np.uint8))
 
 
 def enrol(process: Process, places: int) -> float:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from benchmarks.reference_pipeline import reference_encode
 from benchmarks.report import report, verdict
-from core.evaluation.timing import jpeg, medians, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
+from core.evaluation.timing import medians
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -64,7 +65,7 @@ def main(
 ) -> None:
     """Compare the vectors, then the times."""
     thesis, default = EncoderCatalogue().get(THESIS), EncoderCatalogue().get(DEFAULT_ENCODER)
-    data, coarse = jpeg(sample_picture()), thesis.definition.steps[0]
+    data, coarse = jpeg(sample_frame()), thesis.definition.steps[0]
     words = Words(thesis.centers)
     for step in (coarse, fine):
         a, b = literal(thesis, data, step), ours(thesis, data, step, words)

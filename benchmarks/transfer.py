@@ -1,6 +1,6 @@
 """What a map as a file costs: time and memory of taking a moment, of sending it, of checking and building it.
 
-    python -m benchmarks.transfer [--places 2000 8000] [--folder DIR]
+    python -m benchmarks.transfer [--places 2000 --places 8000] [--folder DIR]
 
 Each size runs in a process of its own on made-up descriptors in the shape of the default encoder's, with thumbnails of
 3 KB.  ``memory`` is the process's peak while it exports and imports, over what it held before.
@@ -8,22 +8,25 @@ Each size runs in a process of its own on made-up descriptors in the shape of th
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
-import resource
-import shutil
+import os
 import tempfile
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
+from benchmarks.process import peak_memory
+from benchmarks.report import report
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from core.storage.archives.building import build
-from core.storage.archives.playback import CHUNK_BYTES
 from core.storage.archives.reading import Archive, check
+from core.storage.archives.virtual_archive import CHUNK_BYTES
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
 BATCH = 64
@@ -39,14 +42,9 @@ def fill(map_: Map, places: int) -> None:
             descriptor /= np.linalg.norm(descriptor)
             local = random.integers(-128, 128, LOCAL, np.int8)
             fields = PlaceFields(pose=Pose(x=number, y=0), sequence="s", timestamp=datetime.now(UTC))
-            picture = random.bytes(3000)
-            items.append(Enrolment(f"p{number}", fields, descriptor, 600, random.bytes(32), local, thumbnail=picture))
+            thumbnail = random.bytes(3000)
+            items.append(Enrolment(f"p{number}", fields, descriptor, 600, random.bytes(32), local, thumbnail=thumbnail))
         map_.enrol(items)
-
-
-def peak() -> float:
-    """The most memory that this process ever held, in MB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def made(folder: Path, places: int) -> None:
@@ -56,16 +54,16 @@ def made(folder: Path, places: int) -> None:
     atlas.close()
 
 
-def measured(folder: Path) -> None:
-    """Export the map, check the file, import it; tell what each took."""
+def measured(folder: Path) -> dict[str, float]:
+    """Export the map, check the file, import it: seconds of each, MB (10^6 bytes) of the file, the disk and memory."""
     atlas, file = Atlas(folder / "data"), folder / "lab.tar"
     lab = atlas.get("lab")
-    before, began = peak(), time.perf_counter()
-    playback = lab.capturing.into(folder / "kept")
+    before, began = peak_memory(os.getpid()), time.perf_counter()
+    virtual = lab.exporter.into(folder / "kept")
     taken = time.perf_counter()
     with file.open("wb") as out:
         position = 0
-        while data := playback.read(position, CHUNK_BYTES):
+        while data := virtual.read(position, CHUNK_BYTES):
             out.write(data)
             position += len(data)
     sent = time.perf_counter()
@@ -75,36 +73,40 @@ def measured(folder: Path) -> None:
         with atlas.building("copy") as unfinished:
             build(archive, unfinished, "copy")
     built = time.perf_counter()
-    mb, kept = playback.size / 1e6, sum(p.stat().st_size for p in playback.folder.iterdir() if p.suffix != ".seg") / 1e6
-    print(
-        f"{lab.count_places()} places, {mb:.0f} MB: taken in {taken - began:.1f} s ({kept:.0f} MB on disk), "
-        f"read in {sent - taken:.1f} s, checked in {checked - sent:.1f} s, built in {built - checked:.1f} s; "
-        f"memory +{peak() - before:.0f} MB",
-        flush=True,
-    )
-    playback.discard()
+    found = {
+        "file": virtual.size / 1e6,
+        "taken": taken - began,
+        "on_disk": sum(path.stat().st_size for path in virtual.folder.iterdir() if path.suffix != ".seg") / 1e6,
+        "read": sent - taken,
+        "checked": checked - sent,
+        "built": built - checked,
+        "memory": peak_memory(os.getpid()) - before,
+    }
+    virtual.discard()
     atlas.close()
+    return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--places", type=int, nargs="+", default=[2000, 8000])
-    parser.add_argument("--folder", type=Path, help="where there is room for three times the map")
-    arguments = parser.parse_args()
-    for places in arguments.places:
-        folder = Path(tempfile.mkdtemp(dir=arguments.folder))
-        try:
-            for work in (made, measured):
-                process = multiprocessing.get_context("spawn").Process(
-                    target=work, args=(folder, places) if work is made else (folder,)
-                )
-                process.start()
-                process.join()
-                if process.exitcode:
-                    raise SystemExit(process.exitcode)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+def main(
+    places: Annotated[list[int] | None, typer.Option(help="Sizes; default 2 000 and 8 000.")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Where there is room for three times the map.")] = None,
+) -> None:
+    """Measure, print a table and write JSON."""
+    figures: dict[int, dict[str, float]] = {}
+    for size in places or [2000, 8000]:
+        with tempfile.TemporaryDirectory(dir=folder) as text:
+            _apart(made, Path(text), size)
+            figures[size] = _apart(measured, Path(text))
+    columns = ["places", "file, MB", "taken, s", "on disk, MB", "read, s", "checked, s", "built, s", "memory, MB"]
+    rows = [(size, *found.values()) for size, found in figures.items()]
+    report("transfer", "A map as a file", columns, rows, {"sizes": figures})
+
+
+def _apart(work: Callable[..., Any], *arguments: object) -> Any:
+    """The result of ``work`` in a process of its own, whose peak of memory is that of this work alone."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(work, arguments)
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

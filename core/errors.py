@@ -1,7 +1,7 @@
 """Every error that the core raises on purpose, one class each.
 
 The core knows no HTTP: the service maps these classes to status codes and stable problem types.
-The text of each error is one plain sentence for the person who reads it.
+The text of each error is one plain sentence for its reader.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class PlacerecError(Exception):
 
 
 class InvalidImage(PlacerecError):
-    """The bytes of a frame cannot be used; base of the classes that say why."""
+    """The bytes of a frame cannot be used; the subclasses say why."""
 
 
 class EmptyImage(InvalidImage):
@@ -23,11 +23,11 @@ class EmptyImage(InvalidImage):
 
 
 class NotAnImage(InvalidImage):
-    """The bytes are not those of any image format, or the codec cannot make pixels of them."""
+    """The bytes are of no image format, or the codec cannot decode them."""
 
 
 class UnsupportedFormat(InvalidImage):
-    """An image, but not JPEG, PNG or WebP."""
+    """The bytes are an image, but not a JPEG, PNG or WebP file."""
 
 
 class TruncatedImage(InvalidImage):
@@ -35,7 +35,7 @@ class TruncatedImage(InvalidImage):
 
 
 class ImageTooLarge(InvalidImage):
-    """More bytes than the limit."""
+    """The image has more bytes than the limit."""
 
 
 class TooManyPixels(InvalidImage):
@@ -58,11 +58,11 @@ class InvalidModel(PlacerecError):
 
 
 class MissingWeights(InvalidModel):
-    """A system needs a weights file that the user has not given, or that is not there."""
+    """A system needs a weights file that the user has not given, or that does not exist."""
 
 
 class WrongVocabulary(InvalidModel):
-    """A vocabulary was trained for other weights, layers, regions or step than it is used with."""
+    """A vocabulary was trained with other weights, layers, regions or quantisation steps than it is used with."""
 
 
 class GoldenMismatch(InvalidModel):
@@ -74,7 +74,7 @@ class UnknownEncoder(PlacerecError):
 
 
 class WrongEncoder(PlacerecError):
-    """The encoder that was named is not the one to which the map is bound."""
+    """The encoder that the caller names is not the map's encoder."""
 
 
 # Maps and places
@@ -93,23 +93,23 @@ class InvalidCursor(PlacerecError):
 
 
 class UnknownMap(PlacerecError):
-    """There is no map of this id."""
+    """There is no map with this id."""
 
 
 class MapExists(PlacerecError):
-    """A map of this id exists already."""
+    """A map with this id exists already."""
 
 
 class UnknownPlace(PlacerecError):
-    """The map has no place of this id."""
+    """The map has no place with this id."""
 
 
 class UnknownSequence(PlacerecError):
-    """The map has no place of this sequence."""
+    """The map has no place in this sequence."""
 
 
 class UnknownCamera(PlacerecError):
-    """The map has no camera of this name."""
+    """The map has no camera with this name."""
 
 
 class NoThumbnail(PlacerecError):
@@ -117,26 +117,26 @@ class NoThumbnail(PlacerecError):
 
 
 class RevisionMismatch(PlacerecError):
-    """The map was changed since the revision that the caller names."""
+    """The map has changed since the revision that the caller names."""
 
 
 class CalibrationImpossible(PlacerecError):
-    """What a map was asked does not tell when to believe its answers: too little, or too hard to tell apart."""
+    """The queries do not suffice for a calibration: they are too few, or right answers look like wrong ones."""
 
 
 # Storage
 
 
 class StorageFull(PlacerecError):
-    """The disk is full; nothing of the write was kept."""
+    """The disk is full; the write was undone."""
 
 
 class StorageFailure(PlacerecError):
-    """The disk refused a read or a write; nothing of the write was kept."""
+    """The disk refused a read or a write; a write was undone."""
 
 
 class MapQuarantined(PlacerecError):
-    """A map is damaged and out of service; the others serve."""
+    """A map is damaged and out of service; other maps are not affected."""
 
 
 class DataDirectoryLocked(PlacerecError):
@@ -151,7 +151,7 @@ class DataDirectoryTooNew(PlacerecError):
 
 
 class InvalidArchive(PlacerecError):
-    """A file is not the export of a map, is cut or damaged, or holds what no map may hold."""
+    """A file is not the export of a map, is incomplete or damaged, or holds what no map may hold."""
 
 
 class ArchiveTooNew(PlacerecError):
@@ -162,12 +162,12 @@ class ArchiveTooNew(PlacerecError):
 
 
 class InvalidTraverse(PlacerecError):
-    """A directory is no traverse: it cannot be read, or holds no image."""
+    """A directory is not a traverse: it cannot be read, or it holds no image."""
 
 
 class InvalidGroundTruth(PlacerecError):
-    """A file that says which references are true, or kept, cannot be used."""
+    """A file that lists true references, or references to keep, cannot be used."""
 
 
 class InvalidResults(PlacerecError):
-    """A file of results, or of similarities, cannot be used."""
+    """A file of results or of similarities cannot be used."""

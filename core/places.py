@@ -1,14 +1,15 @@
-"""What a map remembers of a frame besides its descriptor: id, pose, time, sequence, metadata."""
+"""A place: its id, pose, time, sequence and metadata, and where the places of a map are."""
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core.errors import InvalidIdentifier
@@ -18,11 +19,17 @@ PLACE_ID = r"[A-Za-z0-9][A-Za-z0-9._~-]{0,127}"
 RESERVED_MAP_IDS = frozenset({"import"})
 EARTH_RADIUS = 6_371_008.8  # metres, mean
 
+NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
+"""The kinds of poses in a :class:`Whereabouts`: none, metres in the map's frame, degrees on the Earth."""
+
+NO_TIME = -(1 << 63)
+"""The timestamp of a place without one."""
+
 Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 
 
 def check_map_id(text: str) -> str:
-    """Return ``text`` if it can name a map.
+    """Return ``text`` if it can be the id of a map.
 
     Raises:
         InvalidIdentifier: it cannot.
@@ -33,7 +40,7 @@ def check_map_id(text: str) -> str:
 
 
 def check_place_id(text: str) -> str:
-    """Return ``text`` if it can name a place.
+    """Return ``text`` if it can be the id of a place.
 
     Raises:
         InvalidIdentifier: it cannot.
@@ -74,10 +81,10 @@ class Pose(BaseModel):
         return self
 
     def position(self) -> NDArray[np.float64]:
-        """A 3-vector in metres: x, y, z (0 if absent), or the point on the sphere from its centre.
+        """The position as a vector, float64 [3], in metres: x, y, z (0 if absent), or the point on the Earth's sphere.
 
-        The straight distance between two positions of one kind is the distance of the frames
-        (chord for arc: under 1 mm of error in a kilometre).
+        The distance of two frames with poses of one kind is the Euclidean distance of their positions; on the sphere
+        this takes the chord for the arc, an error of less than 1 mm in a kilometre.
         """
         if self.x is not None and self.y is not None:
             return np.array([self.x, self.y, self.z or 0.0])
@@ -87,12 +94,12 @@ class Pose(BaseModel):
         return EARTH_RADIUS * np.array(unit)
 
     def kind(self) -> Literal["metric", "geographic"]:
-        """Which of the two frames the pose is in."""
+        """Whether the pose is in metres or in degrees."""
         return "metric" if self.x is not None else "geographic"
 
 
 def _utc(moment: datetime) -> datetime:
-    """An instant in UTC; a time without a zone is taken as UTC."""
+    """Convert a time to UTC; one without a zone is taken as UTC."""
     try:
         return moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
     except OverflowError:
@@ -100,7 +107,7 @@ def _utc(moment: datetime) -> datetime:
 
 
 def _written_out(moment: object) -> object:
-    """A time as text has a date in it: a bare number could mean seconds as well as milliseconds, and is refused."""
+    """Refuse a time that is a bare number, which could mean seconds as well as milliseconds."""
     if isinstance(moment, datetime) or (isinstance(moment, str) and _DATE.match(moment)):
         return moment
     raise ValueError("a time is written as in RFC 3339, such as 2026-11-20T10:00:00Z")
@@ -143,3 +150,69 @@ class Place(PlaceFields):
     picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
     created_at: Timestamp
     updated_at: Timestamp
+
+
+@dataclass(frozen=True)
+class Neighborhood:
+    """Two frames show the same place within ``radius`` metres or, without poses, within ``frames`` of a sequence."""
+
+    radius: float
+    frames: int
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where and when the frames of n places were taken, one row for each place.
+
+    kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
+    position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
+    sequence: int32 [n], a code for the sequence's name; places without one share the code -1.
+    ordinal: int64 [n], order of enrolment within the sequence.
+    heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
+    timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
+
+    Heading and timestamp may be left out if none is known.
+    """
+
+    kind: NDArray[np.int8]
+    position: NDArray[np.float64]
+    sequence: NDArray[np.int32]
+    ordinal: NDArray[np.int64]
+    heading: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    timestamp: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def __post_init__(self) -> None:
+        if len(self.heading) < len(self.kind):
+            object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
+        if len(self.timestamp) < len(self.kind):
+            object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def take(self, rows: ArrayLike) -> Whereabouts:
+        """The places ``rows`` (integers or a mask) in that order."""
+        chosen = np.asarray(rows)
+        return Whereabouts(
+            self.kind[chosen],
+            self.position[chosen],
+            self.sequence[chosen],
+            self.ordinal[chosen],
+            self.heading[chosen],
+            self.timestamp[chosen],
+        )
+
+    def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
+        """Which of the places are the same place as ``row``, itself included; bool [n].
+
+        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart.
+        """
+        near = self.sequence == self.sequence[row]
+        near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
+        kind = self.kind[row]
+        if kind != NO_POSE:
+            x, y, z = (self.position - self.position[row]).T
+            distance = np.sqrt(x * x + y * y + z * z)
+            near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
+        near[row] = True
+        return near

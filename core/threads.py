@@ -1,7 +1,7 @@
-"""Threads: those of torch, FAISS, OpenCV and NumPy share the cores, and none holds one while it waits.
+"""How the threads of torch, FAISS, OpenCV and NumPy share the cores.
 
-One frame's forward pass is shared between the cores; all else that is done for a frame takes so little that a
-second thread would cost more than it gains.  Of several frames, each core takes whole ones (:func:`each`).
+The forward pass of a single frame uses all cores; everything else that is done for a frame takes so little time that
+a second thread would cost more than it saves.  Of several frames, each core takes whole ones (:func:`each`).
 """
 
 from __future__ import annotations
@@ -21,32 +21,31 @@ Item = TypeVar("Item")
 Made = TypeVar("Made")
 
 SPINS = "1000"
-"""Turns that an OpenMP thread waits awake for its next work before it sleeps: some ten microseconds."""
+"""How often an idle OpenMP thread polls for work before it sleeps: about ten microseconds."""
 
 
 def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Let OpenMP's threads sleep soon after a parallel section; to be called before torch or FAISS are imported.
+    """Let OpenMP's threads sleep soon after a parallel section; call this before torch or FAISS is imported.
 
-    By default they spin for a millisecond and more.  The search that follows a forward pass then has half the
-    machine, and when other processes want the cores, threads that spin take them from those that are waited for.
-    What the user has set stays.
+    By default they spin for a millisecond and more, and take cores from the search that follows a forward pass and
+    from other processes.  An ``OMP_WAIT_POLICY`` or ``GOMP_SPINCOUNT`` that the user has set stays.
     """
     if "OMP_WAIT_POLICY" not in environment:
         environment.setdefault("GOMP_SPINCOUNT", SPINS)
 
 
 def cores() -> int:
-    """The cores that this process may use."""
+    """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @cache
 def keep_numpy_single_threaded() -> None:
-    """Let NumPy's BLAS compute in the calling thread, from now on, in this process.
+    """Let NumPy's BLAS compute in the calling thread from now on, in this process.
 
-    Waiting for a second thread costs a small product more than it gains, and on a busy machine many
-    times more: the whole takes as long as its latest thread.  torch and FAISS bring libraries of
-    their own, which keep their threads.
+    A second thread costs a small product more time than it saves, and on a busy machine many times more, since the
+    product takes as long as its slowest thread.  torch and FAISS have BLAS libraries of their own, which keep their
+    threads.
     """
     for library in ThreadpoolController().lib_controllers:
         if library.user_api == "blas" and "numpy" in library.filepath:
@@ -54,10 +53,10 @@ def keep_numpy_single_threaded() -> None:
 
 
 def share_cores(threads: int) -> None:
-    """Let torch and FAISS use so many threads each, and OpenCV none of its own, in this process.
+    """Let torch and FAISS use this many threads each, and OpenCV one, in this process.
 
-    Frames are encoded and maps are searched in turn, so each may have all of the cores; OpenCV would only
-    split what takes it a tenth of a millisecond.
+    Encoding and searching take turns, so each may use all of the cores.  OpenCV would only divide work that takes a
+    tenth of a millisecond.
 
     Args:
         threads: at least 1.
@@ -73,11 +72,11 @@ def share_cores(threads: int) -> None:
 
 
 def keep_to(number: int | None) -> None:
-    """Let this thread run on one core of the process's, or on any of them; where the system lets us say so.
+    """Let this thread run on one of the process's cores, or on any of them; only Linux offers this.
 
     Args:
-        number: of the core, from 0 on and counted round; None: any, also where this thread was begun by one that keeps
-            to a core, which it would otherwise share.
+        number: of the core, from 0, modulo the number of cores.  None: any core, even if this thread was started by
+            one that is bound to a core, which it would otherwise share.
     """
     if sys.platform == "linux":
         with suppress(OSError):
@@ -86,19 +85,19 @@ def keep_to(number: int | None) -> None:
 
 
 def compute_alone(number: int | None = None) -> None:
-    """Let this thread compute by itself: others have the other cores.
+    """Let this thread compute without the help of others, which use the other cores.
 
     Args:
-        number: from 0 on, of this thread among those of which each has a core of its own from now on. Left to itself, a
-            system leaves two threads on one core for milliseconds while another core is idle.
+        number: of this thread, from 0, if each of several threads is to have a core of its own.  Otherwise the system
+            may leave two threads on one core for milliseconds while another core is idle.
     """
     import torch
 
     keep_to(number)
-    torch.get_num_threads()  # torch settles a thread's number at its first use, and would undo what follows
+    torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following
     for library in ThreadpoolController().lib_controllers:
         if library.user_api == "openmp":
-            library.set_num_threads(1)  # OpenMP keeps this number by thread
+            library.set_num_threads(1)  # OpenMP keeps this number for each thread
 
 
 @cache
@@ -112,10 +111,10 @@ def in_turns(
     executor: Executor | None,
     helpers: int,
 ) -> None:
-    """Run every part once, in so many threads of the executor and in the calling one.
+    """Run every part once, in the calling thread and in ``helpers`` threads of the executor.
 
-    Each thread takes the next part when it has done one, so that a core that is busy elsewhere delays nothing but
-    the part it is at; a helper that has not begun by the end is not waited for.
+    A thread that has finished a part takes the next one, so that a core that is busy elsewhere delays only one part.
+    A helper that has not started when all parts are taken is not waited for.
     """
     waiting = deque(parts)
 
@@ -135,9 +134,9 @@ def in_turns(
 
 
 def each(work: Callable[[Item], Made], items: Sequence[Item], threads: int) -> list[Made]:
-    """``work`` of every item, in their order, each in one of so many threads that compute alone.
+    """Apply ``work`` to every item, in ``threads`` threads that compute alone; the results are in the items' order.
 
-    It is for work that lets go of the interpreter and does not call this again.
+    The work should release the interpreter lock, and must not call this function itself.
     """
     if threads < 2 or len(items) < 2:
         return [work(item) for item in items]

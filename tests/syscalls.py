@@ -1,4 +1,4 @@
-"""Was everything synced before it was acknowledged?  Read from a trace of system calls.
+"""Audits a trace of system calls: was everything synced before it was acknowledged?
 
 How to use it:
 
@@ -58,7 +58,7 @@ _STRING = re.compile(r'"(?P<text>(?:[^"\\]|\\.)*)"(?P<cut>\.\.\.)?')
 
 
 def strace() -> str | None:
-    """The tracer, if there is one and it may trace here; tests skip without it."""
+    """The path of strace, or None if it is missing or may not trace here; tests skip without it."""
     found = shutil.which("strace")
     if found is None:
         return None
@@ -67,7 +67,7 @@ def strace() -> str | None:
 
 
 def strace_arguments(trace_file: Path, *extra: str) -> list[str]:
-    """What to put before a command so that its trace, and that of its threads and children, is written."""
+    """The words before a command that write a trace of it, its threads and its children."""
     return [
         strace() or "strace",
         "-f",

@@ -1,4 +1,4 @@
-"""Distillation: the student, shown a disturbed crop, learns what the teacher sees in the clean one.
+"""Distillation: from an augmented crop, the student learns to predict the teacher's features of the clean one.
 
 Loss: the mean over cells of 1 - cosine(head(student map), standardized teacher map), for
 conv3 against the teacher's conv5_1 and conv4 against its conv5_5.
@@ -24,17 +24,19 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from training.photographs import DisturbedCrops, split_photographs
+from training.photographs import AugmentedCrops, split_photographs
 from training.student import Student
 from training.teacher import Teacher
 
 SIDE = 227
+"""Height and width of a crop in pixels."""
+HELD_OUT_BATCHES = 6
 HEADS_ALONE = 0.02
 AVERAGING = 0.999  # decay of the running average of the weights, which is what is exported
 
 
 class Standardization:
-    """Per-channel mean and spread of a teacher map, from the first batches, then fixed."""
+    """Subtracts the mean and divides by the spread of each channel of a teacher's map."""
 
     def __init__(self, mean: Tensor, spread: Tensor) -> None:
         self.mean, self.spread = mean, spread
@@ -64,10 +66,10 @@ def learning_rate(step: int, steps: int, peak: float) -> float:
 
 
 def _batches(loader: DataLoader[Any], device: torch.device) -> Iterator[tuple[Tensor, Tensor]]:
-    for clean, disturbed in loader:
+    for clean, augmented in loader:
         yield tuple(
             pixels.to(device).permute(0, 3, 1, 2).float().contiguous(memory_format=torch.channels_last)
-            for pixels in (clean, disturbed)
+            for pixels in (clean, augmented)
         )
 
 
@@ -93,6 +95,8 @@ def distill(
     checkpoint_every: int = 500,
     stop_after: int | None = None,
     start: Path | None = None,
+    side: int = SIDE,
+    held_out_batches: int = HELD_OUT_BATCHES,
 ) -> Path:
     """Train for ``crops`` crops, resuming from ``output`` if a checkpoint lies there.
 
@@ -104,6 +108,8 @@ def distill(
         stop_after: end this sitting after that many steps (the schedule stays that of ``crops``).
         start: folded weights of an earlier run to go on from; the first HEADS_ALONE of the steps
             then move nothing but the heads.
+        side: of the crops, in pixels; 3 more than a multiple of 16, so that the grids of both networks agree.
+        held_out_batches: how many batches the held-out loss is the mean of.
 
     Returns:
         The path of the folded weights.
@@ -125,8 +131,11 @@ def distill(
     if (output / "progress.json").exists():
         first = _restore(output, student, average, optimizer)
 
+    # Processors without AVX-512 compute in bfloat16 ten times slower than in float32.
+    quick = device.type != "cpu" or torch.backends.cpu.get_cpu_capability().startswith("AVX512")
+
     def autocast() -> torch.autocast:
-        return torch.autocast(device.type, torch.bfloat16)
+        return torch.autocast(device.type, torch.bfloat16, enabled=quick)
 
     def targets(clean: Tensor, standards: tuple[Standardization, ...] | None) -> tuple[Tensor, ...]:
         with torch.no_grad(), autocast():
@@ -135,7 +144,7 @@ def distill(
         return maps if standards is None else tuple(s(m) for s, m in zip(standards, maps, strict=True))
 
     def crops_of(paths: tuple[Path, ...], start: int, stop: int, seed: int) -> Iterator[tuple[Tensor, Tensor]]:
-        dataset = DisturbedCrops(paths, photographs, SIDE, seed, start, stop)
+        dataset = AugmentedCrops(paths, photographs, side, seed, start, stop)
         return _batches(DataLoader(dataset, batch, num_workers=workers, drop_last=True), device)
 
     # The standardization is drawn from the seed alone, so a resumed run computes the same one.
@@ -144,20 +153,20 @@ def distill(
 
     if start is not None and first == 0:
         pixels = torch.cat([clean for clean, _ in itertools.islice(crops_of(split.train, 0, 8 * batch, seed + 3), 8)])
-        student.take_up(load_file(start), pixels)
+        student.load_folded_weights(load_file(start), pixels)
         average.load_state_dict(student.state_dict())
     backbone = list(student.stages.parameters())
     heads_alone = 0 if start is None else int(HEADS_ALONE * steps)
 
-    def loss_of(network: Student, clean: Tensor, disturbed: Tensor) -> Tensor:
+    def loss_of(network: Student, clean: Tensor, augmented: Tensor) -> Tensor:
         goal = targets(clean, standards)
         with autocast():
-            made = network(disturbed)
+            made = network(augmented)
         return sum((cosine_loss(p, t) for p, t in zip(made, goal, strict=True)), torch.zeros((), device=device))
 
     @torch.no_grad()
     def held_out_loss() -> float:
-        pairs = crops_of(split.held_out, 0, 6 * batch, seed + 2)
+        pairs = crops_of(split.held_out, 0, held_out_batches * batch, seed + 2)
         return float(np.mean([loss_of(average, *pair).item() for pair in pairs]))
 
     last = steps if stop_after is None else min(steps, first + stop_after)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from training.disturbance import disturb
+from training.augmentation import augment
 
 Pixels = NDArray[np.uint8]
 
@@ -65,7 +65,7 @@ def split_photographs(folder: Path) -> Split:
 
 
 def source_weights(paths: tuple[Path, ...], folder: Path) -> NDArray[np.float64]:
-    """Probability of drawing each photograph: a source of n photographs weighs n^0.7 in all."""
+    """Probability of drawing each photograph; a source of n photographs has a weight of n^0.7 in all."""
     sources = [path.relative_to(folder).parts[0] for path in paths]
     counts = {source: sources.count(source) for source in set(sources)}
     weights = np.array([counts[source] ** 0.7 / counts[source] for source in sources])
@@ -91,8 +91,8 @@ def random_crop(pictures: Sequence[Pixels], side: int, generator: np.random.Gene
     return crops
 
 
-class DisturbedCrops(Dataset[tuple[Pixels, Pixels]]):
-    """Pairs (clean crop, the same crop disturbed), each side x side x 3 uint8 BGR.
+class AugmentedCrops(Dataset[tuple[Pixels, Pixels]]):
+    """Pairs (clean crop, the same crop augmented), each side x side x 3 uint8 BGR.
 
     Of the fixed cameras, most pairs are a crop by day and the same crop of a real night.
 
@@ -121,9 +121,9 @@ class DisturbedCrops(Dataset[tuple[Pixels, Pixels]]):
             day = days[int(generator.integers(len(days)))]
             other = path if path in nights else nights[int(generator.integers(len(nights)))]
             clean, shown = random_crop([read(day), read(other)], self.side, generator)
-            return clean, disturb(shown, generator) if generator.random() < 0.5 else shown
+            return clean, augment(shown, generator) if generator.random() < 0.5 else shown
         (clean,) = random_crop([read(path)], self.side, generator)
-        return clean, disturb(clean, generator)
+        return clean, augment(clean, generator)
 
 
 def read(path: Path) -> Pixels:

@@ -55,7 +55,7 @@ class Student(nn.Module):
         return self.head_conv3(conv3), self.head_conv4(conv4)
 
     @torch.no_grad()
-    def take_up(self, weights: dict[str, Tensor], pixels: Tensor) -> None:
+    def load_folded_weights(self, weights: dict[str, Tensor], pixels: Tensor) -> None:
         """Go on from ``folded_weights``: the same features on ``pixels``, with batch norm to learn through again.
 
         Each filter gets the length it would be drawn with; its batch norm gets the statistics of what the filter

@@ -51,7 +51,7 @@ class Teacher(nn.Module):
 
         On a 227-pixel input the teacher's cell m is centred at pixel 16m and CaffeNet's cell at
         17 + 16m, so dropping the teacher's first and last row and column aligns the two grids to
-        one pixel.
+        one pixel.  The same holds of every input of 16m + 3 pixels, which gives (m - 1) x (m - 1) cells.
         """
         x = torch.relu(self.stem((pixels - self.mean) * SCALE))
         early = x
@@ -59,7 +59,7 @@ class Teacher(nn.Module):
             x = module(x)
             if block == "5_1":
                 early = x
-        return early[:, :, 1:14, 1:14], x[:, :, 1:14, 1:14]
+        return early[:, :, 1:-1, 1:-1], x[:, :, 1:-1, 1:-1]
 
 
 def _convolution(weight: np.ndarray, bias: np.ndarray, stride: int, pad: int, groups: int) -> nn.Conv2d:

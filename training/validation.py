@@ -1,13 +1,13 @@
-"""What encoders are chosen by: three tasks on photographs kept out of training.
+"""The three tasks that encoders are chosen by, on photographs kept out of training.
 
-* ``lip6``: a street walked twice (eval/lip6_outdoor), recall@1 and AUC-PR by its own truth and, since that drifts
-  from what the pictures show, by the truth put right with local features (alignment.py).
+* ``lip6``: two traverses of a street (eval/lip6_outdoor), recall@1 and AUC-PR by the truth as stated and, since that
+  drifts from what the pictures show, by the truth corrected with local features (ground_truth.py).
 * ``webcams``: fixed cameras over months (eval/webcams).  Each daytime picture in turn is its
   camera's one reference among 500 frames of lip6; every other picture of the cameras is a query.
 * ``night``: cameras of train/day_night kept out of training.  One day picture of each camera and
   the 500 distractors are references; queries are the night pictures, shifted sideways by 10–20 %.
 
-The corridor traverse is reported elsewhere and nothing is chosen by it.
+The corridor is reported beside them, and nothing is chosen by it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from core.frames.preprocessing import Pixels
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
-from training.alignment import aligned_truth
+from training.ground_truth import corrected_truth
 from training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs
 
 Array = NDArray[np.float32]
@@ -33,7 +33,7 @@ DAYLIGHT = 70.0
 
 
 @dataclass(frozen=True)
-class Walk:
+class TraverseTask:
     """Queries against references; truth[q, r] is true where r shows the place of q."""
 
     queries: list[Pixels]
@@ -42,8 +42,12 @@ class Walk:
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """Pictures of fixed cameras, which of them are references in turn, and unrelated distractors."""
+class CameraTask:
+    """Pictures of fixed cameras, and unrelated distractors.
+
+    camera: int64 [n], the number of each picture's camera.
+    reference, query: bool [n], which pictures are references in turn, and which are queries.
+    """
 
     pictures: list[Pixels]
     camera: NDArray[np.int64]
@@ -52,31 +56,31 @@ class Cameras:
     distractors: list[Pixels]
 
 
-def walk(folder: Path, queries: str, references: str) -> Walk:
-    """A traverse pair with a ``ground_truth.csv`` of (query, reference) indices in order of name."""
+def load_traverses(folder: Path, queries: str, references: str) -> TraverseTask:
+    """Two traverses of a folder, with a ``ground_truth.csv`` of (query, reference) indices in order of file names."""
     shown = [[read(path) for path in find_photographs(folder / part)] for part in (queries, references)]
     truth = np.zeros((len(shown[0]), len(shown[1])), np.bool_)
     rows = np.loadtxt(folder / "ground_truth.csv", np.int64, delimiter=",", skiprows=1)
     truth[rows[:, 0], rows[:, 1]] = True
-    return Walk(shown[0], shown[1], truth)
+    return TraverseTask(shown[0], shown[1], truth)
 
 
-def realigned(task: Walk) -> Walk:
-    """The same walk with the truth that local features tell."""
-    return replace(task, truth=aligned_truth(task.queries, task.references, task.truth))
+def with_corrected_truth(task: TraverseTask) -> TraverseTask:
+    """The same traverses with the truth corrected by local features."""
+    return replace(task, truth=corrected_truth(task.queries, task.references, task.truth))
 
 
-def webcams(folder: Path, distractors: list[Pixels]) -> Cameras:
-    """The fixed cameras of eval/webcams: every daytime picture is a reference in its turn."""
+def load_webcams(folder: Path, distractors: list[Pixels]) -> CameraTask:
+    """The fixed cameras of eval/webcams; every daytime picture is a reference in turn."""
     paths = find_photographs(folder)
     pictures = [read(path) for path in paths]
     names = sorted({path.parent.name for path in paths})
     camera = np.array([names.index(path.parent.name) for path in paths])
     day = np.array([picture.mean() > DAYLIGHT for picture in pictures])
-    return Cameras(pictures, camera, day, np.ones(len(paths), np.bool_), distractors)
+    return CameraTask(pictures, camera, day, np.ones(len(paths), np.bool_), distractors)
 
 
-def shifted_night(train: Path, distractors: list[Pixels], seed: int = 0) -> Cameras:
+def load_shifted_nights(train: Path, distractors: list[Pixels], seed: int = 0) -> CameraTask:
     """The held-out day/night cameras: day pictures whole or cut on one side, nights cut on the other."""
     generator = np.random.default_rng(seed)
     held_out = [path for path in split_photographs(train).held_out if path.relative_to(train).parts[0] == DAY_NIGHT]
@@ -91,35 +95,53 @@ def shifted_night(train: Path, distractors: list[Pixels], seed: int = 0) -> Came
         pictures.append((picture[:, cut:] if left else picture[:, :-cut]) if night else picture)
     camera = np.array([names.index(path.parent.name) for path in paths])
     day = np.array([path.name.startswith("day") for path in paths])
-    return Cameras(pictures, camera, day, ~day, distractors)
+    return CameraTask(pictures, camera, day, ~day, distractors)
 
 
 @dataclass(frozen=True)
-class Shown:
+class ValidationTasks:
+    """All three tasks; lip6 with the truth as stated, too."""
+
+    lip6: TraverseTask
+    lip6_as_stated: TraverseTask
+    webcams: CameraTask
+    night: CameraTask
+
+
+def load_tasks(datasets: Path) -> ValidationTasks:
+    """Read the validation pictures into memory."""
+    stated = load_traverses(datasets / "eval/lip6_outdoor", "query", "reference")
+    distractors = stated.references[:DISTRACTORS]
+    cameras = load_webcams(datasets / "eval/webcams", distractors), load_shifted_nights(datasets / "train", distractors)
+    return ValidationTasks(with_corrected_truth(stated), stated, *cameras)
+
+
+@dataclass(frozen=True)
+class Encodings:
     """What an encoder makes of n pictures: descriptors float32 [n, D] and local ones int8 [n, C, L]."""
 
     descriptors: Array
     local: Cells
 
-    def part(self, rows: slice) -> Shown:
-        """Some of them."""
-        return Shown(self.descriptors[rows], self.local[rows])
+    def part(self, rows: slice) -> Encodings:
+        """The encodings of some of the pictures."""
+        return Encodings(self.descriptors[rows], self.local[rows])
 
 
-def describe(encoder: Encoder, frames: Sequence[Pixels]) -> Shown:
+def describe(encoder: Encoder, frames: Sequence[Pixels]) -> Encodings:
     """Encode pictures, eight at a time."""
     batches = [frames[start : start + 8] for start in range(0, len(frames), 8)]
     made = [encoding for batch in batches for encoding in encoder.encode_batch(batch)]
-    return Shown(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
+    return Encodings(np.stack([one.descriptor for one in made]), np.stack([one.local for one in made]))
 
 
-def scores(encoder: Encoder, queries: Shown, references: Shown) -> Array:
-    """What a map of all the references answers, second stage included; float32 [Q, R]."""
+def scores(encoder: Encoder, queries: Encodings, references: Encodings) -> Array:
+    """The scores that a map of all the references gives, second stage included; float32 [Q, R]."""
     first = encoder.scores_from_inner_products(queries.descriptors @ references.descriptors.T)
     return encoder.with_agreement(first, queries.local, references.local)
 
 
-def camera_scores(encoder: Encoder, pictures: Shown, distractors: Shown) -> tuple[Array, Array]:
+def camera_scores(encoder: Encoder, pictures: Encodings, distractors: Encodings) -> tuple[Array, Array]:
     """The pictures of fixed cameras among themselves, float32 [n, n], and against the distractors, float32 [n, m].
 
     A map of these tasks holds all distractors and a few of the pictures.  So a picture gains from the second stage
@@ -137,7 +159,7 @@ def camera_scores(encoder: Encoder, pictures: Shown, distractors: Shown) -> tupl
     return raised, scores(encoder, pictures, distractors)
 
 
-def camera_recall(task: Cameras, among: Array, far: Array) -> float:
+def camera_recall(task: CameraTask, among: Array, far: Array) -> float:
     """Mean recall@1 over references in turn and queries.
 
     In each turn every camera has one reference: the one in turn for its own camera; a query of

@@ -1,1 +1,1 @@
-"""The place recognition systems that ours is compared with: those of the thesis, and the one shape they all have."""
+"""The place recognition systems of the literature that ours is compared with, and the shape that all systems share."""

@@ -6,19 +6,14 @@ the third convolution describes a frame: 4 x 14 x 19 = 1064 values.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.maps import unit
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Constants, Resources, VectorSystem, unit
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
 from core.networks.caffemodel import CaffeLayer, read_caffemodel
@@ -49,8 +44,8 @@ ABOUT = About(
 )
 
 
-def grey_input(pixels: Pixels) -> NDArray[np.float32]:
-    """The frame as the authors show it: brightness equalized, grey, 120 x 160, from 0 to 1.
+def grey_input(pixels: Pixels) -> Array:
+    """The network's input as the authors prepare it: brightness equalized, grey, 120 x 160, from 0 to 1.
 
     Args:
         pixels: H x W x 3 uint8, BGR.
@@ -85,7 +80,7 @@ def _fill(module: nn.Conv2d, source: CaffeLayer | None, what: str) -> None:
     arrays = source.arrays() if source is not None and source.type == "Convolution" else []
     targets: list[Tensor] = [module.weight, *([] if module.bias is None else [module.bias])]
     wanted = [tuple(target.shape) for target in targets]
-    # The oldest files give all arrays four sides.
+    # The oldest files write all arrays with four dimensions.
     if len(arrays) != len(wanted) or arrays[0].shape != wanted[0] or arrays[1].size != wanted[1][0]:
         shapes = [array.shape for array in arrays] or "none"
         raise InvalidModel(f"{what} has arrays of the shapes {shapes}; CALC's are {wanted}.")
@@ -94,30 +89,20 @@ def _fill(module: nn.Conv2d, source: CaffeLayer | None, what: str) -> None:
             target.copy_(torch.from_numpy(array.reshape(target.shape)))
 
 
-class Calc:
+class Calc(VectorSystem):
     """One vector a frame, of unit length; scores are cosines."""
 
-    about, sequential = ABOUT, False
-
-    def __init__(self, network: nn.Sequential) -> None:
+    def __init__(self, about: About, network: nn.Sequential) -> None:
         from core.networks.identity import tensors_digest
 
+        super().__init__(about, weights=tensors_digest(network.state_dict()))
         self.network = network
-        self.identity = system_identity(ABOUT, weights=tensors_digest(network.state_dict()))
 
     @torch.inference_mode()
-    def describe(self, pixels: Pixels) -> Description:
-        began = time.perf_counter()
+    def vector(self, pixels: Pixels) -> Array:
         maps: Tensor = self.network(torch.from_numpy(grey_input(pixels))[None, None])
-        vector = unit(maps.reshape(-1).numpy())
-        return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
-
-    def index(self, references: Sequence[Description]) -> Index:
-        return InnerProducts(stack(references))
+        return unit(maps.reshape(-1).numpy())
 
 
-def build(ingredients: Ingredients) -> Calc:
-    return Calc(load_calc(ingredients.file()))
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)
+def build(about: About, resources: Resources) -> Calc:
+    return Calc(about, load_calc(resources.file()))

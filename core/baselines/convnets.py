@@ -12,20 +12,26 @@ was imported before.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.maps import Array, MapsSystem, PooledSystem, unit
-from core.baselines.spp import LEVELS, spatial_pyramid_pool
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.pooling import LEVELS, MapsSystem, PooledSystem, flatten, spatial_pyramid_pool
+from core.baselines.system import (
+    About,
+    Array,
+    Constants,
+    Description,
+    Index,
+    Resources,
+    VectorSystem,
+    stack,
+    unit,
+)
 from core.errors import InvalidModel, MissingWeights
 from core.frames.preprocessing import Pixels, prepare
 from core.method.catalogue import NETWORK_SUFFIX
@@ -63,7 +69,7 @@ def mean_file(model: Path, names: Sequence[str]) -> Path | None:
 
 
 def import_published(model: Path, published: Published, side: int) -> tuple[NetworkDefinition, dict[str, Tensor]]:
-    """The convolutional trunk of a published ``.caffemodel`` as it is to be run on ``side`` x ``side`` pixels.
+    """The convolutional trunk of a published ``.caffemodel``, for an input of ``side`` x ``side`` pixels.
 
     Its mean is that of a mean file beside it, else that which the model itself names, else the published one.
 
@@ -92,7 +98,7 @@ def load_trunk(path: Path, layer: str, published: Published) -> ShallowNetwork:
 
 
 def _extractor(path: Path, layer: str, published: Published) -> FeatureExtractor:
-    # Only the maps are read: what is said of regions here is never used.
+    # Only the maps are read, so what the definition says of regions is never used.
     definition = FeatureDefinition(layers=(layer,), regions=1, steps=(1.0,), unit_features=False)
     return FeatureExtractor(load_trunk(path, layer, published), definition)
 
@@ -110,9 +116,9 @@ ALEXNET = About(
 )
 
 
-def build_alexnet(ingredients: Ingredients) -> PooledSystem:
+def build_alexnet(about: About, resources: Resources) -> PooledSystem:
     published = Published(("ilsvrc_2012_mean.npy", "imagenet_mean.binaryproto"), IMAGENET_MEAN)
-    return PooledSystem(ALEXNET, _extractor(ingredients.file(), "conv3", published), lambda maps: maps.reshape(-1))
+    return PooledSystem(about, _extractor(resources.file(), "conv3", published), flatten)
 
 
 # AMOSNet and HybridNet
@@ -152,7 +158,7 @@ class Differences:
 
     vectors: Array
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+    def score(self, queries: Sequence[Description]) -> Array:
         asked, known = torch.from_numpy(stack(queries)), torch.from_numpy(self.vectors)
         return np.asarray(1 - torch.cdist(asked, known, p=1).numpy() / SCALE, np.float32)
 
@@ -167,14 +173,9 @@ class Pyramid(MapsSystem):
         return Differences(stack(references))
 
 
-def pyramid(about: About) -> Callable[[Ingredients], Pyramid]:
-    """How AMOSNet or HybridNet is made."""
-
-    def build(ingredients: Ingredients) -> Pyramid:
-        published = Published((f"{about.name}_mean.npy", "amosnet_mean.npy"))
-        return Pyramid(about, _extractor(ingredients.file(), "conv5", published))
-
-    return build
+def build_pyramid(about: About, resources: Resources) -> Pyramid:
+    published = Published((f"{about.name}_mean.npy", "amosnet_mean.npy"))
+    return Pyramid(about, _extractor(resources.file(), "conv5", published))
 
 
 # Places365
@@ -193,12 +194,10 @@ PLACES365 = About(
 FULLY_CONNECTED = ("fc6", "fc7")
 
 
-class Places365:
+class Places365(VectorSystem):
     """The rectified fc7 of one frame, of unit length; scores are cosines."""
 
-    about, sequential = PLACES365, False
-
-    def __init__(self, path: Path) -> None:
+    def __init__(self, about: About, path: Path) -> None:
         from core.networks.identity import json_digest, tensors_digest
 
         layers = {layer.name: layer for layer in read_caffemodel(path).layers}
@@ -217,25 +216,20 @@ class Places365:
             raise InvalidModel(f"{path.name}: fc6 does not fit the maps that come before it: {error}") from error
         tensors = weights | {f"head.{name}": tensor for name, tensor in self._head.state_dict().items()}
         digests = {"network": json_digest(definition.model_dump(mode="json")), "weights": tensors_digest(tensors)}
-        self.identity = system_identity(PLACES365, **digests)
+        super().__init__(about, **digests)
 
     @torch.inference_mode()
     def _fc7(self, images: Tensor) -> Tensor:
         found: Tensor = self._head(self._trunk(images)[0])
         return found[0]
 
-    def describe(self, pixels: Pixels) -> Description:
-        began = time.perf_counter()
+    def vector(self, pixels: Pixels) -> Array:
         image = torch.from_numpy(prepare(pixels, self._trunk.input)).permute(2, 0, 1)[None]
-        vector = unit(self._fc7(image).numpy())
-        return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
-
-    def index(self, references: Sequence[Description]) -> Index:
-        return InnerProducts(stack(references))
+        return unit(self._fc7(image).numpy())
 
 
 def _head(definition: NetworkDefinition, layers: dict[str, CaffeLayer], what: str) -> nn.Sequential:
-    """What follows the last convolution: its pooling, then the fully connected layers, each rectified."""
+    """The layers after the last convolution: its pooling, then the fully connected layers, each rectified."""
     last = definition.convolutions()[-1]
     behind = definition.layers[definition.layers.index(last) + 1 :]
     modules = [build_layer(layer, last.channels) for layer in behind if not isinstance(layer, Relu)]
@@ -253,13 +247,5 @@ def _head(definition: NetworkDefinition, layers: dict[str, CaffeLayer], what: st
     return nn.Sequential(*modules).eval().requires_grad_(False)
 
 
-def build_places365(ingredients: Ingredients) -> Places365:
-    return Places365(ingredients.file())
-
-
-SYSTEMS: tuple[Entry, ...] = (
-    Entry(ALEXNET, build_alexnet),
-    Entry(AMOSNET, pyramid(AMOSNET)),
-    Entry(HYBRIDNET, pyramid(HYBRIDNET)),
-    Entry(PLACES365, build_places365),
-)
+def build_places365(about: About, resources: Resources) -> Places365:
+    return Places365(about, resources.file())

@@ -1,10 +1,10 @@
-"""Cross-Region: landmarks found on a late layer, described by the layer before it.
+"""Cross-Region: landmarks found on a late layer, described by the layer before it, matched mutually.
 
 Chen, Maffra, Sa, Chli: Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place
 Recognition, IROS 2017.  A landmark is a group of connected cells of one late map whose activation is not
-zero, whatever its value; the N of highest mean are kept.  Cross-Region-BoW compares landmarks one with
-another and weighs each pair by how rare its words are; Cross-Region-VLAD is the thesis's variant that
-aggregates them as this project does (section 3.4.1).
+zero, whatever its value; the N of highest mean are kept.  Cross-Region-BoW matches the landmarks of two frames
+and weighs each pair by how rare its words are; Cross-Region-VLAD is the thesis's variant that
+aggregates them as this project does (section 3.4.1).  The thesis matches the regions of R-MAC in the same way.
 """
 
 from __future__ import annotations
@@ -17,11 +17,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.entry import Constants, Entry, Ingredients, arrays_digest, system_identity
-from core.baselines.maps import Array, read_maps, unit
-from core.baselines.mutual import MutualRegions
-from core.baselines.system import About, Description, Index, InnerProducts, stack
-from core.baselines.words import nearest_words, train_words
+from core.baselines.pooling import (
+    EARLY,
+    GAMMA,
+    LATE,
+    RMAC_CONSTANTS,
+    RMAC_PAPER,
+    MapsSystem,
+    read_maps,
+    regional_vectors,
+)
+from core.baselines.system import (
+    About,
+    Array,
+    Constants,
+    Description,
+    Index,
+    InnerProducts,
+    Resources,
+    arrays_digest,
+    stack,
+    system_identity,
+    unit,
+)
+from core.baselines.visual_words import nearest_words, train_words
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
 
@@ -29,16 +48,24 @@ if TYPE_CHECKING:
     from core.method.features import FeatureExtractor
 
 N = 200
-EARLY, LATE = "conv3", "conv4"
 VLAD_WORDS = 128
-GAMMA = 0.5
 PAPER = (
     "Chen, Maffra, Sa, Chli: Only Look Once, Mining Distinctive Landmarks from ConvNet for Visual Place "
     "Recognition, IROS 2017"
 )
 LAYERS: Constants = {"N": N, "regions": LATE, "features": EARLY}
+VLAD = About("cross-region-vlad", "Cross-Region-VLAD", PAPER, {**LAYERS, "V": VLAD_WORDS, "gamma": GAMMA})
+BOW_10K = About("cross-region-bow", "Cross-Region-BoW, 10k words", PAPER, {**LAYERS, "V": 10_000})
+BOW_2_6K = About("cross-region-bow-2.6k", "Cross-Region-BoW, 2.6k words", PAPER, {**LAYERS, "V": 2_600})
+RMAC_MUTUAL = About("rmac-mutual", "RMAC, mutual regions", RMAC_PAPER, RMAC_CONSTANTS)
+
+BLOCK = 64
+"""References scored at a time, so that memory stays bounded."""
 
 Boxes = list[tuple[slice, slice]]
+
+
+# Landmarks
 
 
 def find_landmarks(late: Array, count: int) -> tuple[Boxes, NDArray[np.int64]]:
@@ -89,13 +116,65 @@ def cross_features(early: Array, late: Array) -> Array:
     return unit(features)
 
 
+# Mutual regions
+
+
+def mutual_scores(query: Array, query_weights: Array, references: Array, reference_weights: Array) -> Array:
+    """Σ over mutual nearest neighbours of cosine x weight x weight.
+
+    A region of the query and one of a reference are mutual if each is the other's most alike; of
+    equally alike ones the first.
+
+    Args:
+        query: float32 [T, K], regions of unit length; rows of zeros are no regions.
+        query_weights: float32 [T].
+        references: float32 [R, U, K], likewise.
+        reference_weights: float32 [R, U].
+
+    Returns:
+        float32 [R].
+    """
+    count, regions, width = references.shape
+    cosines = (references.reshape(-1, width) @ query.T).reshape(count, regions, len(query))  # R x U x T
+    chosen = cosines.argmax(axis=2)  # R x U: by each reference region
+    choosing = cosines.argmax(axis=1)  # R x T: by each query region
+    mutual = np.take_along_axis(choosing, chosen, axis=1) == np.arange(regions)
+    best = np.take_along_axis(cosines, chosen[..., None], axis=2)[..., 0]
+    weighted = best * reference_weights * query_weights[chosen]
+    return np.where(mutual, weighted, np.float32(0)).sum(axis=1, dtype=np.float32)
+
+
+class MutualRegions:
+    """An index of descriptions with ``regions`` [T, K] and ``weights`` [T], T the same for all.
+
+    Args:
+        scale: the factor by which the sums are multiplied.
+    """
+
+    def __init__(self, references: Sequence[Description], scale: float) -> None:
+        self._regions, self._weights = stack(references, "regions"), stack(references, "weights")
+        self._scale = np.float32(scale)
+
+    def score(self, queries: Sequence[Description]) -> Array:
+        scores = np.empty((len(queries), len(self._regions)), np.float32)
+        for row, query in zip(scores, queries, strict=True):
+            regions, weights = stack([query], "regions")[0], stack([query], "weights")[0]
+            for start in range(0, len(row), BLOCK):
+                block = slice(start, start + BLOCK)
+                row[block] = self._scale * mutual_scores(regions, weights, self._regions[block], self._weights[block])
+        return scores
+
+
+# The systems
+
+
 class CrossRegion(ABC):
-    """What both encodings share: the landmarks of a frame, and the words learned from those of many frames."""
+    """The base of both encodings: the landmarks of a frame, and the words learned from those of many frames."""
 
     sequential = False
 
-    def __init__(self, about: About, extractor: FeatureExtractor, words: int) -> None:
-        self.about, self.extractor, self.words = about, extractor, words
+    def __init__(self, about: About, extractor: FeatureExtractor) -> None:
+        self.about, self.extractor, self.words = about, extractor, int(str(about.configuration["V"]))
         self.centers = np.empty((0, 0), np.float32)  # V x K, once trained
         self.identity = system_identity(about, features=extractor.origin)
 
@@ -107,13 +186,13 @@ class CrossRegion(ABC):
     def learn(self, features: Sequence[Array], seed: int) -> None:
         """Learn what the encoding needs, from the features of each training frame."""
 
-    def train(self, pictures: Iterable[Pixels], seed: int) -> None:
-        """Learn the words from pictures of other places.
+    def train(self, frames: Iterable[Pixels], seed: int) -> None:
+        """Learn the words from frames of other places.
 
         Raises:
             InvalidModel: there are too few landmarks to make words of.
         """
-        self.learn([cross_features(*read_maps(self.extractor, pixels)[0]) for pixels in pictures], seed)
+        self.learn([cross_features(*read_maps(self.extractor, pixels)[0]) for pixels in frames], seed)
         training = arrays_digest(**self.learned())
         self.identity = system_identity(self.about, features=self.extractor.origin, training=training)
 
@@ -124,7 +203,7 @@ class CrossRegion(ABC):
             InvalidModel: there are no words yet.
         """
         if not len(self.centers):
-            raise InvalidModel(f"{self.about.name} has no words yet; train it on pictures first.")
+            raise InvalidModel(f"{self.about.name} has no words yet; train it on frames first.")
         maps, forward = read_maps(self.extractor, pixels)
         began = time.perf_counter()
         features = cross_features(*maps)
@@ -132,10 +211,10 @@ class CrossRegion(ABC):
 
 
 class CrossRegionBow(CrossRegion):
-    """Mutual landmarks, each pair's cosine times the inverse document frequencies of both words."""
+    """Scores by mutual landmarks, each pair's cosine times the inverse document frequencies of both words."""
 
-    def __init__(self, about: About, extractor: FeatureExtractor, words: int) -> None:
-        super().__init__(about, extractor, words)
+    def __init__(self, about: About, extractor: FeatureExtractor) -> None:
+        super().__init__(about, extractor)
         self.rarity = np.empty(0, np.float32)
 
     def learned(self) -> dict[str, NDArray[np.float32]]:
@@ -174,7 +253,7 @@ def rarity(frames: Sequence[NDArray[np.int64]], words: int) -> NDArray[np.float3
 
 
 class CrossRegionVlad(CrossRegion):
-    """The landmarks' VLAD, intra-normalized, compared as this project's own."""
+    """The landmarks' VLAD, intra-normalized, scored as this project's own."""
 
     def learn(self, features: Sequence[Array], seed: int) -> None:
         from core.method.vocabulary import pool_features, train_vocabulary
@@ -197,17 +276,24 @@ class CrossRegionVlad(CrossRegion):
         return InnerProducts(stack(references), finish=lambda products: products / np.float32(words))
 
 
-def entry(kind: type[CrossRegionBow | CrossRegionVlad], name: str, title: str, words: int, **constants: float) -> Entry:
-    about = About(name, title, PAPER, {**LAYERS, "V": words, **constants})
+class MutualRmac(MapsSystem):
+    """The regions of R-MAC matched one with another: the score is the mean of the cosines of mutual ones."""
 
-    def build(ingredients: Ingredients) -> CrossRegionBow | CrossRegionVlad:
-        return kind(about, ingredients.extractor(EARLY, LATE), words)
+    def keep(self, maps: list[Array]) -> dict[str, Array]:
+        vectors = regional_vectors(*maps)
+        return {"regions": vectors, "weights": np.ones(len(vectors), np.float32)}
 
-    return Entry(about, build)
+    def index(self, references: Sequence[Description]) -> Index:
+        return MutualRegions(references, scale=1 / len(references[0].arrays["weights"]))
 
 
-SYSTEMS: tuple[Entry, ...] = (
-    entry(CrossRegionVlad, "cross-region-vlad", "Cross-Region-VLAD", VLAD_WORDS, gamma=GAMMA),
-    entry(CrossRegionBow, "cross-region-bow", "Cross-Region-BoW, 10k words", 10_000),
-    entry(CrossRegionBow, "cross-region-bow-2.6k", "Cross-Region-BoW, 2.6k words", 2_600),
-)
+def build_vlad(about: About, resources: Resources) -> CrossRegionVlad:
+    return CrossRegionVlad(about, resources.extractor(EARLY, LATE))
+
+
+def build_bow(about: About, resources: Resources) -> CrossRegionBow:
+    return CrossRegionBow(about, resources.extractor(EARLY, LATE))
+
+
+def build_rmac_mutual(about: About, resources: Resources) -> MutualRmac:
+    return MutualRmac(about, resources.extractor(LATE))

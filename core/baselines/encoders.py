@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Description, Index, InnerProducts, stack
 from core.frames.preprocessing import Pixels
 
 if TYPE_CHECKING:
     from core.method.catalogue import EncoderSummary
     from core.method.encoder import Encoder
+
+Box = tuple[float, float, float, float]
+"""A region of a frame: left, top, right, bottom, as fractions of its width and height."""
 
 _CAMAL = (
     "Khaliq, Ehsan, Milford, McDonald-Maier: CAMAL: Context-Aware Multi-layer Attention framework "
@@ -34,7 +37,7 @@ PAPERS = {
 
 
 def about_encoder(summary: EncoderSummary) -> About:
-    """An installed encoder as the catalogue shows it; of a damaged one, what is wrong with it."""
+    """An installed encoder as a system; for a damaged one, what is wrong with it in place of the paper."""
     definition = summary.definition
     if definition is None:
         return About(summary.name, summary.name, summary.damaged or "", {})
@@ -47,7 +50,7 @@ def about_encoder(summary: EncoderSummary) -> About:
 
 
 def constants(fields: Mapping[str, Any], within: str = "") -> dict[str, Any]:
-    """The fields of a definition, those of its parts as ``part.field``; what is not in use (None) is left out."""
+    """The fields of a definition without those that are None; fields of its parts are called ``part.field``."""
     flat: dict[str, Any] = {}
     for name, value in fields.items():
         if isinstance(value, Mapping):
@@ -58,7 +61,7 @@ def constants(fields: Mapping[str, Any], within: str = "") -> dict[str, Any]:
 
 
 class EncoderSystem:
-    """One vector a frame, compared by inner products, and local descriptors if there is a second stage."""
+    """One vector a frame, scored by inner products, and local descriptors if the encoder has a second stage."""
 
     sequential = False
 
@@ -73,6 +76,21 @@ class EncoderSystem:
             arrays["local"] = encoding.local
         return Description(arrays, encoding.milliseconds)
 
+    def region_boxes(self, pixels: Pixels) -> list[Box]:
+        """The boxes of a frame's regions, highest energy first; none for a blank frame.
+
+        A frame is resized whole, so the cells of a layer are spread evenly over it; what a cell sees is wider.
+        """
+        by_layer = self.encoder.layer_grids()
+        grids = np.array([by_layer[layer] for layer in self.encoder.definition.layers], np.float64)  # rows, columns
+        regions = self.encoder.encode(pixels).regions
+        cells = grids[regions.layers]  # T x 2
+        tops_lefts, bottoms_rights = regions.boxes[:, :2] / cells, regions.boxes[:, 2:] / cells
+        boxes = np.concatenate([tops_lefts[:, ::-1], bottoms_rights[:, ::-1]], axis=1)[
+            np.argsort(-regions.energies, kind="stable")
+        ]
+        return [(left, top, right, bottom) for left, top, right, bottom in boxes.tolist()]
+
     def index(self, references: Sequence[Description]) -> Index:
         first = InnerProducts(stack(references), finish=self.encoder.scores_from_inner_products)
         if not self.encoder.candidates:
@@ -82,14 +100,14 @@ class EncoderSystem:
 
 @dataclass(frozen=True)
 class TwoStages:
-    """The first candidates by inner product are examined cell by cell; local: int8 [R, C, L]."""
+    """An index whose best candidates by inner product are compared cell by cell; local: int8 [R, C, L]."""
 
     first: InnerProducts
     local: NDArray[np.int8]
     encoder: Encoder
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
-        ranked = self.first.compare(queries)
+    def score(self, queries: Sequence[Description]) -> Array:
+        ranked = self.first.score(queries)
         return self.encoder.with_agreement(ranked, local_of(queries), self.local)
 
 

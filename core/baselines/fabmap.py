@@ -1,35 +1,45 @@
-"""FAB-MAP: how probable a frame's visual words are at each place, and at a new one.
+"""FAB-MAP: the probability of a frame's visual words at each place, and at a new one.
 
 Cummins, Newman: FAB-MAP: Probabilistic Localization and Mapping in the Space of Appearance, International
 Journal of Robotics Research 27(6), 2008.  The local features are SIFT's: OpenCV's wheels do not contain the
 paper's SURF.  A place is known by one frame, no motion is assumed, and the new place is the paper's mean
-field: the sampled one would draw from the training frames, which may show these very places.
+field approximation: sampling would draw from the training frames, which may show the very same places.
+
+The words depend on each other by a tree: Chow, Liu: Approximating Discrete Probability Distributions with Dependence
+Trees, IEEE Transactions on Information Theory 14(3), 1968.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.chow_liu import Tree, chow_liu
-from core.baselines.entry import Constants, Entry, Ingredients, arrays_digest, system_identity
-from core.baselines.system import About, Description, Index
-from core.baselines.words import nearest_words, train_words
+from core.baselines.system import (
+    About,
+    Array,
+    Constants,
+    Description,
+    Index,
+    Resources,
+    arrays_digest,
+    system_identity,
+)
+from core.baselines.visual_words import nearest_words, train_words
 from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
 
-Array = NDArray[np.float32]
 Observations = NDArray[np.bool_]
 Reals = NDArray[np.float64]
 
 V = 4000
 LONGEST_SIDE = 640
 P_Z_GIVEN_E, P_Z_GIVEN_NOT_E = 0.39, 0.0
-"""The detector: how often a word is observed where the thing that makes it is, and where it is not."""
+"""The detector: the probability that a word is observed where its cause is present, and where it is absent."""
 
 CONSTANTS: Constants = {
     "V": V,
@@ -48,6 +58,75 @@ ABOUT = About(
 )
 
 
+# The tree of Chow and Liu
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A directed tree over V binary variables z.
+
+    parents: int64 [V]; the root is its own.
+    marginals: float64 [V], p(z_q = 1).
+    given: float64 [2, V], p(z_q = 1 | z_parent = 0) and p(z_q = 1 | z_parent = 1); the root's are its marginal.
+    """
+
+    parents: NDArray[np.int64]
+    marginals: Reals
+    given: Reals
+
+
+def probability(counts: Reals, total: int, cells: int) -> Reals:
+    """Shares of ``total`` observations, none of them 0.
+
+    Each of a pair's four cases counts as if it had been seen half a time more; ``cells`` of these cases are in
+    ``counts`` (one for a pair, two for a variable alone).
+    """
+    return (counts + 0.5 * cells) / (total + 2.0)
+
+
+def mutual_information(observations: Observations) -> Reals:
+    """Σ_ab p(a, b) log p(a, b) / p(a) p(b) of each pair of variables: bool [M, V] to float64 [V, V]."""
+    total = len(observations)
+    information = np.zeros((observations.shape[1],) * 2)
+    values = [~observations, observations]
+    for first in values:
+        for second in values:
+            both = probability((first.astype(np.float32).T @ second.astype(np.float32)).astype(np.float64), total, 1)
+            rows, columns = (probability(value.sum(axis=0), total, 2) for value in (first, second))
+            information += both * np.log(both / (rows[:, None] * columns))
+    return information
+
+
+def spanning_tree(information: Reals) -> NDArray[np.int64]:
+    """Each variable's parent in the tree of the greatest sum of information, rooted at variable 0; int64 [V]."""
+    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+    # SciPy takes a weight of 0 for no edge, so all are made positive.
+    weights = information.max() + 1.0 - information
+    np.fill_diagonal(weights, 0.0)
+    _, parents = breadth_first_order(minimum_spanning_tree(weights), 0, directed=False)
+    return np.where(parents < 0, np.arange(len(parents)), parents).astype(np.int64)
+
+
+def chow_liu(observations: Observations) -> Tree:
+    """The tree of M observations of V >= 1 variables, bool [M, V]."""
+    total = len(observations)
+    parents = spanning_tree(mutual_information(observations))
+    marginals = probability(observations.sum(axis=0), total, 2)
+    above = observations[:, parents]
+    given = np.stack(
+        [
+            probability((observations & with_parent).sum(axis=0), total, 1)
+            / probability(with_parent.sum(axis=0), total, 2)
+            for with_parent in (~above, above)
+        ]
+    )
+    return Tree(parents, marginals, np.where(parents == np.arange(len(parents)), marginals, given))
+
+
+# Words and places
+
+
 def local_features(pixels: Pixels) -> Array:
     """SIFT descriptors, float32 [T, 128] of whole numbers to 255; T may be 0.  A large frame is shrunk first."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
@@ -59,7 +138,7 @@ def local_features(pixels: Pixels) -> Array:
 
 
 def existence(observed: Observations, marginals: Reals) -> Reals:
-    """p(e_q = 1 | L): that what makes word q is at a place where it was, or was not, observed once.
+    """p(e_q = 1 | L): the probability that the cause of word q is at a place where q was, or was not, observed once.
 
     Its prior is the word's marginal, as in OpenFABMAP (Glover et al., ICRA 2012).
 
@@ -100,7 +179,7 @@ def log_likelihoods(observed: Observations, places: Observations, tree: Tree) ->
         float64 [R + 1].
     """
     without, with_it = observed_given(observed, tree)
-    # Only two values are possible a word: that of places where it was observed, and that of the others.
+    # Each word has only two possible values: one for places where it was observed, one for the others.
     word = np.ones_like(observed)
     if_observed, if_not, average = (
         np.log(there * with_it + (1 - there) * without)
@@ -123,10 +202,10 @@ def log_odds(likelihoods: Reals) -> Reals:
     """
     best = int(np.argmax(likelihoods))
     scaled = np.exp(likelihoods - likelihoods[best])
-    # What all others have together: each but the best one has the best among them, so this loses nothing...
+    # The sum of all others.  For each place but the best one it contains the best one, so no digits are lost ...
     with np.errstate(divide="ignore"):
         others = likelihoods[best] + np.log(scaled.sum() - scaled)
-    # ... and the best one's would be lost to rounding.
+    # ... and for the best one it is computed apart, because rounding would destroy it.
     others[best] = np.logaddexp.reduce(np.delete(likelihoods, best))
     return np.asarray((likelihoods - others)[:-1])
 
@@ -138,7 +217,7 @@ class Places:
         self._tree = tree
         self._places = np.stack([unpack(reference, len(tree.parents)) for reference in references])
 
-    def compare(self, queries: Sequence[Description]) -> Array:
+    def score(self, queries: Sequence[Description]) -> Array:
         frames = (unpack(query, len(self._tree.parents)) for query in queries)
         return np.stack([log_odds(log_likelihoods(frame, self._places, self._tree)) for frame in frames]).astype(
             np.float32
@@ -167,16 +246,16 @@ class FabMap:
         learned = arrays_digest(centers=self.centers, parents=tree.parents, marginals=tree.marginals, given=tree.given)
         return system_identity(ABOUT, training=learned)
 
-    def train(self, pictures: Iterable[Pixels], seed: int) -> None:
-        """Learn the vocabulary, and from its words in the same pictures the tree.
+    def train(self, frames: Iterable[Pixels], seed: int) -> None:
+        """Learn the vocabulary, and from its words in the same frames the tree.
 
         Raises:
             InvalidModel: none has a local feature.
         """
-        # Whole numbers: bytes keep them, in a quarter of the room.
-        frames = [local_features(pixels).astype(np.uint8) for pixels in pictures]
-        self.centers = train_words(frames, V, seed)
-        self.tree = chow_liu(np.stack([self.observe(frame.astype(np.float32)) for frame in frames]))
+        # The values are whole numbers, so bytes hold them in a quarter of the memory.
+        features = [local_features(pixels).astype(np.uint8) for pixels in frames]
+        self.centers = train_words(features, V, seed)
+        self.tree = chow_liu(np.stack([self.observe(found.astype(np.float32)) for found in features]))
 
     def observe(self, features: Array) -> Observations:
         """Which words the features of a frame, float32 [T, 128], are nearest to; bool [V]."""
@@ -186,7 +265,7 @@ class FabMap:
 
     def describe(self, pixels: Pixels) -> Description:
         if self.tree is None:
-            raise InvalidModel("fabmap has no words yet; train it on pictures first.")
+            raise InvalidModel("fabmap has no words yet; train it on frames first.")
         began = time.perf_counter()
         features = local_features(pixels)
         between = time.perf_counter()
@@ -196,13 +275,10 @@ class FabMap:
 
     def index(self, references: Sequence[Description]) -> Index:
         if self.tree is None:
-            raise InvalidModel("fabmap has no words yet; train it on pictures first.")
+            raise InvalidModel("fabmap has no words yet; train it on frames first.")
         return Places(references, self.tree)
 
 
-def build(ingredients: Ingredients) -> FabMap:
-    ingredients.none(ABOUT)
+def build(about: About, resources: Resources) -> FabMap:
+    resources.refuse_weights(about)
     return FabMap()
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)

@@ -7,15 +7,10 @@ gradient that of its strongest channel, and blocks of one cell.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-
 import cv2
 import numpy as np
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.maps import unit
-from core.baselines.system import About, Description, Index, InnerProducts, stack
+from core.baselines.system import About, Array, Constants, Resources, VectorSystem, unit
 from core.frames.preprocessing import Pixels
 
 WINDOW, BLOCK, STRIDE, CELL, BINS = 512, 16, 8, 16, 9
@@ -23,28 +18,18 @@ CONSTANTS: Constants = {"window": WINDOW, "block": BLOCK, "stride": STRIDE, "cel
 ABOUT = About("hog", "HOG", "Dalal, Triggs: Histograms of Oriented Gradients for Human Detection, CVPR 2005", CONSTANTS)
 
 
-class Hog:
+class Hog(VectorSystem):
     """One histogram vector of unit length; scores are cosines."""
 
-    about, sequential = ABOUT, False
-
-    def __init__(self) -> None:
-        self.identity = system_identity(ABOUT)
+    def __init__(self, about: About) -> None:
+        super().__init__(about)
         self._hog = cv2.HOGDescriptor((WINDOW, WINDOW), (BLOCK, BLOCK), (STRIDE, STRIDE), (CELL, CELL), BINS)
 
-    def describe(self, pixels: Pixels) -> Description:
-        began = time.perf_counter()
+    def vector(self, pixels: Pixels) -> Array:
         histograms = self._hog.compute(cv2.resize(pixels, (WINDOW, WINDOW), interpolation=cv2.INTER_LINEAR))
-        vector = unit(np.asarray(histograms, np.float32).reshape(-1))
-        return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
-
-    def index(self, references: Sequence[Description]) -> Index:
-        return InnerProducts(stack(references))
+        return unit(np.asarray(histograms, np.float32).reshape(-1))
 
 
-def build(ingredients: Ingredients) -> Hog:
-    ingredients.none(ABOUT)
-    return Hog()
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)
+def build(about: About, resources: Resources) -> Hog:
+    resources.refuse_weights(about)
+    return Hog(about)

@@ -1,8 +1,8 @@
-"""SeqSLAM: tiny pictures compared in sequences, along paths of nearly constant velocity.
+"""SeqSLAM: tiny patch-normalized frames matched in sequences, along paths of nearly constant velocity.
 
 Milford, Wyeth: SeqSLAM: Visual Route-based Navigation for Sunny Summer Days and Stormy Winter Nights, ICRA
 2012.  Constants and the form of the score are those of OpenSeqSLAM (Sünderhauf, 2013).  As there, the
-sequence of a query has it in the middle: half of it lies ahead, which a robot under way would have to wait for.
+sequence of a query has the query in the middle: half of it lies ahead, which a moving robot would have to wait for.
 """
 
 from __future__ import annotations
@@ -14,11 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.baselines.entry import Constants, Entry, Ingredients, system_identity
-from core.baselines.system import About, Description, Index, stack
+from core.baselines.system import About, Array, Constants, Description, Index, Resources, stack, system_identity
 from core.frames.preprocessing import Pixels
-
-Array = NDArray[np.float32]
 
 R_X, R_Y = 64, 32
 P = 8
@@ -108,7 +105,7 @@ def path_costs(matrix: Array) -> Array:
     """
     queries, references = matrix.shape
     half, cells = D_S // 2, np.arange(references)
-    # Velocities that differ by 1 / d_s are the ones whose paths differ.
+    # Paths differ only where velocities differ by at least 1 / d_s.
     velocities = np.arange(round(V_MIN * D_S), round(V_MAX * D_S) + 1) / D_S
     least = np.full(matrix.shape, np.inf, np.float32)
     for velocity in velocities:
@@ -128,7 +125,7 @@ def path_costs(matrix: Array) -> Array:
 def distinctness(costs: Array) -> Array:
     """Least cost more than R_window / 2 references from a query's best one, over each cost; over 1 is distinct.
 
-    OpenSeqSLAM's measure of a match, upside down, given for every reference: within a row it keeps the order.
+    This is the inverse of OpenSeqSLAM's measure of a match, for every reference; it keeps the order within a row.
 
     Args:
         costs: float32 [Q, R], not negative.
@@ -137,7 +134,7 @@ def distinctness(costs: Array) -> Array:
         float32 [Q, R].
     """
     far = np.abs(np.arange(costs.shape[1]) - costs.argmin(axis=1)[:, None]) > R_WINDOW // 2
-    # On a short traverse nothing may be that far: then the worst cost of all stands in.
+    # On a short traverse nothing may be that far away; then the worst cost is used.
     rival = np.where(far, costs, np.inf).min(axis=1, keepdims=True)
     rival = np.where(np.isfinite(rival), rival, costs.max(axis=1, keepdims=True))
     least = np.float32(1e-6)  # a path may cost nothing
@@ -145,18 +142,18 @@ def distinctness(costs: Array) -> Array:
 
 
 class Sequences:
-    """References in order of their traverse."""
+    """References in the order of their traverse."""
 
     def __init__(self, references: Sequence[Description]) -> None:
-        self._pictures = stack(references, "picture")
+        self._patches = stack(references, "patches")
 
-    def compare(self, queries: Sequence[Description]) -> Array:
-        matrix = enhance_contrast(differences(stack(queries, "picture"), self._pictures))
+    def score(self, queries: Sequence[Description]) -> Array:
+        matrix = enhance_contrast(differences(stack(queries, "patches"), self._patches))
         return distinctness(path_costs(matrix))
 
 
 class SeqSlam:
-    """Downsampled, patch-normalized pictures, compared as one sequence."""
+    """Downsampled, patch-normalized frames, scored as one sequence."""
 
     about, sequential = ABOUT, True
 
@@ -166,16 +163,13 @@ class SeqSlam:
     def describe(self, pixels: Pixels) -> Description:
         began = time.perf_counter()
         grey = cv2.resize(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), (R_X, R_Y), interpolation=cv2.INTER_AREA)
-        picture = patch_normalize(np.asarray(grey, np.uint8)).reshape(-1)
-        return Description({"picture": picture}, {"forward": 1e3 * (time.perf_counter() - began)})
+        patches = patch_normalize(np.asarray(grey, np.uint8)).reshape(-1)
+        return Description({"patches": patches}, {"forward": 1e3 * (time.perf_counter() - began)})
 
     def index(self, references: Sequence[Description]) -> Index:
         return Sequences(references)
 
 
-def build(ingredients: Ingredients) -> SeqSlam:
-    ingredients.none(ABOUT)
+def build(about: About, resources: Resources) -> SeqSlam:
+    resources.refuse_weights(about)
     return SeqSlam()
-
-
-SYSTEMS: tuple[Entry, ...] = (Entry(ABOUT, build),)

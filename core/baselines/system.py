@@ -1,43 +1,55 @@
-"""What every system that is compared looks like: a frame becomes a description, descriptions are compared.
+"""The shape that all compared systems share: a frame becomes a description, and descriptions are scored.
 
-A new system is one class with ``about``, ``identity``, ``describe`` and ``index``, and one line in
-``catalogue.py``.  A system that learns something from pictures of its own (words, a tree) has ``train`` too.
+A new system is one class with ``about``, ``identity``, ``describe`` and ``index``, and one row in
+``core.baselines.registry``.  A system that learns something from frames (words, a tree) has ``train`` too.
 """
 
 from __future__ import annotations
 
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from core.errors import InvalidModel
 from core.frames.preprocessing import Pixels
+
+if TYPE_CHECKING:
+    from core.method.catalogue import EncoderCatalogue
+    from core.method.features import FeatureExtractor
+
+Array = NDArray[np.float32]
+Constants = Mapping[str, str | int | float | bool | tuple[int | float | str, ...]]
+"""A system's constants by their names in its paper."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What ``placerec evaluate --list`` says of a system.
+    """What a system is, as ``placerec evaluate --list`` shows it.
 
-    name: as it is asked for, such as ``seqslam``.
+    name: the name that selects it on the command line, such as ``seqslam``.
     paper: authors, title, venue and year.
     configuration: its constants, by their names in the paper.
-    weights: one sentence naming the file that the user must supply; None where none is needed.
+    weights: one sentence that names the file which the user must supply; None where none is needed.
     """
 
     name: str
     title: str
     paper: str
-    configuration: Mapping[str, str | int | float | bool | tuple[int | float | str, ...]]
+    configuration: Constants
     weights: str | None = None
 
 
 @dataclass(frozen=True)
 class Description:
-    """What is kept of one frame.
+    """A system's description of one frame.
 
-    arrays: by name; all systems but the exact shapes are free.  Their bytes are the memory of a place.
+    arrays: by name; a system is free to choose them.  Their bytes are the memory of a place.
     milliseconds: of the stages that made it, such as ``forward``, ``regions``, ``vlad``.
     """
 
@@ -51,17 +63,17 @@ class Description:
 
 
 class Index(Protocol):
-    """References ready to be compared with."""
+    """References that queries can be scored against."""
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
-        """Scores, float32 [Q, R], higher is more alike, all finite; a sequential system takes the queries in order."""
+    def score(self, queries: Sequence[Description]) -> Array:
+        """Scores, float32 [Q, R], all finite; higher is more alike.  A sequential system takes queries in order."""
 
 
 class System(Protocol):
     """One way to recognize places.
 
     identity: name and a digest of all that can change a score: constants, weights, training.
-    sequential: a score depends on the queries before it, so they must be compared all together.
+    sequential: a score depends on the queries before it, so that all queries must be scored together.
     """
 
     @property
@@ -77,15 +89,15 @@ class System(Protocol):
         """Describe one frame, H x W x 3 uint8 BGR of any size; a blank frame gives a valid description too."""
 
     def index(self, references: Sequence[Description]) -> Index:
-        """Make R >= 1 references ready; a sequential system takes them in order of their traverse."""
+        """Prepare R >= 1 references; a sequential system takes them in the order of their traverse."""
 
 
 @runtime_checkable
 class Trainable(Protocol):
-    """A system that must see pictures of other places before it can describe or compare."""
+    """A system that must see frames of other places before it can describe or score."""
 
-    def train(self, pictures: Iterable[Pixels], seed: int) -> None:
-        """Learn from the pictures; ``identity`` then speaks of what was learned."""
+    def train(self, frames: Iterable[Pixels], seed: int) -> None:
+        """Learn from the frames; afterwards ``identity`` covers what was learned."""
 
 
 @dataclass(frozen=True)
@@ -95,17 +107,113 @@ class InnerProducts:
     vectors: float32 [R, D].
     """
 
-    vectors: NDArray[np.float32]
+    vectors: Array
     name: str = "descriptor"
-    finish: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
-    """What turns inner products into the scores that users see; must not change their order."""
+    finish: Callable[[Array], Array] | None = None
+    """Turns inner products into the scores that users see; it must not change their order."""
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+    def score(self, queries: Sequence[Description]) -> Array:
         asked = np.stack([query.arrays[self.name] for query in queries])  # Q x D
         products = np.asarray(asked @ self.vectors.T, np.float32)  # Q x R
         return products if self.finish is None else self.finish(products)
 
 
-def stack(descriptions: Sequence[Description], name: str = "descriptor") -> NDArray[np.float32]:
+class VectorSystem(ABC):
+    """The base of systems that describe a frame by one vector of unit length and score by the cosine.
+
+    Args:
+        digests: by name, digests of all besides the constants that can change a score, such as the weights.
+    """
+
+    sequential = False
+
+    def __init__(self, about: About, **digests: str) -> None:
+        self.about, self.identity = about, system_identity(about, **digests)
+
+    @abstractmethod
+    def vector(self, pixels: Pixels) -> Array:
+        """The vector of a frame, float32 [D], of unit length or zero."""
+
+    def describe(self, pixels: Pixels) -> Description:
+        began = time.perf_counter()
+        vector = self.vector(pixels)
+        return Description({"descriptor": vector}, {"forward": 1e3 * (time.perf_counter() - began)})
+
+    def index(self, references: Sequence[Description]) -> Index:
+        return InnerProducts(stack(references))
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What systems are built from.
+
+    models: the installed encoders and networks.
+    weights: the file that the user gave for this system.  Where ``About.weights`` asks for a file, the registry
+        has checked that it exists.
+    """
+
+    models: EncoderCatalogue
+    weights: Path | None = None
+
+    def extractor(self, *layers: str) -> FeatureExtractor:
+        """Frames to the rectified maps of ``layers``, in that order, by the network of the default encoder.
+
+        A weights file takes its place: a network file such as ``placerec model import`` writes.
+
+        Raises:
+            InvalidModel: the network has no such layer, or its file cannot be used.
+        """
+        from core.method.features import FeatureDefinition, FeatureExtractor
+        from core.networks.network import load_network
+
+        network = self.weights
+        if network is None:
+            network = self.models.network_file(next(s.network for s in self.models.describe() if s.default))
+        # Only the maps are read, so what the definition says of regions is never used.
+        definition = FeatureDefinition(layers=layers, regions=1, steps=tuple(1.0 for _ in layers), unit_features=False)
+        return FeatureExtractor(load_network(network, layers), definition)
+
+    def refuse_weights(self, about: About) -> None:
+        """Refuse a file given to a system that could not use one.
+
+        Raises:
+            InvalidModel: there is one.
+        """
+        if self.weights is not None:
+            raise InvalidModel(f"{about.name} uses no network, so it takes no file of weights.")
+
+    def file(self) -> Path:
+        """The weights file of a system whose ``About.weights`` asks for one."""
+        assert self.weights is not None, "the registry checks this before it builds"
+        return self.weights
+
+
+def stack(descriptions: Sequence[Description], name: str = "descriptor") -> Array:
     """The arrays ``name`` of R descriptions as float32 [R, ...]."""
     return np.stack([description.arrays[name] for description in descriptions]).astype(np.float32, copy=False)
+
+
+def unit(vectors: Array) -> Array:
+    """Vectors along the last axis, each divided by its length; zero stays zero."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
+
+
+def system_identity(about: About, **digests: str) -> str:
+    """``<name>@<sha256>`` over the constants of a system and over ``digests``.
+
+    Args:
+        digests: by name, digests of all else that can change a score: weights, training.
+    """
+    from core.networks.identity import json_digest
+
+    return f"{about.name}@{json_digest({'configuration': dict(about.configuration), **digests})}"
+
+
+def arrays_digest(**arrays: NDArray[np.generic]) -> str:
+    """SHA-256 over names, types, shapes and values: what a system has learned, for its identity."""
+    import torch
+
+    from core.networks.identity import tensors_digest
+
+    return tensors_digest({name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()})

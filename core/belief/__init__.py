@@ -1,8 +1,8 @@
-"""Where a robot under way is: a belief over the places of a map, carried from frame to frame (thesis 2.1, 2.2.6).
+"""Where a moving robot is: a belief over the places of a map, carried from frame to frame (thesis 2.1, 2.2.6).
 
-``graph`` knows which places follow one another, ``evidence`` what one frame's scores say, ``motion`` how far a robot
-gets, ``filter`` is the hidden Markov model, ``paths`` the sequence search beside it, ``estimate`` sums a belief up,
-``run`` puts them together and ``record`` writes a run down.
+``graph`` knows which places follow one another, ``evidence`` what one frame's scores say and ``motion`` how far a robot
+gets.  ``filter`` is the hidden Markov model and ``paths`` the sequence search, which is an alternative to it.
+``estimate`` summarizes a belief, ``run`` puts these together and ``record`` serializes a run.
 """
 
 from core.belief.estimate import Candidate, Estimate

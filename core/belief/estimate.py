@@ -1,4 +1,4 @@
-"""What to tell a robot of a belief: the place, how probable it is, and what else it could be."""
+"""The summary of a belief for a robot: the most probable place, its probability, and the alternatives."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from core.belief.graph import PlaceGraph
 from core.judgement.verdict import Verdict
 
 RECOGNIZED = 0.5
-"""Least probability of a place, its neighbours included, with which it is told; the same of not being in the map."""
+"""A place is recognized from this probability on, its neighbours included; so is not being in the map."""
 
 MODES = 8
-"""Places looked at, each with its neighbours, besides those that belong to one already."""
+"""At least this many distinct places are looked for, each with its neighbours."""
 
 LIKELY = 512
-"""Of a belief that is spread over the map, no more places are looked at."""
+"""At most this many of the likeliest places are looked at."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One place that it may be.
+    """A place where the robot may be.
 
     row: of the map.
-    probability: of it and of the places that are the same place.
+    probability: of the place and of the frames that are the same place.
     """
 
     row: int
@@ -35,10 +35,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A belief in a few numbers.
+    """The summary of a belief.
 
     candidates: distinct places, best first; none in an empty map.
-    unknown: probability of not being in the map.
+    unknown: the probability that the robot is not in the map.
     """
 
     verdict: Verdict
@@ -47,10 +47,10 @@ class Estimate:
 
 
 def estimate(belief: Belief, graph: PlaceGraph, count: int) -> Estimate:
-    """Sum a belief up.
+    """Summarize a belief.
 
-    The verdict is ``unknown`` where not being in the map is as probable as being in it, ``recognized`` where one place
-    with its neighbours is, else ``ambiguous``.
+    The verdict is ``unknown`` if not being in the map has a probability of at least RECOGNIZED, ``recognized`` if one
+    place with its neighbours has, else ``ambiguous``.
 
     Args:
         count: how many candidates to list.
@@ -86,9 +86,9 @@ def _modes(masses: NDArray[np.float32], graph: PlaceGraph, count: int) -> list[C
 
 
 def _middle(place: int, same: NDArray[np.int64], masses: NDArray[np.float32], graph: PlaceGraph) -> int:
-    """Of the frames around ``place`` in its sequence that are the same place, the one at half their probability.
+    """The median, by probability, of the frames around ``place`` in its sequence that are the same place.
 
-    The likeliest single frame jumps to and fro between neighbours; this one is steadier and nearer the truth.
+    It is steadier than the likeliest frame, which jumps between neighbours, and closer to the truth.
     """
     stretch = same[(same >= graph.first[place]) & (same < graph.last[place])]
     pieces = np.split(stretch, np.flatnonzero(np.diff(stretch) > 1) + 1)

@@ -1,14 +1,14 @@
 """What one frame says about every place: log likelihood ratios from the scores of a search.
 
-A score means little by itself, so it is held against two others of the same frame: the mean score of listed
-places that cannot be the best one's place (a place that scores so is no likelier than any that was not listed)
-and the *believable* score, at which the single-frame verdict would just accept a best match.  Between them
-evidence grows in proportion, beyond them faster; a place at the believable score gains STRENGTH.  Places outside
-the list share the background's 0: a compact index returns the best hundred or so and no more, and an encoder with a
-second stage compares only its candidates in full.
+A score means little by itself, so it is compared with two other scores of the same frame: the mean score of listed
+places other than the best match's (a place with this score is no likelier than one that is not listed), and the
+*believable* score, at which the single-frame verdict would just accept a best match.  Between the two, evidence grows
+in proportion to the score, and beyond the second faster; at the believable score it is STRENGTH.  Places that are not
+listed have the background's evidence, 0: a compact index returns only about the best hundred, and a second stage
+compares only its candidates.
 
-Consecutive frames are not independent (they show the same thing, so they are mistaken about the same thing),
-which is why STRENGTH is far below what the odds of one frame alone would be.
+Consecutive frames are not independent: they show the same things and lead to the same mistakes.  STRENGTH is therefore
+far below the log odds of one frame alone.
 """
 
 from __future__ import annotations
@@ -18,32 +18,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import FEWEST_PLACES, TOP_PLACES, Calibration, Neighborhood, Whereabouts, filled_up
+from core.judgement.verdict import FEWEST_PLACES, TOP_PLACES, Calibration, filled_up
+from core.places import Neighborhood, Whereabouts
 
 LISTED = 100
-"""Places that speak for themselves where there is no second stage; every index returns so many."""
+"""Without a second stage, this many places are listed; every index returns as many."""
 
 STRENGTH = 0.7
 """Log likelihood ratio of a place at the believable score against one in the background."""
 
 CLEARNESS = 1.0
-"""What is gained beside it for each such step above the believable score: mistakes are rarely as clear as that."""
+"""Further log likelihood ratio for each such step above the believable score: mistakes are rarely that clear."""
 
 STRONGEST = 6.0
-"""No frame says more of a place, whatever it scores."""
+"""Largest log likelihood ratio that a frame gives to a place."""
 
 UNKNOWN = 0.8
-"""What a frame says of not being in the map, as a share of STRENGTH: a place that scores better, on the average of
-the frames, is believed before it."""
+"""Log likelihood ratio of not being in the map, as a share of STRENGTH: a place whose evidence is stronger on average
+is believed before it."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one frame says; the background's log likelihood is 0.
+    """The evidence of one frame; the background's log likelihood is 0.
 
     rows: int64 [k], rows of the map.
-    gains: float32 [k], over 0: log likelihood ratio of those places to the background.
-    unknown: log likelihood ratio of not being in the map to the background.
+    gains: float32 [k], over 0: the log likelihood ratio of those places to the background.
+    unknown: the log likelihood ratio of not being in the map to the background.
     """
 
     rows: NDArray[np.int64]
@@ -51,12 +52,12 @@ class Evidence:
     unknown: float
 
     def tempered(self, weight: float) -> Evidence:
-        """With every log likelihood ``weight`` times as large."""
+        """The evidence with every log likelihood ratio multiplied by ``weight``."""
         return Evidence(self.rows, self.gains * np.float32(weight), self.unknown * weight)
 
 
 NOTHING = Evidence(np.empty(0, np.int64), np.empty(0, np.float32), 0.0)
-"""A frame that says nothing: one without regions, or one in an empty map."""
+"""The evidence of a frame that says nothing: one without regions, or one in an empty map."""
 
 
 def evidence(
@@ -67,13 +68,15 @@ def evidence(
     neighborhood: Neighborhood,
     examined: NDArray[np.bool_] | None = None,
 ) -> Evidence:
-    """What a search says of the places of a map.
+    """The evidence of a search.
 
     Args:
-        rows, scores: int64 and float32 [n], best first, as ``judge`` gets them; the best 100 suffice.
+        rows, scores: int64 [n] and float32 [n], best first; the best LISTED suffice.
         whereabouts: of the same n places.
-        calibration: that by which the frame is judged.
-        examined: bool [n], which of them the encoder's second stage has examined; None or none: it has no such stage.
+        calibration: by which the frame is judged.
+        neighborhood: which places are the same place.
+        examined: bool [n], which of them the encoder's second stage has examined; None, or none of them: it has no
+            second stage.
     """
     if len(rows) == 0:
         return NOTHING
@@ -89,13 +92,13 @@ def evidence(
 
 
 def believable_score(rest: NDArray[np.float64], calibration: Calibration, second_stage: bool) -> tuple[float, float]:
-    """The mean score of the rest, and the least score at which a best match would be believed beside that rest.
+    """The mean score of the rest, and the least score at which a best match would be accepted beside that rest.
 
-    The second solves the verdict's own rule for the score: threshold² = s · (s - top), where top is the mean of the
-    best few of the rest, or in older calibrations of one stage threshold = (s - top) / spread.
+    The second solves the verdict's rule threshold² = s · (s - top) for s, where top is the mean of the best few of the
+    rest; in older calibrations without a second stage the rule is threshold = (s - top) / spread.
 
     Args:
-        rest: float64 [n], best first: listed places that are not the best one's place.
+        rest: float64 [n], best first: scores of listed places other than the best match's.
     """
     leads = second_stage or calibration.decision == "leading"
     scores = filled_up(rest.astype(np.float32), TOP_PLACES if leads else FEWEST_PLACES, calibration)

@@ -1,13 +1,13 @@
-"""The belief of a robot under way: a hidden Markov model over the places of a map, and whether it is in the map.
+"""The belief of a moving robot: a hidden Markov model over the places of a map, and whether the robot sees the map.
 
-Given that the robot sees the map, where it is follows the forward algorithm (Rabiner, A tutorial on hidden Markov
-models, Proceedings of the IEEE 77(2), 1989, section III.A) in its scaled form, which is causal: a frame changes what
-is believed of now and nothing else.  It may be carried off to any place at any time (JUMP).  With a lag the backward
-pass over the frames since then tells, besides, where the robot was that many frames ago.
+Given that the robot sees the map, its place follows the forward algorithm (Rabiner, A tutorial on hidden Markov
+models, Proceedings of the IEEE 77(2), 1989, section III.A) in its scaled form, which is causal: a frame only changes
+the belief about the present.  The robot may be carried to any place at any time (JUMP).  With a lag, the backward pass
+over the later frames tells where the robot was that many frames ago.
 
-Whether it sees the map is a second chain of two states (LEAVING, RETURNING), which weighs the likelihood of each frame
-under the first against that of a frame from outside.  So a robot whose view was blocked is looked for where it
-must have got to by then: what it saw meanwhile, however little, still counts among the places.
+Whether the robot sees the map is a second chain of two states (LEAVING, RETURNING), which compares the likelihood of
+each frame under the first chain with that of a frame from outside.  A robot whose view was blocked is therefore looked
+for where it must have got to by then: what it saw meanwhile, however little, still counts among the places.
 """
 
 from __future__ import annotations
@@ -22,29 +22,35 @@ from core.belief.graph import PlaceGraph
 from core.belief.motion import Masses, Transition
 
 START_UNKNOWN = 0.5
-"""Belief, before the first frame, that the map does not show where the robot is."""
+"""The probability before the first frame that the robot does not see the map."""
 
 JUMP = 1e-3
+"""Probability, at each frame, that the robot was carried to any place."""
+
 LEAVING = 2e-2
+"""Probability, at each frame, that a robot that saw the map no longer does."""
+
 RETURNING = 0.1
+"""Probability, at each frame, that a robot that did not see the map does again."""
 
 ALIKE = 1.02
-"""Places that hold no more than this times the floor are not moved one by one: what nearly all hold alike stays so."""
+"""Places with at most this times the floor are not moved one by one, as nearly all places have about as much."""
 
 MANY = 1000
-"""In smaller maps every place is moved, which costs little there; and there what the others hold is not little."""
+"""In maps with fewer places than this, every place is moved: it takes little time there, and the error would count."""
 
 VANISHING = 1e-30
+"""A likelihood below this counts as impossible."""
 
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What is believed of the present.
+    """What is believed about the present.
 
-    given: float32 [n], probabilities of the places, in the order of their graph, if the robot sees the map; their
-        sum is 1, or 0 where there is no place.
-    unknown: probability that it does not; 1 in an empty map.
-    floor: what a place holds for which nothing speaks; most hold no more.
+    given: float32 [n], the probabilities of the places, in the order of their graph, if the robot sees the map; their
+        sum is 1, or 0 if there is no place.
+    unknown: the probability that the robot does not see the map; 1 in an empty map.
+    floor: the probability of a place without any evidence, as most places are.
     """
 
     given: Masses
@@ -65,7 +71,7 @@ def uninformed(places: int) -> Belief:
 
 
 def predicted(belief: Belief, transition: Transition) -> Belief:
-    """What is believed after a motion and before the frame (the sum in Rabiner's eq. 20)."""
+    """The belief after a motion and before the frame (the sum in Rabiner's equation 20)."""
     n = len(belief.given)
     if not n:
         return belief
@@ -79,7 +85,7 @@ def predicted(belief: Belief, transition: Transition) -> Belief:
 
 
 def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
-    """What is believed once a frame is seen (the product with its likelihoods, scaled)."""
+    """The belief after a frame (the product with its likelihoods in Rabiner's equation 20, scaled)."""
     n = len(belief.given)
     if not n:
         return belief
@@ -87,14 +93,14 @@ def observed(belief: Belief, seen: Evidence, graph: PlaceGraph) -> Belief:
     inside = float(likely.sum(dtype=np.float64))
     outside = belief.unknown * float(np.exp(seen.unknown - scale))
     known = (1 - belief.unknown) * inside
-    if inside < VANISHING or known + outside < VANISHING:  # nothing that was thought possible can have shown this
+    if inside < VANISHING or known + outside < VANISHING:  # the frame contradicts everything that was believed
         return uninformed(n)
     floor = belief.floor * float(np.exp(-scale)) / inside
     return Belief(likely / np.float32(inside), outside / (known + outside), floor)
 
 
 def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses, float]:
-    """Values times the likelihoods of a frame, and the log by which these were lowered, so that nothing overflows."""
+    """Values times the likelihoods of a frame, divided by exp(scale) so that nothing overflows; and the scale."""
     places = graph.places_at(seen.rows)
     there = places >= 0
     scale = max(0.0, seen.unknown, float(seen.gains[there].max(initial=0)))
@@ -105,7 +111,7 @@ def _weighted(values: Masses, seen: Evidence, graph: PlaceGraph) -> tuple[Masses
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """What smoothing needs of one past frame: the belief after it, the transition into it, what it showed."""
+    """What smoothing needs of one past frame: the belief after it, the transition into it, and its evidence."""
 
     belief: Belief
     transition: Transition
@@ -113,24 +119,24 @@ class _Moment:
 
 
 class Smoother:
-    """The last frames of a run, kept to tell where the robot was ``lag`` frames ago given all since."""
+    """Keeps the last frames of a run and tells where the robot was ``lag`` frames ago, given all frames since."""
 
     def __init__(self, lag: int) -> None:
         self.lag = lag
         self._moments: deque[_Moment] = deque(maxlen=lag + 1)
 
     def clear(self) -> None:
-        """Forget; for when the places have changed."""
+        """Forget the frames; needed when the places have changed."""
         self._moments.clear()
 
     def append(self, belief: Belief, transition: Transition, seen: Evidence) -> None:
-        """Remember one frame."""
+        """Add one frame."""
         self._moments.append(_Moment(belief, transition, seen))
 
     def smoothed(self, graph: PlaceGraph) -> Belief | None:
-        """The belief of ``lag`` frames ago (Rabiner's eqs. 25 and 27, scaled); None while there are fewer.
+        """The belief of ``lag`` frames ago (Rabiner's equations 25 and 27, scaled); None while there are fewer frames.
 
-        The frames since then tell the places apart; ``unknown`` stays what it was.
+        The later frames change the probabilities of the places; ``unknown`` stays what it was.
         """
         n = len(graph)
         if len(self._moments) <= self.lag or not n:
@@ -148,9 +154,10 @@ class Smoother:
 
 
 def reindexed(belief: Belief, old: PlaceGraph, new: PlaceGraph) -> Belief:
-    """A belief after places came, went or moved: by row; new places start with what holds where nothing speaks.
+    """Carry a belief over, row by row, to a graph in which places were added, removed or moved.
 
-    What dead rows held becomes belief that the robot sees nothing of the map: it is where a place was that is no more.
+    New places start with the least probability of the others.  The probability of removed places is added to
+    ``unknown``: the robot is where the map no longer has a place.
     """
     n = len(new)
     if not len(old) or not n:

@@ -1,50 +1,53 @@
-"""The places of a map as a robot can go from one to the next: along their sequences, and from pose to pose.
+"""The places of a map as a graph of ways from one to the next: along their sequences, and from pose to pose.
 
-A belief has one probability for each living place, in the order of this graph: by sequence, and within it by
-ordinal, so that "k frames on" is "k entries on".  Where places have poses, each is also joined to those near it.
+A belief has one probability for each living place, in the order of this graph: by sequence, and within a sequence by
+ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
-from core.places import EARTH_RADIUS
+from core.kernels.belief import same_place
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 
 NEAREST = 24
-"""A place is joined to so many of the nearest, at most; fewer in maps of over FULLY_JOINED places."""
+"""A place is joined to at most this many of the nearest places."""
+
 NEAREST_OF_MANY = 8
+"""The same in maps of over FULLY_JOINED places."""
+
 FULLY_JOINED = 200_000
+
 ALONG = 4
-"""... and to so many before and behind it in its sequence, however near others lie."""
+"""A place is also joined to this many places before and after it in its sequence, however near others are."""
+
 SPACINGS = 3.0
-"""The nearest are looked for within so many times the usual distance of consecutive frames."""
+"""The nearest places are looked for within this many times the usual distance of consecutive frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlaceGraph:
-    """n living places and who is near whom.
+    """n living places, and which of them are joined.
 
     rows: int64 [n], the map's row of each place, in the graph's order.
     index: int32 [rows of the map], the place at a row; -1 for a row that is dead or not allowed.
-    first, last: int32 [n], the ends (inclusive, exclusive) of the stretch of places of one sequence.
+    first, last: int32 [n], the bounds (inclusive, exclusive) of the places of each place's sequence.
     posed: bool [n].
-    coordinates: float64 [n, 3], metres east (or along x), north (y), up (z), to be compared with near places only.
-    shrink: float64 [n], what a metre along the first coordinate measures at the place: the cosine of its latitude.
-    heading: float64 [n], radians counter-clockwise from the first coordinate; of places without a heading the
-        direction in which their sequence goes on; NaN where there is neither.
-    starts, targets: int64 [n + 1] and int32 [edges]: place i is joined to targets[starts[i]:starts[i + 1]], itself
-        the first of them.  Places without a pose have no edges.
+    coordinates: float64 [n, 3], metres east (or along x), north (y), up (z), comparable only between near places.
+    shrink: float64 [n], the length at the place of a metre along the first coordinate: the cosine of its latitude.
+    heading: float64 [n], radians counter-clockwise from the first coordinate; for places without a heading the
+        direction to the next frame of their sequence; NaN if there is neither.
+    starts, targets: int64 [n + 1] and int32 [edges]: place i is joined to targets[starts[i]:starts[i + 1]], of which
+        it is itself the first.  Places without a pose have no edges.
     spacing: metres between consecutive frames, the median; 0 without poses.
     reach: metres within which neighbours were looked for.
     neighborhood: which places are the same place.
+    whereabouts: of the n places, in the graph's order.
     """
 
     rows: NDArray[np.int64]
@@ -64,7 +67,7 @@ class PlaceGraph:
 
     @property
     def geographic(self) -> bool:
-        """Whether any place is told by latitude and longitude."""
+        """Whether the pose of any place is a latitude and longitude."""
         return bool((self.whereabouts.kind == GEOGRAPHIC).any())
 
     def __len__(self) -> int:
@@ -72,25 +75,25 @@ class PlaceGraph:
 
     @property
     def bytes(self) -> int:
-        """Of memory that its arrays hold."""
+        """Memory of its arrays, in bytes."""
         arrays = (self.rows, self.index, self.first, self.last, self.posed, self.coordinates, self.shrink)
         return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets))
 
     def places_at(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
-        """The places at rows of the map, int32 [k]; -1 where none lives, rows beyond the graph's map included."""
+        """The places at rows of the map, int32 [k]; -1 for rows without a living place, and for rows added since."""
         inside = (rows >= 0) & (rows < len(self.index))
         found = np.full(len(rows), -1, np.int32)
         found[inside] = self.index[rows[inside]]
         return found
 
     def same_place(self, place: int) -> NDArray[np.int64]:
-        """The places, itself included, that are the same place as one; int64 [m].
+        """The places that are the same place as one, itself included; int64 [m], ascending.
 
-        Only those joined to it and those beside it in its sequence are looked at, so that the cost does not grow
-        with the map.
+        Only places that are joined to it and places beside it in its sequence are considered, so that the time does
+        not grow with the map.
         """
         where = self.whereabouts
-        found: NDArray[np.int64] = _same_place(
+        found: NDArray[np.int64] = same_place(
             place,
             int(self.first[place]),
             int(self.last[place]),
@@ -104,39 +107,16 @@ class PlaceGraph:
         return found
 
 
-@cast(Callable[[Callable[..., Any]], Callable[..., Any]], numba.njit(cache=True, nogil=True))
-def _same_place(place, first, last, joined, kind, position, ordinal, radius, frames):  # type: ignore[no-untyped-def]
-    """As ``Whereabouts.near`` has it, among the places joined and those beside it in its sequence; ascending."""
-    low, high = max(first, place - frames), min(last, place + frames + 1)
-    found = np.empty(len(joined) + high - low, np.int64)
-    count = 0
-    for number in range(len(found)):
-        beside = number >= len(joined)
-        other = low + number - len(joined) if beside else joined[number]
-        if other == place and not beside:
-            continue
-        if kind[other] == kind[place] and kind[place] != NO_POSE:
-            if beside and other != place and np.any(joined == other):
-                continue
-            distance = np.sqrt(np.sum((position[other] - position[place]) ** 2))
-            same = distance <= radius or other == place
-        else:
-            same = beside and abs(ordinal[other] - ordinal[place]) <= frames
-        if same:
-            found[count] = other
-            count += 1
-    return np.sort(found[:count])
-
-
 def place_graph(
     whereabouts: Whereabouts, living: NDArray[np.int64], rows: int, neighborhood: Neighborhood
 ) -> PlaceGraph:
-    """The graph of a map's living places.
+    """Build the graph of a map's living places.
 
     Args:
         whereabouts: of all rows of the map.
-        living: int64 [n], the rows of the places to take.
-        rows: of the map, dead ones included.
+        living: int64 [n], the rows of the places to include.
+        rows: number of rows of the map, dead ones included.
+        neighborhood: which places are the same place.
     """
     where = whereabouts.take(living)
     order = np.lexsort((where.ordinal, where.sequence))
@@ -149,7 +129,7 @@ def place_graph(
     first, last = np.repeat(ends[:-1], lengths), np.repeat(ends[1:], lengths)
     coordinates, shrink = _plane(where)
     posed = where.kind != NO_POSE
-    follows = np.zeros(len(living), np.bool_)  # whether the next entry is the next frame, with a pose of one kind
+    follows = np.zeros(len(living), np.bool_)  # whether the next entry is the next frame, with a pose of the same kind
     if len(living) > 1:
         follows[:-1] = (first[1:] == first[:-1]) & posed[1:] & (where.kind[1:] == where.kind[:-1])
     steps = np.linalg.norm(where.position[1:] - where.position[:-1], axis=1)[follows[:-1]]
@@ -177,13 +157,13 @@ def place_graph(
 
 
 def _plane(where: Whereabouts) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Coordinates in which near places can be subtracted, and the shrinking of the first one."""
+    """Coordinates that can be subtracted for near places, and the shrinking of the first of them."""
     coordinates, shrink = where.position.copy(), np.ones(len(where))
     earthly = where.kind == GEOGRAPHIC
     if earthly.any():
         unit = where.position[earthly] / EARTH_RADIUS
         longitude = np.arctan2(unit[:, 1], unit[:, 0])
-        middle = np.angle(np.exp(1j * longitude).mean())  # so that the seam lies behind the map
+        middle = np.angle(np.exp(1j * longitude).mean())  # so that the seam at ±180° is opposite the map
         longitude = np.angle(np.exp(1j * (longitude - middle)))
         latitude = np.arcsin(np.clip(unit[:, 2], -1, 1))
         flat = np.stack([longitude, latitude, np.zeros(len(latitude))], axis=1)
@@ -198,8 +178,8 @@ def _headings(
     shrink: NDArray[np.float64],
     follows: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Radians from the first coordinate; the way on where no heading was given."""
-    # Beside x and y a heading is counter-clockwise from +x, beside a latitude clockwise from north.
+    """Headings in radians from the first coordinate; the direction to the next frame if none was given."""
+    # In metres a heading is counter-clockwise from +x, in degrees clockwise from north.
     given = np.radians(np.where(where.kind == GEOGRAPHIC, 90 - where.heading, where.heading))
     way = np.full(len(where), np.nan)
     here = np.flatnonzero(follows)
@@ -208,7 +188,7 @@ def _headings(
     length = np.hypot(east, north)
     clear = length > 0
     way[here[clear]] = np.arctan2(north, east)[clear]
-    after = here + 1  # the last frame of a stretch looks where the one before it looked
+    after = here + 1  # the last frame of a sequence has the direction of the frame before it
     ending = after[np.isnan(way[after])]
     way[ending] = way[ending - 1]
     return np.where(np.isnan(given), way, given)
@@ -217,7 +197,7 @@ def _headings(
 def _edges(
     where: Whereabouts, first: NDArray[np.int32], last: NDArray[np.int32], reach: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """Which places are joined: for each itself, then those beside it in its sequence and the nearest, once each."""
+    """The edges: each place is joined to itself, then to those beside it in its sequence and to the nearest."""
     n = len(where)
     none = np.empty(0, np.int64)
     pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []

@@ -1,55 +1,61 @@
 """How a robot gets from place to place between two frames.
 
-Three models, each a transition matrix that is never written out: along the sequence (nothing is known but the order
-of the frames), within reach (a speed limit and the time between frames), by odometry (how far, which way, how
-sure).  The last two need poses; places without one always go along their sequence.
+There are three models, each a transition matrix over the places: along the sequences (only the order of the frames is
+known), within reach (a speed limit and the time between frames are known), and by odometry (how far, which way and how
+surely).  The last two need poses; places without one always go along their sequence.  A matrix is not written out to
+be applied: compiled loops (``core.kernels.belief``) go through the joined places alone.  ``matrix()`` of each model
+gives it in plain NumPy.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.belief.graph import PlaceGraph
-from core.kernels.belief_moves import along_sequence, by_odometry, within_reach
+from core.kernels.belief import FITS, MISFIT, along_sequence, by_odometry, within_reach
 from core.places import EARTH_RADIUS
 
 Masses = NDArray[np.float32]
+Matrix = NDArray[np.float64]
+
+HALF_TURN = math.pi * EARTH_RADIUS
+"""Half of the Earth's girth, metres."""
 
 FARTHEST_STEPS = 16
-"""A motion of more reaches than this is as good as a jump: it leaves no belief in any place."""
+"""A motion of more steps than this counts as a jump to any place."""
 
 DRIFT = 0.1
-"""Standard deviation of odometry beside what it says of itself: wheels slip by a tenth."""
+"""Standard deviation of odometry, as a share of the distance, in addition to its own variance: wheels slip."""
 
 HEADING_SPREAD = math.radians(20)
 """Standard deviation between a place's heading and that of a robot that sees the same."""
 
 TURN_NOTED = math.radians(15)
-"""A robot that has turned by this much sees something else, wherever it stands."""
+"""A robot that has turned by this much sees something else, even if it has not moved."""
 
 
 @dataclass(frozen=True)
 class Stride:
-    """Frames of a map's sequence that go by from one frame of a run to the next.
+    """By how many frames of a map's sequence a robot advances from one frame of its run to the next.
 
-    advance: the usual number, at least 0: 1 for a robot at the pace of the traverse, 0.1 for a camera ten times as
-        fast.
-    backwards: whether it may go against the sequence as readily; else a frame's slip is allowed.
+    advance: the usual number, at least 0: 1 for a robot at the pace of the traverse, 0.1 for a camera with ten times
+        the frame rate.
+    backwards: whether the robot may as well go against the sequence; otherwise it goes back by at most one frame.
     """
 
     advance: float = 1.0
     backwards: bool = False
 
     def kernel(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Offsets along the sequence and their probabilities: two-sided exponential around ``advance``.
+        """Offsets along the sequence, int64 [m], and their probabilities, float64 [m].
 
-        The scale is half a frame and two fifths of the advance, so that a pace that is not known well, as it never
-        is, costs little.
+        They are a two-sided exponential distribution around ``advance``.  Its scale is half a frame plus two fifths of
+        the advance, as the pace is never known well.
         """
         scale = 0.5 + 0.4 * self.advance
         farthest = math.ceil(self.advance + 4 * scale)
@@ -61,7 +67,7 @@ class Stride:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Motion since the frame before, in the robot's frame of then: metres and radians, with variances."""
+    """Motion since the frame before, in the robot's coordinates at that frame: metres and radians, with variances."""
 
     forward: float
     left: float = 0.0
@@ -70,9 +76,9 @@ class Odometry:
     turn_variance: float = 0.0
 
     def then(self, other: Odometry) -> Odometry:
-        """This motion, followed by another."""
+        """This motion followed by another."""
         cos, sin = math.cos(self.turn), math.sin(self.turn)
-        swing = self.turn_variance * (other.forward**2 + other.left**2)  # a turn not known well moves what follows
+        swing = self.turn_variance * (other.forward**2 + other.left**2)  # an uncertain turn displaces what follows
         return Odometry(
             self.forward + cos * other.forward - sin * other.left,
             self.left + sin * other.forward + cos * other.left,
@@ -82,7 +88,7 @@ class Odometry:
         )
 
     def part(self, count: int) -> Odometry:
-        """The ``count``-th part of it, taken as a straight line in the direction of the whole and then the turn."""
+        """One of ``count`` equal parts: a straight line in the direction of the whole, then a part of the turn."""
         share = 1 / count
         return Odometry(
             share * self.forward,
@@ -94,17 +100,17 @@ class Odometry:
 
     @property
     def distance(self) -> float:
-        """Metres as the crow flies."""
+        """The straight distance in metres."""
         return math.hypot(self.forward, self.left)
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is known of the motion between two frames; nothing, in a run's first.
+    """What is known about the motion between two frames; nothing for a run's first frame.
 
-    odometry: None where the robot tells none.
-    reach: metres that it can have gone, by its speed limit and the time between; None where that is not known.
-    frames: by how many the run's frame number grew; 1 where every frame arrives.
+    odometry: None if the robot reports none.
+    reach: the metres that the robot can have moved, by its speed limit and the time between; None if not known.
+    frames: by how much the run's frame number grew; 1 if every frame arrives.
     """
 
     odometry: Odometry | None = None
@@ -114,32 +120,177 @@ class Step:
 
 @dataclass
 class Pending:
-    """Motion told and not yet applied: less than half the distance between places, which no place would show."""
+    """Motion that was reported but not yet applied, as it is less than half the distance between places."""
 
     odometry: Odometry = field(default_factory=lambda: Odometry(0.0))
     reach: float = 0.0
 
 
-Move = Callable[[Masses, float, bool, float, Masses], tuple[float, float]]
-"""As the loops of ``moves.py`` are called: masses, the most not worth moving, whether to turn the matrix over, the
-value of being out of the map, and where to put the result."""
+class Move(Protocol):
+    """One step's transition matrix, which is never written out to be applied."""
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        """Multiply masses by the matrix with a compiled loop, into ``moved``, which holds zeros.
+
+        Args:
+            masses: float32 [n].
+            least: masses up to this are not moved; the first result is their sum.
+            back: whether to multiply by the transposed matrix instead.
+            outside: with ``back``, the value of having left the map.
+
+        Returns:
+            The mass that was not moved, and the mass that has left the map.
+        """
+
+    def matrix(self) -> Matrix:
+        """The matrix T in plain NumPy: T_ij is the share of place i's mass that goes to place j, float64 [n, n].
+
+        What a row lacks of 1 leaves the map.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class AlongSequences:
+    """Along the sequences by the offsets and probabilities of a :meth:`Stride.kernel`.
+
+    Places that are not ``moving``, bool [n], keep their mass.
+    """
+
+    graph: PlaceGraph
+    kernel: tuple[NDArray[np.int64], NDArray[np.float64]]
+    moving: NDArray[np.bool_]
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        moved[~self.moving] = masses[~self.moving]
+        graph = self.graph
+        found: tuple[float, float] = along_sequence(
+            masses, self.moving, graph.first, graph.last, *self.kernel, least, back, moved
+        )
+        return found
+
+    def matrix(self) -> Matrix:
+        places = np.arange(len(self.graph))
+        weights = np.zeros((len(places), len(places)))
+        for offset, weight in zip(*self.kernel, strict=True):
+            target = places + offset
+            inside = (self.graph.first <= target) & (target < self.graph.last)
+            weights[places[inside], target[inside]] = weight
+        stays = ~self.moving | ~weights.any(axis=1)  # at rest, or in a sequence that is shorter than the stride
+        weights[stays] = np.eye(len(places))[stays]
+        return weights / weights.sum(axis=1, keepdims=True)
+
+
+def displacements(graph: PlaceGraph) -> NDArray[np.float64]:
+    """Metres from place i to place j along the three coordinates, float64 [n, n, 3]; on the Earth the shorter way."""
+    apart = graph.coordinates[np.newaxis] - graph.coordinates[:, np.newaxis]
+    if graph.geographic:
+        east = apart[..., 0]
+        apart[..., 0] = np.where(np.abs(east) > HALF_TURN, east - np.copysign(2 * HALF_TURN, east), east)
+    apart[..., 0] *= graph.shrink[:, np.newaxis]
+    return apart
+
+
+def _pose_matrix(graph: PlaceGraph, fits: NDArray[np.float64]) -> Matrix:
+    """T_ij = w_ij / max(Σ_j w_ij, FITS), with the weight w_ij of the motion from place i to a joined place j.
+
+    If even all joined places together fit worse than FITS, the robot was probably not at place i, or is where the map
+    has no place: the motion is an observation, too.  Places without a pose keep their mass.
+    """
+    places = np.arange(len(graph))
+    joined = np.zeros((len(graph), len(graph)), np.bool_)
+    joined[np.repeat(places, np.diff(graph.starts)), graph.targets] = True
+    weights = np.where(joined, fits, 0.0)
+    matrix = weights / np.maximum(weights.sum(axis=1, keepdims=True), FITS)
+    matrix[places[~graph.posed], places[~graph.posed]] = 1
+    return matrix
+
+
+@dataclass(frozen=True, eq=False)
+class WithinReach:
+    """To the joined places within ``reach`` metres alike, and a little to those just beyond it.
+
+    A place b · ``softness`` metres beyond the reach has the weight exp(-b²/2); from b = 4 on it has none.
+    """
+
+    graph: PlaceGraph
+    reach: float
+    softness: float
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        graph = self.graph
+        moved[~graph.posed] = masses[~graph.posed]
+        edges = (graph.starts, graph.targets, graph.coordinates, graph.shrink, _half_turn(graph))
+        found: tuple[float, float] = within_reach(
+            masses, *edges, self.reach, self.softness, least, back, outside, moved
+        )
+        return found
+
+    def matrix(self) -> Matrix:
+        beyond = (np.linalg.norm(displacements(self.graph), axis=2) - self.reach) / self.softness
+        return _pose_matrix(self.graph, np.where(beyond < 4, np.exp(-0.5 * np.maximum(beyond, 0) ** 2), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ByOdometry:
+    """To the joined places by how well each fits a motion.
+
+    A place that the motion misses by d metres and, where both headings are known, by a turn of φ radians, has the
+    weight exp(-m) with the misfit m = (precision · d² + turn_precision · φ²) / 2; from m = MISFIT on it has none.
+    """
+
+    graph: PlaceGraph
+    odometry: Odometry
+    precision: float
+    turn_precision: float
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        graph, odometry = self.graph, self.odometry
+        moved[~graph.posed] = masses[~graph.posed]
+        edges = (graph.starts, graph.targets, graph.coordinates, graph.shrink, _half_turn(graph))
+        motion = (odometry.forward, odometry.left, odometry.turn, self.precision, self.turn_precision)
+        found: tuple[float, float] = by_odometry(masses, *edges, graph.heading, motion, least, back, outside, moved)
+        return found
+
+    def matrix(self) -> Matrix:
+        odometry, heading = self.odometry, self.graph.heading
+        known = ~np.isnan(heading)
+        cos, sin = np.cos(heading), np.sin(heading)
+        ahead = np.stack([odometry.forward * cos - odometry.left * sin, odometry.forward * sin + odometry.left * cos])
+        apart = displacements(self.graph)
+        directed = np.square(apart[..., 0] - ahead[0][:, np.newaxis]) + np.square(
+            apart[..., 1] - ahead[1][:, np.newaxis]
+        )
+        undirected = np.square(np.hypot(apart[..., 0], apart[..., 1]) - odometry.distance)
+        missed = np.where(known[:, np.newaxis], directed, undirected) + np.square(apart[..., 2])
+        turned = heading[np.newaxis] - heading[:, np.newaxis] - odometry.turn
+        turned = np.nan_to_num(turned - 2 * np.pi * np.floor((turned + np.pi) / (2 * np.pi)))  # in [-π, π)
+        misfit = 0.5 * self.precision * missed + 0.5 * self.turn_precision * np.square(turned)
+        return _pose_matrix(self.graph, np.where(misfit < MISFIT, np.exp(-misfit), 0.0))
+
+
+def _half_turn(graph: PlaceGraph) -> float:
+    """Half of the way round along the first coordinate, in metres; infinite where it does not lead round."""
+    return HALF_TURN if graph.geographic else math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """One step's matrix on one graph: a few moves, one after the other.
+    """One step's transition on one graph: a few moves, one after the other.
 
-    jumps: nothing that a place held stays near it; the moves are not looked at.
+    jumps: the robot may be anywhere; the moves are ignored.
     """
 
     moves: tuple[Move, ...]
     jumps: bool = False
 
     def forward(self, masses: Masses, floor: float) -> tuple[Masses, float, float]:
-        """Where masses float32 [n] go, what of them is to be spread over all places, and what has left the map.
+        """Move masses, float32 [n].
 
         Args:
-            floor: masses up to this are spread instead of moved: what all hold alike stays alike.
+            floor: masses up to this are not moved, but are to be spread over all places.
+
+        Returns:
+            The moved masses, float32 [n]; the mass to be spread over all places; the mass that has left the map.
         """
         if self.jumps:
             return np.zeros_like(masses), float(masses.sum(dtype=np.float64)), 0.0
@@ -151,7 +302,7 @@ class Transition:
         return masses if self.moves else masses.copy(), spread, gone
 
     def backward(self, values: Masses, outside: float) -> Masses:
-        """The mean of ``values`` float32 [n] over the successors of each place; ``outside`` where there is none."""
+        """The mean of ``values``, float32 [n], over the successors of each place; ``outside`` counts for the rest."""
         if self.jumps:
             return np.full_like(values, values.mean(dtype=np.float64))
         for move in reversed(self.moves):
@@ -162,40 +313,33 @@ class Transition:
 
 
 def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) -> Transition:
-    """The matrix of one step.
+    """The transition of one step.
 
     Args:
-        pending: motion too small to show is put into it, and taken out when it has become enough.
+        graph: of the map's places.
+        step: what is known about the motion.
+        stride: the usual advance along a sequence.
+        pending: collects motion that is too small to apply, until it is enough; changed.
     """
     moves: list[Move] = []
     if step.frames > FARTHEST_STEPS:
         return Transition((), jumps=True)
     told = graph.posed.any() and (step.odometry is not None or step.reach is not None)
     along = ~graph.posed if told else np.ones(len(graph), np.bool_)
-    offsets, weights = stride.kernel()
-
-    def go_along(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-        moved[~along] = p[~along]
-        found: tuple[float, float] = along_sequence(
-            p, along, graph.first, graph.last, offsets, weights, least, back, moved
-        )
-        return found
-
     if along.any():
-        moves += [go_along] * step.frames
+        moves += [AlongSequences(graph, stride.kernel(), along)] * step.frames
     if told:
-        further = _by_pose(graph, step, pending, along)
+        further = _by_pose(graph, step, pending)
         if further is None:
             return Transition((), jumps=True)
         moves += further
     return Transition(tuple(moves))
 
 
-def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.bool_]) -> list[Move] | None:
+def _by_pose(graph: PlaceGraph, step: Step, pending: Pending) -> list[Move] | None:
     """The moves of places with poses; None for a motion farther than the graph can follow."""
     shows = 0.5 * graph.spacing
-    half_turn = math.pi * EARTH_RADIUS if graph.geographic else math.inf
-    geometry = (graph.starts, graph.targets, graph.coordinates, graph.shrink)
+    move: Move
     if step.odometry is not None:
         whole = pending.odometry.then(step.odometry)
         pending.reach = 0.0
@@ -206,16 +350,7 @@ def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.
         count = max(1, math.ceil(whole.distance / graph.reach)) if graph.reach else 1
         part = whole.part(min(count, FARTHEST_STEPS))
         precision = 1 / max(part.variance + shows**2 + (DRIFT * part.distance) ** 2, 1e-6)
-        turn_precision = 1 / (part.turn_variance + HEADING_SPREAD**2)
-        motion = (part.forward, part.left, part.turn, precision, turn_precision)
-
-        def go(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-            moved[along] = p[along]
-            found: tuple[float, float] = by_odometry(
-                p, *geometry, half_turn, graph.heading, motion, least, back, outside, moved
-            )
-            return found
-
+        move = ByOdometry(graph, part, precision, 1 / (part.turn_variance + HEADING_SPREAD**2))
     else:
         assert step.reach is not None
         whole_reach = pending.reach + step.reach
@@ -225,13 +360,5 @@ def _by_pose(graph: PlaceGraph, step: Step, pending: Pending, along: NDArray[np.
             return []
         pending.reach = 0.0
         count = max(1, math.ceil(whole_reach / graph.reach)) if graph.reach else 1
-        reach, softness = whole_reach / min(count, FARTHEST_STEPS), max(shows, 1e-3)
-
-        def go(p: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
-            moved[along] = p[along]
-            found: tuple[float, float] = within_reach(
-                p, *geometry, half_turn, reach, softness, least, back, outside, moved
-            )
-            return found
-
-    return None if count > FARTHEST_STEPS else [go] * count
+        move = WithinReach(graph, whole_reach / min(count, FARTHEST_STEPS), max(shows, 1e-3))
+    return None if count > FARTHEST_STEPS else [move] * count

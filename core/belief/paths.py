@@ -1,10 +1,10 @@
-"""Straight paths through the last frames, instead of a filter: the sequence search of SeqSLAM, looking back only.
+"""Straight paths through the last frames: the sequence search of SeqSLAM, over past frames only.
 
 Milford, Wyeth: SeqSLAM: Visual Route-based Navigation for Sunny Summer Days and Stormy Winter Nights, ICRA 2012.
-There paths of nearly constant velocity are laid through a matrix of differences; here through the evidence of the
-last frames, which already sets each score against the others of its frame, as SeqSLAM's contrast enhancement does.
-A path ends at the present frame.  No motion is assumed but a pace; nothing older than the last frames counts, so
-that a robot that was carried off is found again once it has gone as many frames.
+SeqSLAM searches for paths of nearly constant velocity in a matrix of differences; here they are searched for in the
+evidence of the last frames, which already compares each score with the others of its frame, as SeqSLAM's contrast
+enhancement does.  A path ends at the present frame.  Only the pace is assumed to be known.  As nothing older than the
+last frames counts, a robot that was carried away is found again after as many frames.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,25 +20,18 @@ from core.belief.evidence import NOTHING, Evidence
 from core.belief.filter import Belief, uninformed
 from core.belief.graph import PlaceGraph
 from core.belief.motion import Stride
+from core.kernels.belief import add_along
 
 PACES = tuple(round(0.5 + 0.1 * step, 1) for step in range(11))
 """Velocities of the paths, as multiples of the usual advance."""
 
 
-@numba.njit(cache=True, nogil=True)
-def _add_along(places, gains, shift, first, last, totals):  # type: ignore[no-untyped-def]
-    """Add each place's gain to the end of the path that was at that place ``shift`` frames of the sequence before."""
-    for k in range(len(places)):
-        place = places[k]
-        if place >= 0 and first[place] <= place + shift < last[place]:
-            totals[place + shift] += gains[k]
-
-
 class PathSearch:
-    """The evidence of a run's last frames.
+    """The evidence of a run's last frames, and the best paths through it.
 
     Args:
-        frames: how many count, 1 or more.
+        frames: how many frames a path has, at least 1.
+        seen: the evidence of earlier frames, oldest first.
     """
 
     def __init__(self, frames: int, seen: Sequence[Evidence] = ()) -> None:
@@ -52,16 +44,16 @@ class PathSearch:
         return tuple(self._seen)
 
     def append(self, seen: Evidence, missed: int = 0) -> None:
-        """Take in one frame, after ``missed`` ones that did not arrive, which say nothing."""
+        """Add one frame, after ``missed`` frames that did not arrive and say nothing."""
         for _ in range(min(missed, self.frames)):
             self._seen.append(NOTHING)
         self._seen.append(seen)
 
     def belief(self, graph: PlaceGraph, stride: Stride) -> Belief:
-        """Each place by the likelihood of the best path that ends there, every path being as likely beforehand.
+        """The belief in which each place has the likelihood of the best path that ends there.
 
-        "Not in the map" is held against the best path of all, not against their sum: a map of many places is no
-        likelier to hold the robot than one of few.
+        All paths have the same prior.  "Not in the map" is compared with the best path, not with the sum of all: a
+        robot is no likelier to be in a map of many places than in a map of few.
         """
         n = len(graph)
         if not n:
@@ -78,7 +70,7 @@ class PathSearch:
         for path in sorted(shifts):
             totals = np.zeros(n, np.float32)
             for shift, (places, gains) in zip(path, placed, strict=True):
-                _add_along(places, gains, shift, graph.first, graph.last, totals)
+                add_along(places, gains, shift, graph.first, graph.last, totals)
             np.maximum(best, totals, out=best)
         unknown = sum(seen.unknown for seen in self._seen)
         return _normalised(best, unknown)

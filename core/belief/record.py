@@ -1,4 +1,4 @@
-"""A run's state as bytes: a JSON head with its length before it and the arrays behind it, under one checksum."""
+"""A run's state as bytes: a checksum of what follows, the length of a JSON header, the header, and the arrays."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _PREFIX = struct.Struct("<II")  # checksum of all that follows it, length of the
 
 
 class DamagedRecord(ValueError):
-    """The bytes are not those that were written, or were written in another form."""
+    """The bytes are damaged, or of another format."""
 
 
 def to_bytes(state: RunState) -> bytes:
-    """A few kilobytes: rows as 8 bytes each, probabilities and gains as 4."""
+    """Serialize a state, in a few kilobytes: 8 bytes for each row, 4 for each probability and gain."""
     odometry = state.odometry
     head = {
         "format": FORMAT,
@@ -43,10 +43,10 @@ def to_bytes(state: RunState) -> bytes:
 
 
 def from_bytes(data: bytes) -> RunState:
-    """What ``to_bytes`` wrote.
+    """Read what :func:`to_bytes` wrote.
 
     Raises:
-        DamagedRecord: it did not write this.
+        DamagedRecord: the bytes are damaged, or of another format.
     """
     try:
         checksum, length = _PREFIX.unpack_from(data)

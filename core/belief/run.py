@@ -1,4 +1,4 @@
-"""One robot's run: frames come in one by one, the belief goes on; what has to be kept of it between two frames."""
+"""One robot's run: its belief, updated frame by frame, and the state from which it can be continued."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from core.belief.motion import TURN_NOTED, Odometry, Pending, Step, Stride, tran
 from core.belief.paths import PathSearch
 
 LOST_AFTER = 5
-"""A robot that was recognized once is lost when so many frames in a row were not."""
+"""After a first recognized frame, the robot is lost once this many frames in a row were not recognized."""
 
 STANDING = 0.1
-"""What a further look from the same spot counts: it shows the same, so it is mistaken about the same."""
+"""Weight of a further frame from the same spot: it shows the same things and leads to the same mistakes."""
 
 KEPT = 512
-"""Places whose probabilities are written down one by one; the others share what is left."""
+"""The state has the probabilities of this many places; the others share the rest."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,13 @@ class RunOptions:
 
 @dataclass(frozen=True, eq=False)
 class RunState:
-    """What a run can be taken up from again: all but the probabilities of the least likely places, and the lag.
+    """From what a run can be continued: all but the probabilities of the least likely places and the last frames.
 
-    rows, masses: int64 and float32 [k], the likeliest places and their probabilities if the robot sees the map.
-    seen: evidence that the path search still counts.
+    rows, masses: int64 [k] and float32 [k], the likeliest places and their probabilities if the robot sees the map.
+    unknown: the probability that the robot does not see the map.
+    frames, unrecognized: as of the :class:`Run`.
+    odometry, reach: motion told and not yet applied.
+    seen: the evidence that the path search still uses.
     """
 
     rows: NDArray[np.int64]
@@ -60,10 +63,10 @@ class RunState:
 
 
 class Run:
-    """The belief of one run.  Not to be used by two threads at a time.
+    """The belief of one run; two threads must not use it at the same time.
 
-    frames: frames taken in so far.
-    unrecognized: frames since the last that was recognized; None before the first.
+    frames: how many frames there were.
+    unrecognized: how many frames since the last recognized one; None before the first.
     """
 
     def __init__(self, options: RunOptions, graph: PlaceGraph) -> None:
@@ -77,28 +80,28 @@ class Run:
 
     @property
     def lost(self) -> bool:
-        """Whether it was known where the robot is, and has not been for some frames."""
+        """Whether the robot was recognized once, but not in the last frames."""
         return self.unrecognized is not None and self.unrecognized >= LOST_AFTER
 
     @property
     def bytes(self) -> int:
-        """Of memory that the run holds at most, the graph not counted."""
+        """Upper bound of the run's memory in bytes, without the graph."""
         moments = 1 + (self.options.lag + 1 if self.options.lag else 0)
         return 4 * len(self.graph) * moments + 2048 * self.options.path_frames
 
     def place_on(self, graph: PlaceGraph) -> None:
-        """Go on over the places as they are now."""
+        """Continue on another graph, after the map's places have changed."""
         if graph is not self.graph:
             self.belief = reindexed(self.belief, self.graph, graph)
             self._smoother.clear()
             self.graph = graph
 
     def advance(self, seen: Evidence, step: Step) -> None:
-        """Take in one frame.
+        """Update the belief with one frame.
 
         Args:
-            seen: what it says.
-            step: the motion since the frame before; of the first frame it does not matter.
+            seen: the evidence of the frame.
+            step: the motion since the frame before; ignored for the first frame.
         """
         if self.options.filter == "path":
             self._paths.append(seen, step.frames - 1)
@@ -114,7 +117,7 @@ class Run:
         self.frames += 1
 
     def _freshness(self, step: Step) -> float:
-        """How much a frame says that the one before did not; all, where nothing is known of the motion."""
+        """The weight of a frame: less than 1 if odometry says that the robot has hardly moved since the last one."""
         if step.odometry is None or not self.frames or not self.graph.spacing:
             return 1.0
         moved = step.odometry.distance / (0.5 * self.graph.spacing)
@@ -122,11 +125,11 @@ class Run:
         return float(min(1.0, max(STANDING, moved, turned)))
 
     def estimate(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
-        """Where the robot is; counts whether it was recognized, so call it once a frame.
+        """Where the robot is; this counts unrecognized frames, so call it once for each frame.
 
         Args:
-            count: candidates to list.
-            alive: bool [rows of the map]; places that have died since the graph was made are not told.
+            count: how many candidates to list.
+            alive: bool [rows of the map]; places that were removed since the graph was made are not listed.
         """
         found = self._told(self.belief, count, alive)
         if found.verdict == "recognized":
@@ -136,11 +139,11 @@ class Run:
         return found
 
     def look(self, count: int, alive: NDArray[np.bool_]) -> Estimate:
-        """The same between two frames; nothing is counted."""
+        """Where the robot is, without counting: for calls between two frames."""
         return self._told(self.belief, count, alive)
 
     def earlier(self, count: int, alive: NDArray[np.bool_]) -> Estimate | None:
-        """Where the robot was ``lag`` frames ago, given all frames since; None where that is not known."""
+        """Where the robot was ``lag`` frames ago, given all frames since; None if that is not known."""
         smoothed = self._smoother.smoothed(self.graph) if self.options.lag else None
         return None if smoothed is None else self._told(smoothed, count, alive)
 
@@ -155,7 +158,7 @@ class Run:
         return estimate(belief, self.graph, count)
 
     def state(self) -> RunState:
-        """What to write down."""
+        """The state from which the run can be continued."""
         masses = self.belief.given
         best = np.argpartition(-masses, KEPT)[:KEPT] if len(masses) > KEPT else np.arange(len(masses))
         seen = self._paths.seen if self.options.filter == "path" else ()
@@ -172,7 +175,7 @@ class Run:
 
     @classmethod
     def restored(cls, options: RunOptions, graph: PlaceGraph, state: RunState) -> Run:
-        """A run taken up again; places that are no more are left out, the others share what was not written down."""
+        """Continue a run from its state; removed places are left out, the others share what the state does not have."""
         run = cls(options, graph)
         run.frames, run.unrecognized = state.frames, state.unrecognized
         run._pending = Pending(state.odometry, state.reach)

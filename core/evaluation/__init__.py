@@ -1,15 +1,13 @@
-"""How well systems recognize one traverse by another: the thesis's protocol, its data sets, its comparison."""
+"""How well systems recognize one traverse by another: the thesis's protocol, data sets, and report."""
 
-from core.evaluation.protocol.comparison import Box, Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
 from core.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
     Evaluation,
-    auc_pr,
-    auc_roc,
     extended_precision,
-    recall_at,
     recall_at_full_precision,
+    recall_at_k,
     summarize,
 )
 from core.evaluation.protocol.outcomes import Outcome, judge, judge_ranking
@@ -18,20 +16,17 @@ from core.evaluation.protocol.results import results_csv
 __all__ = [
     "DEPTHS",
     "STAGES",
-    "Box",
     "Comparison",
     "Evaluation",
     "Outcome",
     "Run",
     "ScalePoint",
     "SeverityCurve",
-    "auc_pr",
-    "auc_roc",
     "extended_precision",
     "judge",
     "judge_ranking",
-    "recall_at",
     "recall_at_full_precision",
+    "recall_at_k",
     "results_csv",
     "summarize",
 ]

@@ -1,12 +1,11 @@
-"""What was measured before, kept by the content of all that it depends on.
+"""A cache of measurements, keyed by the content of everything that they depend on.
 
-An entry is one file, a SHA-256 and the ``.npz`` bytes that it covers (JSON and arrays), written whole
-or not at all; one that cannot be read counts as absent.  The folder can be deleted at any time.
+An entry is one file: a SHA-256 and the ``.npz`` bytes (JSON and arrays) that it covers, written whole
+or not at all.  An entry that cannot be read counts as absent.  The folder can be deleted at any time.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
@@ -22,22 +21,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import replacing
 from core.errors import InvalidTraverse
 from core.networks.identity import canonical_json, json_digest
 
 FORMAT = "placerec-evaluation/1"
 VALUES = "values"
-LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "scipy", "torch")
+LIBRARIES = ("faiss-cpu", "numba", "numpy", "opencv-python-headless", "scipy", "torch")
 
-# What shows, keeps or transports figures but cannot change one.
-NOT_COMPUTING = ("evaluation/report", "evaluation/cache.py", "evaluation/data/datasets.py", "models", "storage")
+NOT_COMPUTING = (
+    "belief/",
+    "disk/",
+    "evaluation/cache.py",
+    "evaluation/data/datasets.py",
+    "evaluation/report/",
+    "evaluation/samples.py",
+    "evaluation/timing.py",
+    "index/",
+    "recognition/",
+    "storage/",
+    "upkeep/",
+)
+"""Code of ``core`` that no figure of an evaluation depends on."""
 
 DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """What is kept under one key."""
+    """The content of one entry."""
 
     values: dict[str, Any]
     arrays: dict[str, NDArray[np.generic]] = field(default_factory=dict)
@@ -50,16 +62,16 @@ def default_folder() -> Path:
 
 
 class EvaluationCache:
-    """A folder of entries; without a folder nothing is kept.
+    """A folder of entries; with None as folder nothing is cached.
 
-    writable: turns False when an entry could not be written; the run goes on without.
+    writable: turns False when an entry could not be written; the run goes on without it.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self.folder, self.writable = folder, True
 
     def load(self, key: str) -> CacheEntry | None:
-        """The entry of a key; None where there is none, or a damaged one."""
+        """The entry of a key; None if it is absent or damaged."""
         if self.folder is None:
             return None
         try:
@@ -74,23 +86,21 @@ class EvaluationCache:
         return CacheEntry(json.loads(arrays.pop(VALUES).tobytes()), arrays)
 
     def store(self, key: str, entry: CacheEntry) -> None:
-        """Keep an entry, whole or not at all."""
+        """Write an entry, whole or not at all."""
         if self.folder is None:
             return
         buffer = io.BytesIO()
         text = np.frombuffer(canonical_json(entry.values).encode(), np.uint8)
         np.savez(buffer, allow_pickle=False, **{VALUES: text}, **entry.arrays)
         data = buffer.getvalue()
-        # Two evaluations may store the same entry at one time: each writes a file of its own.
+        # Two evaluations may store the same entry at the same time, so each writes a file of its own.
         partial = self.folder / f"{key}.{secrets.token_hex(4)}.tmp"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(hashlib.sha256(data).digest() + data)
-            os.replace(partial, self._file(key))
+            with replacing(self._file(key), partial, durable=False):
+                partial.write_bytes(hashlib.sha256(data).digest() + data)
         except OSError:
             self.writable = False
-            with contextlib.suppress(OSError):
-                partial.unlink()
 
     def _file(self, key: str) -> Path:
         assert self.folder is not None
@@ -98,7 +108,7 @@ class EvaluationCache:
 
 
 def cache_key(**parts: Any) -> str:
-    """SHA-256 over ``parts`` (JSON) and over all that computes: the code in ``core/`` and its libraries."""
+    """SHA-256 over ``parts`` (JSON), the code in ``core/`` that computes figures, and the versions of its libraries."""
     return json_digest({"format": FORMAT, "code": code_digest(), "libraries": _libraries(), **parts})
 
 
@@ -115,7 +125,7 @@ def code_digest() -> str:
 
 
 def files_digest(paths: Sequence[Path]) -> str:
-    """SHA-256 over the contents of files in their order; names do not count.
+    """SHA-256 over the contents of files in their order, without their names.
 
     Raises:
         InvalidTraverse: one cannot be read.

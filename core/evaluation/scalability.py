@@ -9,9 +9,10 @@ import numpy as np
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.protocol.comparison import ScalePoint
-from core.evaluation.protocol.figures import auc_pr, recall_at
-from core.evaluation.protocol.outcomes import judge
-from core.evaluation.subjects import Subject
+from core.evaluation.protocol.figures import recall_at_k
+from core.evaluation.protocol.outcomes import best_matched, best_scores, judge
+from core.evaluation.subject import Subject
+from core.judgement.curves import auc_pr
 
 POINTS = 6
 FEWEST = 8
@@ -44,7 +45,7 @@ def scalability(subject: Subject, cache: EvaluationCache) -> list[ScalePoint]:
 
 
 def scale_steps(subject: Subject) -> int:
-    """Queries that are compared for the points."""
+    """How many queries are scored for the points."""
     return sum(len(_asked(subject.pair, size)) for size in scale_sizes(len(subject.pair.kept)))
 
 
@@ -58,13 +59,13 @@ def _point(subject: Subject, size: int) -> ScalePoint:
     """The point of the first ``size`` kept references."""
     kept, asked = subject.pair.kept[:size], _asked(subject.pair, size)
     index = subject.system.index(subject.references.descriptions[:size])
-    compared = subject.compare(index, [subject.queries.descriptions[number] for number in asked])
-    outcomes = judge(compared.scores, kept, [subject.pair.truth[number] for number in asked])
+    scored = subject.score(index, [subject.queries.descriptions[number] for number in asked])
+    outcomes = judge(scored.scores, kept, [subject.pair.truth[number] for number in asked])
     return ScalePoint(
         system=subject.about.name,
         references=size,
         queries=len(asked),
-        auc_pr=auc_pr([outcome.score for outcome in outcomes], [outcome.matched for outcome in outcomes]),
-        recall_at_1=recall_at(outcomes, 1),
-        milliseconds=float(np.median(compared.milliseconds)),
+        auc_pr=auc_pr(best_scores(outcomes), best_matched(outcomes)),
+        recall_at_1=recall_at_k(outcomes, 1),
+        milliseconds=float(np.median(scored.milliseconds)),
     )

@@ -8,9 +8,10 @@ from core.baselines.system import Index
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
 from core.evaluation.data.disturbances import DISTURBANCES, Disturbance
 from core.evaluation.protocol.comparison import SeverityCurve
-from core.evaluation.protocol.figures import auc_pr, recall_at
-from core.evaluation.protocol.outcomes import judge
-from core.evaluation.subjects import Described, Subject
+from core.evaluation.protocol.figures import recall_at_k
+from core.evaluation.protocol.outcomes import best_matched, best_scores, judge
+from core.evaluation.subject import Described, Subject
+from core.judgement.curves import auc_pr
 
 
 def severity(
@@ -39,7 +40,7 @@ def severity(
 
 
 def severity_steps(subject: Subject, disturbances: Sequence[Disturbance] = DISTURBANCES) -> int:
-    """Pictures that are described and compared for the curves; the undisturbed ones are compared only."""
+    """How many images are described and scored for the curves; the undisturbed ones are only scored."""
     return len(subject.pair.queries) * sum(2 * len(disturbance.levels) - 1 for disturbance in disturbances)
 
 
@@ -67,10 +68,10 @@ def _disturbed(subject: Subject, disturbance: Disturbance, level: float, seed: i
 
 def _point(subject: Subject, index: Index, queries: Described) -> tuple[float, float]:
     """recall@1 (0 where no query has a true reference) and AUC-PR."""
-    scores = subject.compare(index, queries.descriptions).scores
+    scores = subject.score(index, queries.descriptions).scores
     outcomes = judge(scores, subject.pair.kept, subject.pair.truth)
-    area = auc_pr([outcome.score for outcome in outcomes], [outcome.matched for outcome in outcomes])
-    return recall_at(outcomes, 1) or 0.0, area
+    area = auc_pr(best_scores(outcomes), best_matched(outcomes))
+    return recall_at_k(outcomes, 1) or 0.0, area
 
 
 def _loaded(entry: CacheEntry | None, disturbance: Disturbance, subject: Subject) -> SeverityCurve | None:

@@ -1,27 +1,29 @@
-"""How long things take: medians of interleaved runs, so that what disturbs one disturbs all."""
+"""How long the stages of recognition take: medians of interleaved runs, so that what disturbs one disturbs all."""
 
 from __future__ import annotations
 
 import copy
+import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import nn
 
+from core.evaluation.samples import fill_map, sample_frame
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, prepare
-from core.judgement.verdict import NO_POSE
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import examine
-from core.storage.files.segment_files import ROWS_PER_SEGMENT
-from core.storage.search.snapshot import Snapshot
-from core.storage.search.spots import Spot
+from core.recognition.recognition import locate
+from core.storage import Atlas
 from core.threads import each
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels last": torch.channels_last}
+MATCHES = 5
+"""Matches that a timed query lists."""
 
 
 def medians(runs: Mapping[str, Callable[[], object]], rounds: int, warm_up: int = 3) -> dict[str, float]:
@@ -34,28 +36,6 @@ def medians(runs: Mapping[str, Callable[[], object]], rounds: int, warm_up: int 
             if index >= warm_up:
                 times[name].append(1e3 * (time.perf_counter() - began))
     return {name: float(np.median(spent)) for name, spent in times.items()}
-
-
-def sample_picture(seed: int = 0, width: int = 640, height: int = 480) -> Pixels:
-    """Blocks, circles and grain: as rich in regions, and as large as a file, as a photograph."""
-    random = np.random.default_rng(seed)
-    picture = np.zeros((height, width, 3), np.uint8)
-    picture[:] = np.linspace(60, 200, height, dtype=np.uint8)[:, None, None]
-    for _ in range(60):
-        x, y = int(random.integers(width)), int(random.integers(height))
-        colour = tuple(int(value) for value in random.integers(0, 256, 3))
-        if random.random() < 0.6:
-            corner = (x + int(random.integers(10, 160)), y + int(random.integers(10, 160)))
-            cv2.rectangle(picture, (x, y), corner, colour, -1)
-        else:
-            cv2.circle(picture, (x, y), int(random.integers(5, 70)), colour, -1)
-    grain = random.normal(0, 9, (height, width, 1))
-    return np.clip(cv2.GaussianBlur(picture, (0, 0), 1.2) + grain, 0, 255).astype(np.uint8)
-
-
-def jpeg(picture: Pixels, quality: int = 90) -> bytes:
-    """The picture as JPEG bytes."""
-    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def forward_passes(encoder: Encoder, pixels: Pixels) -> dict[str, Callable[[], object]]:
@@ -84,6 +64,11 @@ def forward_passes(encoder: Encoder, pixels: Pixels) -> dict[str, Callable[[], o
     return {name: make(layout) for name, layout in LAYOUTS.items()}
 
 
+def better_forward(times: Mapping[str, float]) -> float:
+    """The bare forward pass in the better of the two layouts, milliseconds."""
+    return min(times[name] for name in LAYOUTS)
+
+
 def encoding_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], object]]:
     """Runs to compare: the two bare forward passes, ``encode`` (with decoding), ``decode``, ``regions``."""
     pixels = decode(data)
@@ -97,20 +82,22 @@ def encoding_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], objec
 
 
 def encode_batch(encoder: Encoder, frames: Sequence[bytes]) -> list[Encoding]:
-    """Decode and encode frames as fast as this process can: the cores decode some each, and encode some each."""
+    """Decode and encode frames as fast as this process can: each core decodes some, then encodes some."""
     return encoder.encode_batch(each(decode, frames, torch.get_num_threads()))
 
 
-def search_run(encoder: Encoder, places: int) -> Callable[[], object]:
-    """A search of both stages among so many places of random values, one of which is asked for."""
-    random, middle = np.random.default_rng(0), places // 2
-    known = random.standard_normal((places, encoder.dimension), np.float32)
-    local = random.integers(-127, 128, (places, *encoder.local_shape), np.int8)
-    empty = Snapshot(encoder.dimension, ROWS_PER_SEGMENT, local_shape=encoder.local_shape, halves=True)
-    snapshot = empty.appended(list(known), [Spot(NO_POSE, (0.0, 0.0, 0.0), -1, 0)] * places, list(local))
-    return lambda: examine(encoder, snapshot, local[middle], snapshot.search(known[middle]))
+@contextmanager
+def search_run(encoder: Encoder, places: int) -> Iterator[Callable[[], object]]:
+    """A run that answers an encoded query as the service does: both stages, verdict, look-up of the matches.
 
-
-def better_forward(times: Mapping[str, float]) -> float:
-    """The bare forward pass in the better of the two layouts, milliseconds."""
-    return min(times[name] for name in LAYOUTS)
+    The map has so many sample places and lies in a temporary folder until the block ends.
+    """
+    query = encoder.encode(sample_frame(0))
+    with tempfile.TemporaryDirectory() as folder:
+        fill_map(Path(folder), "sample", encoder, places)
+        atlas = Atlas(Path(folder))
+        try:
+            map_ = atlas.get("sample")
+            yield lambda: locate(map_, encoder, [query], MATCHES)
+        finally:
+            atlas.close()

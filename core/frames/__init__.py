@@ -1,1 +1,1 @@
-"""Frames: from the bytes of a file to pixels, masks, the input of a network; folders of frames as traverses."""
+"""Frames: decoding files to pixels, masks, the input of a network, and folders of frames as traverses."""

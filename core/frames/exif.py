@@ -1,7 +1,7 @@
-"""What a camera writes beside the pixels: orientation, position, time (CIPA DC-008, Exif 2.32).
+"""The EXIF metadata of an image file: orientation, position, time (CIPA DC-008, Exif 2.32).
 
-An EXIF block is a small TIFF file.  Cameras and editors write many that are broken; whatever cannot
-be read counts as absent, and no block raises an error.
+An EXIF block is a small TIFF file.  Cameras and editors write many that are broken; tags that cannot be read count as
+absent, and no block raises an error.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from core.frames.containers import find_exif
 from core.places import Pose
 
 Value = bytes | tuple[int, ...] | tuple[float, ...]
-"""Text, whole numbers, or fractions of one tag."""
+"""The value of a tag: text, whole numbers, or fractions."""
 
 MAX_TAGS = 512
 MAX_BYTES = 1024  # of one tag; those read here have a few dozen
@@ -35,10 +35,10 @@ _FRACTIONS = (5, 10)
 
 
 def read_orientation(block: bytes | None) -> int:
-    """Orientation 1 to 8 of an EXIF block; 1, the pixels as they are, if it says none.
+    """The orientation, 1 to 8, of an EXIF block; 1 (the pixels as they are) if it has none.
 
-    The number says where row 0 and column 0 of the stored pixels are seen: 1 top left, 2 top right,
-    3 bottom right, 4 bottom left, 5 left top, 6 right top, 7 right bottom, 8 left bottom.
+    The number says where row 0 and column 0 of the stored pixels belong: 1 top left, 2 top right, 3 bottom right,
+    4 bottom left, 5 left top, 6 right top, 7 right bottom, 8 left bottom.
     """
     if block is None:
         return 1
@@ -46,15 +46,15 @@ def read_orientation(block: bytes | None) -> int:
     return int(value[0]) if value and value[0] in range(1, 9) else 1
 
 
-def read_whereabouts(data: bytes) -> tuple[Pose | None, datetime | None]:
-    """Where and when an image file says that it was taken.
+def read_pose_and_time(data: bytes) -> tuple[Pose | None, datetime | None]:
+    """The pose and the time that an image file was taken at, according to its metadata; None for what is missing.
 
-    The pose is in degrees (WGS 84). Its heading is the image direction if that is measured from true
-    north; a magnetic direction is left out, its declination being unknown. The time is in UTC: the
-    camera's clock if it names its offset, else the satellites'. A clock without an offset names no instant.
+    The pose is in degrees (WGS 84).  Its heading is the image direction if that is relative to true north; a magnetic
+    direction is ignored, as its declination is not known.  The time is in UTC: that of the camera's clock if its offset
+    is given, else that of the satellites.
 
     Args:
-        data: a JPEG, PNG or WebP file; of anything else nothing is known.
+        data: a JPEG, PNG or WebP file; other bytes have no metadata.
     """
     block = find_exif(data)
     if block is None:
@@ -70,7 +70,7 @@ def _first_folder(block: bytes) -> int:
 
 
 def _order(block: bytes) -> str:
-    """Byte order of a TIFF block as a struct prefix; "" if it is none."""
+    """The byte order of a TIFF block as a struct prefix; "" if the block is not TIFF."""
     return {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4], "")
 
 
@@ -79,7 +79,7 @@ def _unpack(block: bytes, position: int, codes: str) -> tuple[int, ...]:
 
 
 def _folder(block: bytes, position: int) -> dict[int, Value]:
-    """The tags of the directory at ``position``, as far as they can be read; none at position 0."""
+    """The readable tags of the directory at ``position``; none for position 0."""
     tags: dict[int, Value] = {}
     if position < 8 or position + 2 > len(block):
         return tags

@@ -1,4 +1,4 @@
-"""From the bytes of a frame to colour pixels, and back to small pictures."""
+"""From the bytes of an image file to colour pixels, and from pixels to thumbnails and PNG files."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from core.frames.truncation import may_be_filled, same, with_other_endings
 
 __all__ = ["Header", "Limits", "Pixels", "decode", "encode_png", "encode_thumbnail", "read_header"]
 
-# The orientation is applied here, the same way for the three formats; OpenCV's versions differ in it.
+# The orientation is applied here in the same way for all formats; OpenCV's versions differ in this.
 _COLOUR = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
-# A bad picture is an error that the caller gets; OpenCV need not tell stderr of it as well.
+# A damaged image raises an error; OpenCV need not write to stderr as well.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How large a frame may be, in bytes as sent and in pixels by its header, and how small."""
+    """Limits of an image file: its bytes, the pixels that its header announces, and its shorter side."""
 
     max_bytes: int = 16 * 1024 * 1024
     max_pixels: int = 40_000_000
@@ -41,22 +41,22 @@ class Limits:
 
 
 def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
-    """The pixels of a JPEG, PNG or WebP file, upright by its EXIF orientation.
+    """Decode a JPEG, PNG or WebP file, upright by its EXIF orientation.
 
     Grey pictures and palettes become colour, transparency is dropped, 16 bits become 8.
 
     Returns:
-        H x W x 3 uint8, BGR, contiguous.
+        uint8 [H, W, 3], BGR, contiguous.
 
     Raises:
-        EmptyImage: no bytes.
-        ImageTooLarge: more than ``limits.max_bytes``.
+        EmptyImage: there are no bytes.
+        ImageTooLarge: the file has more than ``limits.max_bytes``.
         TooManyPixels: the header announces more than ``limits.max_pixels``; nothing was decoded.
         ImageTooSmall: a side is under ``limits.min_side``.
-        TruncatedImage: the bytes end before the image does, or do not hold all of it.
-        UnsupportedFormat: an image, but not one of the three formats, or an animation.
-        NotAnImage: anything else, or damaged.
-        MemoryError: there is no room for the pixels.
+        TruncatedImage: the bytes end before the image does, or a part of it is missing.
+        UnsupportedFormat: the file is an image of another format, or an animation.
+        NotAnImage: the file is not an image, or is damaged.
+        MemoryError: there is not enough memory for the pixels.
     """
     if not data:
         raise EmptyImage("The image has no bytes.")
@@ -83,7 +83,7 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
 
 
 def _pixels(data: bytes) -> Pixels | None:
-    """What OpenCV makes of a file, None if nothing."""
+    """Decode a file with OpenCV; None if it cannot."""
     try:
         decoded = cv2.imdecode(np.frombuffer(data, np.uint8), _COLOUR)
     except cv2.error as error:
@@ -94,7 +94,7 @@ def _pixels(data: bytes) -> Pixels | None:
 
 
 def _upright(pixels: Pixels, orientation: int) -> Pixels:
-    """Pixels as they are to be seen, for an EXIF orientation from 1 to 8; no copy is made for 1."""
+    """Turn pixels upright by their EXIF orientation, 1 to 8; no copy is made for 1."""
     match orientation:
         case 2:
             turned = cv2.flip(pixels, 1)
@@ -116,12 +116,12 @@ def _upright(pixels: Pixels, orientation: int) -> Pixels:
 
 
 def encode_thumbnail(pixels: Pixels, longest_side: int = 320, quality: int = 80) -> bytes:
-    """A JPEG of the picture, shrunk (never enlarged) to ``longest_side`` pixels.
+    """Encode a picture as JPEG, shrunk (never enlarged) to ``longest_side`` pixels.
 
     Args:
-        pixels: H x W x 3 uint8, BGR.
-        longest_side: pixels of the longer side at most.
-        quality: 1 to 100, as JPEG encoders count it.
+        pixels: uint8 [H, W, 3], BGR.
+        longest_side: at most this many pixels of the longer side.
+        quality: of the JPEG, 1 to 100.
 
     Raises:
         InvalidImage: the picture cannot be encoded (a side is zero, or over 65 535).
@@ -135,10 +135,10 @@ def encode_thumbnail(pixels: Pixels, longest_side: int = 320, quality: int = 80)
 
 
 def encode_png(pixels: Pixels) -> bytes:
-    """A PNG of the picture, pixel for pixel.
+    """Encode a picture as PNG, without loss.
 
     Args:
-        pixels: H x W x 3 uint8, BGR.
+        pixels: uint8 [H, W, 3], BGR.
 
     Raises:
         InvalidImage: the picture cannot be encoded (a side is zero).

@@ -1,4 +1,4 @@
-"""Masks: the parts of a camera's picture that show the vehicle or a time stamp, and never the place."""
+"""Masks: the parts of a camera's frames that never show the place, such as the vehicle or a time stamp."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Corner = tuple[Coordinate, Coordinate]
 Polygon = Annotated[tuple[Corner, ...], Field(min_length=3, max_length=256), FailFast()]
 
 _FINER = 8
-"""Steps of a cell's side in which its covered area is counted."""
+"""The covered area of a cell is counted on a grid of this many pixels a side."""
 
 _LEAST_LEFT = 0.1
-"""Share of the picture that a mask must leave to be seen."""
+"""The share of the frame that a mask must leave visible."""
 
 
 class Mask(BaseModel):
@@ -43,27 +43,27 @@ class Mask(BaseModel):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of its content, hexadecimal: two frames encoded under equal digests were masked alike."""
+        """The SHA-256 of its content, hexadecimal: frames encoded under the same digest were masked alike."""
         return hashlib.sha256(json.dumps(self.polygons, separators=(",", ":")).encode()).hexdigest()
 
     def shares(self, height: int, width: int) -> NDArray[np.float32]:
-        """Which share of each cell of a grid over the frame is covered; float32 [height, width], read-only."""
+        """The covered share of each cell of a grid over the frame; float32 [height, width], read-only."""
         return _shares(self, height, width)
 
     def covered(self, height: int, width: int) -> NDArray[np.bool_]:
-        """The cells of a grid over the frame at least half of which is covered; bool [height, width]."""
+        """Which cells of a grid over the frame are covered by half or more; bool [height, width]."""
         return np.asarray(self.shares(height, width) >= 0.5)
 
 
 @lru_cache(maxsize=64)
 def _shares(mask: Mask, height: int, width: int) -> NDArray[np.float32]:
-    """Drawn finer than the grid and averaged; a camera's grids are few, so they are kept."""
+    """Draw the mask finer than the grid and average it; results are cached, as a camera has few grids."""
     canvas = np.zeros((height * _FINER, width * _FINER), np.uint8)
     size = np.array([width, height], np.float64) * _FINER
     for polygon in mask.polygons:
-        # Corners lie between pixels, OpenCV counts from pixel centres; 4 bits of a pixel are fine enough.
+        # Corners lie between pixels, while OpenCV counts from pixel centres; 4 fractional bits are precise enough.
         corners = np.rint((np.array(polygon) * size - 0.5) * 16).astype(np.int32)
-        one = np.zeros_like(canvas)  # by itself: of two in one call, what both hold would be left open
+        one = np.zeros_like(canvas)  # one by one: in a single call, the overlap of two polygons would stay uncovered
         cv2.fillPoly(one, [corners], 1, shift=4)
         canvas |= one
     shares = canvas.reshape(height, _FINER, width, _FINER).mean(axis=(1, 3), dtype=np.float32)

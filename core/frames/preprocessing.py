@@ -1,4 +1,4 @@
-"""From colour pixels to the network's input (thesis, section 4.3: the frame is resized whole)."""
+"""From colour pixels to the network's input (thesis, section 4.3: the whole frame is resized)."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from functools import lru_cache
 from typing import Annotated, Literal
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.frames.masks import Mask
+from core.kernels.pixels import largest_deviation, normalize
 
 Pixels = NDArray[np.uint8]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -20,7 +20,7 @@ INTERPOLATION = {"linear": cv2.INTER_LINEAR, "area": cv2.INTER_AREA}
 
 
 class InputDefinition(BaseModel):
-    """What a network wants to see: ``(pixels - mean) * scale`` at its own size.
+    """The input of a network: ``(pixels - mean) * scale`` at its own size.
 
     ``mean`` (0–255 units) and ``scale`` are in the channel order of the network.
     """
@@ -36,16 +36,16 @@ class InputDefinition(BaseModel):
 
 
 def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-    """One frame as network input.
+    """Make a frame the input of a network.
 
     The whole frame is resized without a crop; its aspect ratio is not kept (method, section 1).
 
     Args:
-        pixels: H x W x 3 uint8, BGR.
-        out: where to put it, contiguous; None: a new array.
+        pixels: uint8 [H, W, 3], BGR.
+        out: where to put the result, contiguous; None: a new array.
 
     Returns:
-        height x width x 3 float32 in the network's channel order.
+        float32 [height, width, 3], in the network's channel order.
     """
     height, width = definition.height, definition.width
     if pixels.shape[:2] != (height, width):
@@ -56,48 +56,24 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
     if out is None:
         out = np.empty((height, width, 3), np.float32)
     mean, scale = _of_a_row(definition.mean, width), _of_a_row(definition.scale, width)
-    _scaled(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
+    normalize(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
     return out
 
 
 @lru_cache(maxsize=32)
 def _of_a_row(values: tuple[float, float, float], width: int) -> NDArray[np.float32]:
-    """What each channel has, for a row of pixels; float32 [3 W]."""
+    """The three channels' values, repeated for each pixel of a row; float32 [3 W]."""
     return np.tile(np.array(values, np.float32), width)
-
-
-@numba.njit(cache=True, nogil=True)
-def _scaled(pixels, mean, scale, out):  # type: ignore[no-untyped-def]
-    """(pixels - mean) * scale, whole rows at a time: uint8 [H, W, 3], float32 [3 W] twice, to float32 [H, 3 W]."""
-    rows = pixels.reshape(out.shape)
-    for y in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            out[y, i] = (np.float32(rows[y, i]) - mean[i]) * scale[i]
 
 
 def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
     """The largest standard deviation of a colour channel, in 0–255 units, over a grid of some 5 000 pixels.
 
     Args:
-        pixels: H x W x 3 uint8.
-        mask: what not to count; 0 where nothing is left.
+        pixels: uint8 [H, W, 3].
+        mask: pixels that it covers do not count; the contrast is 0 if none is left.
     """
     stride = max(1, min(pixels.shape[:2]) // 64)
     sampled = np.ascontiguousarray(pixels[::stride, ::stride])
     counted = sampled.reshape(-1, 3) if mask is None else sampled[~mask.covered(*sampled.shape[:2])]
-    return float(_deviation(counted)) if len(counted) else 0.0
-
-
-@numba.njit(cache=True, nogil=True)
-def _deviation(values):  # type: ignore[no-untyped-def]
-    """The largest standard deviation of a column; uint8 [n, 3]."""
-    largest = 0.0
-    for channel in range(3):
-        total, squares = 0, 0  # exact
-        for i in range(len(values)):
-            value = int(values[i, channel])
-            total += value
-            squares += value * value
-        mean = total / len(values)
-        largest = max(largest, squares / len(values) - mean * mean)
-    return np.sqrt(largest)
+    return float(largest_deviation(counted)) if len(counted) else 0.0

@@ -1,4 +1,4 @@
-"""Traverses on disk: which images a directory holds, in which order, and what is true of two of them."""
+"""Traverses on disk: the images of a directory in order, and the ground truth between two traverses."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 from core.errors import InvalidGroundTruth, InvalidTraverse
 
 Truth = list[NDArray[np.int64]]
-"""For each query its true references: indices in ascending order, maybe none."""
+"""For each query the indices of its true references, ascending; there may be none."""
 
 SUPPORTED_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
-# Pictures that we cannot decode are listed too: left out silently, they would shift every index after them.
+# Images that cannot be decoded are listed, too: if they were skipped, every index after them would shift.
 OTHER_SUFFIXES = frozenset({".avif", ".bmp", ".gif", ".heic", ".jp2", ".pbm", ".pgm", ".ppm", ".tif", ".tiff"})
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sorts names as people count: ``2.jpg`` before ``10.jpg``; equal numbers by their spelling."""
+    """A sort key by which ``2.jpg`` comes before ``10.jpg``; equal numbers are sorted by their spelling."""
     parts = re.split(r"([0-9]+)", name)
     return [int(part) if index % 2 else part for index, part in enumerate(parts)], name
 
 
 def find_images(directory: Path) -> list[Path]:
-    """The images of a directory in natural order, those of its subfolders and hidden files left out.
+    """The images of a directory in natural order, without hidden files and those of subfolders.
 
     Raises:
-        InvalidTraverse: it is no directory, cannot be read, or holds no image.
+        InvalidTraverse: the directory does not exist, cannot be read, or has no image.
     """
     images, _ = _entries(directory)
     _check_not_empty(images, directory)
@@ -38,10 +38,10 @@ def find_images(directory: Path) -> list[Path]:
 
 
 def find_images_below(directory: Path) -> list[Path]:
-    """The images of a directory and of all folders below it in natural order; hidden ones are left out.
+    """The images of a directory and of all folders below it in natural order, without hidden ones.
 
     Raises:
-        InvalidTraverse: it is no directory, one cannot be read, or there is no image.
+        InvalidTraverse: the directory does not exist, a folder cannot be read, or there is no image.
     """
     found, folders = _entries(directory)
     while folders:
@@ -53,7 +53,7 @@ def find_images_below(directory: Path) -> list[Path]:
 
 def _entries(directory: Path) -> tuple[list[Path], list[Path]]:
     """The images and the folders of a directory."""
-    # Hidden ones are left out, and links to folders, which may run in circles.
+    # Hidden entries are left out, and links to folders, which may form cycles.
     suffixes = SUPPORTED_SUFFIXES | OTHER_SUFFIXES
     try:
         entries = [path for path in directory.iterdir() if not path.name.startswith(".")]
@@ -70,7 +70,7 @@ def _check_not_empty(images: list[Path], directory: Path) -> None:
 
 
 def tolerance_truth(queries: int, references: int, tolerance: int) -> Truth:
-    """Query i shows what references i - ``tolerance`` to i + ``tolerance`` show."""
+    """The ground truth of aligned traverses: query i matches the references i - ``tolerance`` to i + ``tolerance``."""
     return [
         np.arange(max(0, query - tolerance), min(references, query + tolerance + 1), dtype=np.int64)
         for query in range(queries)
@@ -78,7 +78,7 @@ def tolerance_truth(queries: int, references: int, tolerance: int) -> Truth:
 
 
 def read_ground_truth(path: Path, queries: int, references: int) -> Truth:
-    """The true references from a CSV file with rows ``query,reference``, several rows per query.
+    """Read the true references from a CSV file with rows ``query,reference``; a query may have several rows.
 
     A header with these two names may come first; indices count from 0.
 
@@ -100,7 +100,7 @@ def read_ground_truth(path: Path, queries: int, references: int) -> Truth:
 
 
 def read_kept_references(path: Path, references: int) -> NDArray[np.int64]:
-    """The indices of the references to keep, one a line; int64 [R'], ascending.
+    """Read the indices of the references to keep, one on each line; int64 [R'], ascending.
 
     Raises:
         InvalidGroundTruth: the file cannot be read, a line is no index, or none is kept.

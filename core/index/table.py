@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from core.index.codes import CodedQuery, Coder, Codes, PlaneQuery
 from core.index.selection import best_first, best_positions, together
 from core.kernels.codes import estimates_at, estimates_of
-
-if TYPE_CHECKING:
-    from core.index.lists import InvertedLists
 
 Array = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -42,6 +39,21 @@ class Block(NamedTuple):
     first: int
     used: int
     codes: Codes
+
+
+class Preselection(Protocol):
+    """What names the rows of a table that are worth judging, such as :class:`core.index.lists.InvertedLists`."""
+
+    def candidates(
+        self,
+        table: CodeTable,
+        query: CodedQuery,
+        count: int,
+        allowed: NDArray[np.bool_] | None = None,
+        executor: Executor | None = None,
+    ) -> Rows:
+        """About ``count`` rows or more that are allowed, ascending; fewer where there are not as many."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +134,7 @@ class CodeTable:
         query: CodedQuery,
         count: int,
         allowed: NDArray[np.bool_] | None = None,
-        lists: InvertedLists | None = None,
+        lists: Preselection | None = None,
         executor: Executor | None = None,
     ) -> Shortlist:
         """The ``count`` rows with the highest estimates, fewer where there are not as many; equal ones by row.

@@ -1,1 +1,1 @@
-"""What scores amount to: verdicts, probabilities, calibration, priors, positions.  Knows no encoder and no map."""
+"""What scores mean: verdicts, probabilities, calibration, priors, positions.  No encoder and no map is known here."""

@@ -1,17 +1,17 @@
-"""Several frames of one moment as one query, and several maps as one answer: evidence added up as log odds.
+"""The fusion of several frames of one moment into one query, and of several maps' answers into one.
 
-*Cameras of a rig.*  A place is what :meth:`Whereabouts.near` calls one.  Held against the places outside it, a
-camera's best score within a place gives a decision value, and the calibrated curve its log odds x.  A camera that
-does not recognise a place says little against it: it may be covered, or look where nobody took a frame.  With the
-probability e it says nothing at all, so that its part is
+*Cameras of a rig.*  Frames that are near each other by :meth:`Whereabouts.near` are one place.  Compared with the
+places outside it, a camera's best score within a place gives a decision value, and the calibrated curve its log odds x.
+A camera that does not recognize a place says little against it: its view may be blocked, or it may look where no frame
+was taken.  With the probability e it says nothing at all, so that it contributes
 
     log((1 - e) · exp(x) + e)  >=  log e,
 
-and the log odds of a place are the sum of its cameras' parts.  Cameras are taken for independent given the place,
-which they are not altogether: they share the light and the weather.  A rig of one camera is a plain query.
+and the log odds of a place are the sum over the cameras.  Cameras are assumed to be independent given the place, which
+is not quite true, since they share the light and the weather.  A rig of one camera is a plain query.
 
-*Maps.*  Each map's best match has the log odds x_m of being right.  Different places cannot both be where the frame
-was taken, and none of them may be: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
+*Maps.*  Each map's best match has the log odds x_m of being right.  At most one of the maps' matches can be right, and
+perhaps none is: the probability of match m is exp(x_m) / (1 + Σ exp(x_j)).
 """
 
 from __future__ import annotations
@@ -24,27 +24,31 @@ from numpy.typing import NDArray
 
 from core.judgement.priors import decision_slope, log_odds, log_odds_per_score
 from core.judgement.probability import FARTHEST
-from core.judgement.verdict import Calibration, Judgement, Neighborhood, Verdict, Whereabouts, leading, standing_out
+from core.judgement.verdict import Calibration, Judgement, Verdict, leading, standing_out
+from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
 
 BLIND = 0.3
-"""e: how often a camera of a rig says nothing of the place where it is."""
+"""e, the probability that a camera of a rig says nothing about the place where it is."""
 
 LISTED = 50
-"""Places of each camera's ranking that count where there is no second stage."""
+"""Without a second stage, this many places of each camera's ranking count."""
 
 ALIKE = float(np.log(4))
-"""Two maps' places whose log odds differ by less are not told apart: one is less than four times as likely."""
+"""If the log odds of two maps' places differ by less than this (a factor of four in the odds), the answer is
+ambiguous."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What one camera of a rig found.
+    """The ranking of one camera of a rig.
 
-    rows: int64 [n], best first, their scores, float32 [n], and where they are.
-    examined: bool [n], which of them the second stage has compared; none: there is none.
-    weights: float64 [n], log prior of the places, the same for all cameras; None: nothing is known.
+    rows: int64 [n], rows of the map, best first.
+    scores: float32 [n].
+    whereabouts: of the n places.
+    examined: bool [n], which of them the second stage has compared; none if the encoder has no second stage.
+    weights: float64 [n], log prior of the places, the same for all cameras; None: there is no prior.
     """
 
     rows: NDArray[np.int64]
@@ -54,18 +58,19 @@ class View:
     weights: Values | None = None
 
     def listed(self) -> NDArray[np.int64]:
-        """Positions of the places whose scores can be compared with each other."""
+        """The positions of the places whose scores can be compared with each other, int64."""
         return np.flatnonzero(self.examined) if self.examined.any() else np.arange(min(LISTED, len(self.rows)))
 
 
 @dataclass(frozen=True)
 class Fused:
-    """What all cameras together found.
+    """The joint ranking of all cameras.
 
-    rows: int64 [n], best first, and where they are.
-    scores: float32 [n], the best that any camera gives to each.
-    log_odds: float64 [n], descending, of the places by all cameras and what was known.
-    weights: float64 [n], log prior of the places; zeros if nothing was known.
+    rows: int64 [n], rows of the map, best first.
+    whereabouts: of the n places.
+    scores: float32 [n], the best score that any camera gives to each place.
+    log_odds: float64 [n], descending, by all cameras and the prior.
+    weights: float64 [n], log prior of the places; zeros without a prior.
     """
 
     judgement: Judgement
@@ -77,10 +82,10 @@ class Fused:
 
 
 def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighborhood, second_stage: bool) -> Fused:
-    """One judgement from what several cameras found in one map.
+    """Judge the frames of several cameras of a rig together, against one map.
 
     Args:
-        views: of the cameras that have something to say; at least one, each with at least one place.
+        views: of the cameras whose frames have a region; at least one, each with at least one place.
         second_stage: whether the encoder has one.
     """
     listed = [view.listed() for view in views]
@@ -101,12 +106,12 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
     )[first]
     of_place += np.where(near, prior, -np.inf).max(axis=1)
     steepness = log_odds_per_score(calibration, second_stage)
-    # Frames of one place share its evidence; among them those come first that the cameras are like themselves.
+    # The frames of one place share its evidence; among them, those with the best scores of their own come first.
     lowest = np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
     own = np.where(np.isfinite(scores), scores, lowest)
     behind = np.stack([np.where(near, row, -np.inf).max(axis=1) for row in own]) - own
     total = of_place - steepness * behind.mean(axis=0)
-    # Places that lead in no camera's eyes have the same odds, and are told by their scores.
+    # Places that lead for no camera have the same odds and are ranked by their scores.
     order = np.lexsort((-own.mean(axis=0), -np.round(total, 9)))
     found = scores.max(axis=0)[order].astype(np.float32)
     judgement = _judged(of_place[order], found, near[order[0]][order], calibration, steepness)
@@ -114,7 +119,7 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
 
 
 def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
-    """One after the other; at least one."""
+    """Several whereabouts, at least one, joined into one."""
     return Whereabouts(
         *(
             np.concatenate([getattr(part, name) for part in parts])
@@ -124,7 +129,12 @@ def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
 
 
 def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calibration, second_stage: bool) -> Values:
-    """Of each place by one camera: float64 [n], from its scores [n] (-inf: not listed) and who is near whom, [n, n]."""
+    """The log odds of each place by one camera, float64 [n].
+
+    Args:
+        scores: float64 [n], -inf for places that the camera does not list.
+        near: bool [n, n], which places are the same place.
+    """
     found = np.empty(len(scores))
     for place, same in enumerate(near):
         best = float(scores[same].max())
@@ -140,7 +150,7 @@ def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calib
 
 
 def _added(parts: Values) -> Values:
-    """Σ log((1 - e) · exp(x) + e) over cameras, float64 [C, n] to [n]; x itself where there is one camera."""
+    """Σ log((1 - e) · exp(x) + e) over cameras, float64 [C, n] to [n]; x itself for a single camera."""
     if len(parts) == 1:
         return np.asarray(parts[0], np.float64)
     return np.asarray(np.logaddexp(np.log1p(-BLIND) + parts, np.log(BLIND)).sum(axis=0), np.float64)
@@ -153,9 +163,9 @@ def _judged(
     calibration: Calibration,
     steepness: float,
 ) -> Judgement:
-    """The verdict on the first of places in order; ``same`` says which of them are its place, too.
+    """Judge the first of the ranked places; ``same`` says which of the others are the same place.
 
-    Besides by a margin that is too small it is ambiguous if the best rival would be believed by itself.
+    The verdict is ambiguous if the margin is too small, and also if the best rival alone would be recognized.
     """
     best = float(log_odds_of_places[0])
     others = np.flatnonzero(~same)
@@ -171,7 +181,7 @@ def _judged(
     elif margin is not None and margin < calibration.margin:
         verdict = "ambiguous"
     elif rival is not None and log_odds_of_places[rival] >= least:
-        verdict = "ambiguous"  # one camera says this and another that, each of which would be believed alone
+        verdict = "ambiguous"  # two cameras disagree, and each alone would be believed
     probability = None
     if calibration.curve is not None:
         rivals = () if rival is None else (float(log_odds_of_places[rival]),)
@@ -180,14 +190,14 @@ def _judged(
 
 
 def joint_probabilities(log_odds_of_matches: Sequence[float]) -> Values:
-    """exp(x_m) / (1 + Σ exp(x_j)) of matches that exclude each other; float64 [m], adding up to less than 1."""
+    """exp(x_m) / (1 + Σ exp(x_j)) of matches that exclude each other; float64 [m], with a sum below 1."""
     x = np.clip(np.asarray(log_odds_of_matches, np.float64), -FARTHEST, FARTHEST)
     total = np.logaddexp.reduce(np.append(x, 0.0))
     return np.asarray(np.exp(x - total), np.float64)
 
 
 def log_odds_of(judgement: Judgement, calibration: Calibration) -> float:
-    """The log odds of a best match: by its probability or, without a calibrated curve, by its decision value alone."""
+    """The log odds of a best match, from its probability or, without a calibrated curve, from its decision value."""
     if judgement.probability is not None:
         probability = min(max(judgement.probability, 1e-15), 1 - 1e-15)
         return float(np.log(probability) - np.log1p(-probability))

@@ -1,9 +1,9 @@
-"""Where the frame was taken, from the poses of the places that it matches.
+"""The pose of a query frame, estimated from the poses of the places that it matches.
 
-The estimate is the mean of the poses of the best match and of the matches within reach of it, weighted by their odds:
-places far away that happen to look alike are other answers, not part of this one, and the middle between two far
-places is a place where nobody is.  On the Earth the mean is taken of points in space and brought back to the
-surface, headings as directions in space too, so that nothing jumps at ±180° or at a pole.
+The estimate is the mean of the poses of the best match and of the matches within reach of it, weighted by their odds.
+Places further away that look alike are other answers and take no part.  On the Earth, the mean is taken of points in
+space and projected back to the surface, and headings are directions in space, so that nothing jumps at ±180° or at a
+pole.
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, NO_POSE, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """A position, a heading if the places have any, and how far off they may be.
+    """An estimated pose, with a heading if the places have any, and its uncertainty.
 
-    spread: metres, standard deviation of the distance; see :func:`estimate_pose`.
-    heading_spread: degrees, circular standard deviation; None with fewer than two headings.
-    places: how many it rests on.
+    spread: metres, the standard deviation of the distance; see :func:`estimate_pose`.
+    heading_spread: degrees, the circular standard deviation; None with fewer than two headings.
+    places: how many places the estimate rests on.
     """
 
     pose: Pose
@@ -43,7 +42,7 @@ def circular_mean(degrees: ArrayLike, weights: ArrayLike) -> tuple[float, float]
         weights: [n], not negative, not all 0.
 
     Returns:
-        Mean in [0, 360) and deviation, infinite where the directions cancel out.
+        The mean in [0, 360) and the deviation, which is infinite if the directions cancel out.
     """
     angles, share = np.radians(np.asarray(degrees, np.float64)), np.asarray(weights, np.float64)
     share = share / share.sum()
@@ -52,7 +51,7 @@ def circular_mean(degrees: ArrayLike, weights: ArrayLike) -> tuple[float, float]
 
 
 def _deviation(length: float) -> float:
-    """Circular standard deviation in degrees from the length R of the mean of unit vectors."""
+    """The circular standard deviation in degrees, from the length R of the mean of unit vectors."""
     length = min(length, 1.0)
     return float("inf") if length <= 1e-12 else float(np.degrees(np.sqrt(max(0.0, -2 * np.log(length)))))
 
@@ -60,7 +59,7 @@ def _deviation(length: float) -> float:
 def _north_east(position: Vectors) -> tuple[Vectors, Vectors]:
     """Unit vectors to the north and to the east at points of the sphere, each [n, 3].
 
-    At a pole, where every direction is south or north, those of the meridian that the point was computed with.
+    At a pole they are those of the meridian with which the point was computed.
     """
     x, y, z = position.T
     theta, phi = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
@@ -70,7 +69,7 @@ def _north_east(position: Vectors) -> tuple[Vectors, Vectors]:
 
 
 def _geographic_heading(places: Whereabouts, weights: Vectors, at: Vectors) -> tuple[float, float]:
-    """Mean heading at a point of the sphere, and its circular standard deviation; degrees."""
+    """The mean heading at a point of the sphere, and its circular standard deviation, in degrees."""
     angles = np.radians(places.heading.astype(np.float64))[:, np.newaxis]
     north, east = _north_east(places.position)
     direction = weights @ (np.cos(angles) * north + np.sin(angles) * east)
@@ -80,16 +79,16 @@ def _geographic_heading(places: Whereabouts, weights: Vectors, at: Vectors) -> t
 
 
 def estimate_pose(places: Whereabouts, log_weights: ArrayLike, reach: float, used: int = 20) -> PoseEstimate | None:
-    """The pose of a frame by its matches.
+    """Estimate the pose of a frame from its matches.
 
-    The spread's square is the weighted mean square distance of the poses from their mean, plus the square of half the
-    distance from the best match to its nearest neighbour among the places (of half the reach, where none is within
-    it): a frame taken between two places is like one of them, and nothing tells how far it was from it.
+    The square of the spread is the weighted mean square distance of the poses from their mean, plus the square of half
+    the distance from the best match to its nearest neighbour among the places (half the reach if none is within it): a
+    frame taken between two places looks like one of them, and its distance from that one is not known.
 
     Args:
         places: of n matches, best first; only the first ``used`` count for the mean.
-        log_weights: [n], the log odds of each; only differences count.
-        reach: metres within which a match is part of the best one's answer.
+        log_weights: [n], the log odds of each match; only their differences matter.
+        reach: metres from the best match within which other matches belong to its answer.
 
     Returns:
         None if there is no match, or the best one has no pose.

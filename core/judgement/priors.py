@@ -1,13 +1,13 @@
-"""What a robot knows of where it is, held against where the places of a map are.
+"""Prior knowledge of where a robot is: constraints on places, as filters or as weights.
 
 A constraint used as a *filter* leaves only the places that satisfy it.  Used as a *soft prior* it weighs them: with
-the probability t ("trust") what the robot knows is right, and with 1 - t it says nothing, so that a place weighs
+the probability t ("trust") the prior knowledge is right, and with 1 - t it says nothing, so that a place has the weight
 
     w = (1 - t) + t · Π fit,    fit in [0, 1],
 
-and log w, at most 0 and at least log(1 - t), is added to the place's log odds.  The weight is relative to the place
-that fits best, hence a prior can make an answer less sure, or choose among places that look alike, but it never makes
-a match surer than its frame did; and a robot that was carried away is still found, by stronger evidence.
+and log w, at most 0 and at least log(1 - t), is added to the place's log odds.  A prior can make an answer less
+certain or choose among places that look alike, but it never makes a match more certain than the frame does; and a robot
+that was carried away is still found if the evidence is strong enough.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_TIME, Calibration, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.judgement.verdict import Calibration
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_TIME, Pose, Whereabouts
 
 Flags = NDArray[np.bool_]
 Values = NDArray[np.float64]
 
 LARGEST_TRUST = 0.999
-"""Nothing is known for certain; who wants certainty filters."""
+"""The trust is limited to this: no prior is certain.  A filter is."""
 
 TOLERANCE = 1e-8
-"""Metres by which a place may be beyond the edge of an area: what rounding does to a position on the Earth."""
+"""Metres by which a place may be beyond the edge of an area, to allow for the rounding of positions on the Earth."""
 
 UNCALIBRATED_STEEPNESS = 4.0
-"""Log odds lost from the threshold down to a decision value of 0, for encoders that nobody calibrated."""
+"""Log odds lost from the threshold down to a decision value of 0, for calibrations without a curve."""
 
 
 class Constraint(Protocol):
-    """Something that is true of some places."""
+    """A statement that is true of some places."""
 
     def holds(self, places: Whereabouts) -> Flags:
-        """Of which of the n places it is true; bool [n]."""
+        """Which of the n places satisfy it; bool [n]."""
 
     def fit(self, places: Whereabouts) -> Values:
-        """How well each of the n places goes with it; float64 [n] in [0, 1]."""
+        """How well each of the n places fits it; float64 [n] in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Disc:
         return np.exp(-self._squares(places) / (2 * max(self._straight(), 1e-3) ** 2))
 
     def _straight(self) -> float:
-        """The radius as the chord of its arc where positions are points of a sphere."""
+        """The radius as a straight distance: on the sphere, the chord of its arc."""
         if self.centre.kind() == "metric":
             return self.radius
         return 2 * EARTH_RADIUS * float(np.sin(min(self.radius / (2 * EARTH_RADIUS), np.pi / 2)))
@@ -79,7 +79,7 @@ class Disc:
 
 @dataclass(frozen=True)
 class Box:
-    """Between two parallels and two meridians, degrees; ``west`` > ``east`` crosses the antimeridian.  With edges."""
+    """Between two parallels and two meridians, in degrees, edges included; ``west`` > ``east`` crosses ±180°."""
 
     west: float
     south: float
@@ -108,16 +108,16 @@ class Box:
 
 @dataclass(frozen=True)
 class Facing:
-    """Heading within ``tolerance`` degrees of ``heading``, around the circle; the fit is Gaussian in the angle between.
+    """Heading within ``tolerance`` degrees of ``heading``; the fit is Gaussian in the angle between them.
 
-    Headings count as the poses of the places do.  Places whose heading nobody knows do not satisfy it.
+    Headings follow the convention of the places' poses.  Places without a known heading do not satisfy it.
     """
 
     heading: float
     tolerance: float
 
     def _apart(self, places: Whereabouts) -> NDArray[np.float32]:
-        """Degrees between the headings; NaN where one is not known."""
+        """Degrees between the headings, in [0, 180]; NaN if a place's is not known."""
         apart = np.abs(places.heading - np.float32(self.heading % 360))
         return np.minimum(apart, np.float32(360) - apart)
 
@@ -150,7 +150,7 @@ class Period:
 
 @dataclass(frozen=True)
 class InSequences:
-    """Of one of these sequences, by code."""
+    """In one of these sequences, given by their codes."""
 
     codes: tuple[int, ...]
 
@@ -166,12 +166,12 @@ class InSequences:
 
 @dataclass(frozen=True)
 class NotLately:
-    """Not of the robot's own last frames, which it would find again at every standstill.
+    """Not among the robot's own last frames, which it would otherwise find at every standstill.
 
     sequence: code of its own sequence.
-    ordinal: the oldest of its last frames in that sequence; None: no bound.
-    moment, span: microseconds; of its own sequence, places less than ``span`` from ``moment`` are left out, and
-        those of which nobody knows the time; None: no bound.
+    ordinal: places of that sequence from this ordinal on are excluded; None: no bound.
+    moment, span: microseconds; places of that sequence less than ``span`` from ``moment``, and those without a known
+        time, are excluded; None: no bound.
     """
 
     sequence: int
@@ -185,7 +185,7 @@ class NotLately:
             lately |= places.ordinal >= self.ordinal
         if self.moment is not None:
             timed = places.timestamp != NO_TIME
-            # In floating point, for the difference of two int64 may be none: a microsecond in 285 years is exact.
+            # In floating point, as the difference of two int64 may overflow; it is exact over 285 years.
             apart = np.abs(places.timestamp.astype(np.float64) - self.moment)
             lately |= ~timed | (apart < self.span)
         return ~(lately & (places.sequence == self.sequence))
@@ -203,11 +203,11 @@ def holding(constraints: Iterable[Constraint], places: Whereabouts) -> Flags:
 
 
 def log_weights(fits: Sequence[Values], trust: float) -> Values:
-    """log w of n places by what the robot knows (module's docstring); float64 [n] in [log(1 - trust), 0].
+    """log w of n places by the prior knowledge (see the module); float64 [n] in [log(1 - trust), 0].
 
     Args:
         fits: float64 [n] in [0, 1], one array for each constraint, at least one.
-        trust: probability that what the robot knows is right, in [0, 1].
+        trust: probability that the prior knowledge is right, in [0, 1].
     """
     trusted = min(trust, LARGEST_TRUST)
     product = fits[0].copy()
@@ -219,9 +219,9 @@ def log_weights(fits: Sequence[Values], trust: float) -> Values:
 def log_odds_per_score(calibration: Calibration, second_stage: bool) -> float:
     """By how much the log odds of a match grow with its score.
 
-    The derivative of the calibrated curve at a match that leads: √(s · (s - top)) grows by about one with s.  The
-    older decision value of one stage is a score in units of the rest's deviation, for which that of the background
-    stands.  Without a curve the threshold is taken for even odds.
+    This is the derivative of the calibrated curve at a match that leads, as √(s · (s - top)) grows by about one with s.
+    The older decision value without a second stage is a score in units of the standard deviation of the rest, for which
+    that of the background is taken.  Without a curve, the threshold is taken for even odds.
     """
     slope = decision_slope(calibration)
     leads = second_stage or calibration.decision == "leading"
@@ -245,10 +245,17 @@ def log_odds(decision: float, calibration: Calibration) -> float:
 def weighed(
     scores: NDArray[np.float32], weights: Values, calibration: Calibration, second_stage: bool
 ) -> NDArray[np.float32]:
-    """Scores as the prior changes them: log weights in units of the score added, float32 [n].
+    """Lower scores by a prior: the log weights are converted to units of the score and added.
 
-    No score falls under what unrelated frames have, unless it was under it before: a place that the prior rules out
-    counts as one that shows something else, and not as a sign of how well the others stand out.
+    A score does not fall below the mean of unrelated frames unless it was lower before: a place that the prior rules
+    out counts as an unrelated one, and must not make the others stand out more.
+
+    Args:
+        scores: float32 [n].
+        weights: float64 [n], log weights.
+
+    Returns:
+        float32 [n].
     """
     lowered = scores + (weights / log_odds_per_score(calibration, second_stage)).astype(np.float32)
     return np.asarray(np.maximum(lowered, np.minimum(scores, np.float32(calibration.background_mean))), np.float32)

@@ -1,10 +1,9 @@
 """From a decision value to the probability that the best match is right, and back.
 
-A logistic curve, P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), fitted by maximum likelihood to
-outcomes with known truth (Platt, "Probabilistic outputs for support vector machines", 1999).  Two numbers
-suffice: the decision value is made to mean the same everywhere, so the curve has only to be placed and scaled,
-which few frames can do without following their noise, and it rises everywhere, so that no threshold on the one
-is another order than a threshold on the other.
+The curve is logistic, P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), and fitted by maximum likelihood to
+answers whose truth is known (Platt, "Probabilistic outputs for support vector machines", 1999).  Its two parameters
+can be fitted to few frames without following their noise.  As it rises everywhere, thresholds on the decision value
+and on the probability are equivalent.
 """
 
 from __future__ import annotations
@@ -14,9 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 FARTHEST = 35.0
-"""Log odds beyond this are cut: 1 - P would be lost in rounding, and nothing measured is as sure."""
+"""Log odds are limited to this: beyond it 1 - P would be lost in rounding, and no measurement is as certain."""
 
 NEWTON_STEPS = 100
+"""At most this many iterations fit a curve."""
 
 
 class Curve(BaseModel):
@@ -28,15 +28,15 @@ class Curve(BaseModel):
     intercept: float = Field(allow_inf_nan=False, description="Log odds at the decision value 0.")
 
     def probability(self, decision: float) -> float:
-        """Of one decision value, in (0, 1)."""
+        """The probability for one decision value, in (0, 1)."""
         return float(self.probabilities([decision])[0])
 
     def probabilities(self, decisions: ArrayLike) -> NDArray[np.float64]:
-        """Of decision values, any shape, each in (0, 1)."""
+        """The probabilities for decision values of any shape, each in (0, 1)."""
         return sigmoid(self.slope * np.asarray(decisions, np.float64) + self.intercept)
 
     def decision(self, probability: float) -> float:
-        """The decision value of a probability in (0, 1)."""
+        """The decision value for a probability in (0, 1)."""
         return float((np.log(probability) - np.log1p(-probability) - self.intercept) / self.slope)
 
 
@@ -46,18 +46,18 @@ def sigmoid(log_odds: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def fit_curve(decisions: ArrayLike, right: ArrayLike, shares: ArrayLike | None = None) -> Curve:
-    """The curve under which the outcomes are most likely.
+    """Fit the curve under which the outcomes are most likely.
 
-    Both kinds of outcome are smoothed as Platt does: the targets are (N₊ + 1) / (N₊ + 2) and 1 / (N₋ + 2), as if one
-    more of each kind had been seen, so that outcomes that a threshold separates give a finite slope.
+    The targets are (N₊ + 1) / (N₊ + 2) and 1 / (N₋ + 2), as Platt proposes, as if one more outcome of each kind had
+    been seen; so outcomes that a threshold separates give a finite slope.
 
     Args:
         decisions: [n], decision values.
         right: bool [n], whether the best match was right.
-        shares: [n], how much each outcome counts, over 0; all alike if left out.
+        shares: [n], over 0, the weight of each outcome; None: all weigh the same.
 
     Raises:
-        ValueError: there is one kind of outcome only, or right answers have no higher decision values than wrong ones.
+        ValueError: all answers are right or all are wrong, or right answers do not have higher decision values.
     """
     d, y = np.asarray(decisions, np.float64), np.asarray(right, np.bool_)
     positive, negative = int(y.sum()), int((~y).sum())
@@ -92,6 +92,6 @@ def _loss(
     targets: NDArray[np.float64],
     counted: NDArray[np.float64],
 ) -> float:
-    """The negative logarithm of the likelihood."""
+    """The negative log-likelihood."""
     odds = design @ weights
     return float((counted * (np.logaddexp(0, odds) - targets * odds)).sum())

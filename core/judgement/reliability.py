@@ -1,4 +1,4 @@
-"""How far stated probabilities can be believed: reliability diagram, calibration error, Brier score, intervals."""
+"""How well stated probabilities hold: reliability diagram, calibration error, Brier score, confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
 BINS = 10
+"""Bins of a reliability diagram."""
+
 CONFIDENCE = 0.95
+"""Confidence of the intervals."""
 
 
 class Share(BaseModel):
@@ -44,10 +47,13 @@ class Reliability(BaseModel):
 
 
 def wilson(count: int, of: int, confidence: float = CONFIDENCE) -> Share:
-    """A share and its interval (Wilson, "Probable inference", JASA 22, 1927), which is sound for few and for extremes.
+    """A share and its confidence interval (Wilson, "Probable inference", JASA 22, 1927).
 
-    With p = count / of and z the normal quantile of the confidence:
-    (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n).
+    With n = ``of``, p = count / n and z the normal quantile of the confidence, the interval is
+    (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n).  It is sound for few observations and for shares near 0 and 1.
+
+    Raises:
+        ValueError: the count is negative or more than ``of``.
     """
     if not 0 <= count <= of:
         raise ValueError(f"{count} of {of} is no share")
@@ -56,22 +62,22 @@ def wilson(count: int, of: int, confidence: float = CONFIDENCE) -> Share:
     z, p = NormalDist().inv_cdf((1 + confidence) / 2), count / of
     centre, spread = p + z * z / (2 * of), z * np.sqrt(p * (1 - p) / of + z * z / (4 * of * of))
     scale = 1 + z * z / of
-    # Rounding must not put a bound on the wrong side of what was counted.
+    # Rounding must not put a bound on the wrong side of the observed share.
     low, high = max(0.0, min(p, (centre - spread) / scale)), min(1.0, max(p, (centre + spread) / scale))
     return Share(value=p, low=float(low), high=float(high), count=count, of=of)
 
 
 def brier(probabilities: ArrayLike, right: ArrayLike) -> float:
-    """Mean square of probability minus outcome (Brier, 1950); both [n], n > 0."""
+    """The mean square of probability minus outcome (Brier, 1950); both [n], n > 0."""
     return float(np.square(np.asarray(probabilities, np.float64) - np.asarray(right, np.float64)).mean())
 
 
 def reliability(probabilities: ArrayLike, right: ArrayLike, bins: int = BINS) -> Reliability:
-    """The diagram and its figures, over bins of equal width.
+    """The reliability diagram over bins of equal width, and its figures.
 
     Args:
         probabilities: [n], n > 0, each in [0, 1].
-        right: bool [n].
+        right: bool [n], whether each answer was right.
 
     Raises:
         ValueError: there is no answer, or a probability outside [0, 1].

@@ -1,4 +1,4 @@
-"""Trials: queries whose truth is known, judged, to tell when an answer can be believed."""
+"""Trials: judged queries whose true place is known, from which calibrations are fitted."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trials:
-    """Outcomes of n queries, float64 [n], bool [n] and int64 [n].
+    """The outcomes of n queries.
 
-    decision: the decision value.
-    margin: lead over the best rival; infinite without one.
-    known: the place was in the map.
-    right: it was the best match.
-    frame: number of the frame that was asked.  One asked twice, of a map with its place and of one without, has one
-        number; numbers follow the order in which the frames were taken.
+    decision: float64 [n], the decision value.
+    margin: float64 [n], the lead over the best rival; infinite without one.
+    known: bool [n], whether the place was in the map.
+    right: bool [n], whether it was the best match.
+    frame: int64 [n], the number of the query's frame, in the order in which the frames were taken.  A frame that is a
+        query of a map with its place and of a map without it has the same number in both.
     """
 
     decision: Values
@@ -36,22 +36,22 @@ class Trials:
         return len(self.decision)
 
     def take(self, chosen: Flags) -> Trials:
-        """Some of them."""
+        """The trials that are chosen, bool [n]."""
         return Trials(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def recognized(self, calibration: Calibration) -> Flags:
-        """Which of them a calibration lets pass, bool [n]."""
+        """Which of them are recognized by a calibration, bool [n]."""
         return (self.decision >= calibration.threshold) & (self.margin >= calibration.margin)
 
     def probabilities(self, calibration: Calibration) -> Values:
-        """That each is right, by a calibration with a curve, float64 [n]."""
+        """The probability that each is right, by a calibration with a curve, float64 [n]."""
         pairs = zip(self.decision.tolist(), self.margin.tolist(), strict=True)
         return np.array([probability_of(decision, margin, calibration) for decision, margin in pairs], np.float64)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One query: the judgement of it, whether its place was there, whether it was found."""
+    """One query: its judgement, whether its place was in the map, whether that was the best match, and its frame."""
 
     judgement: Judgement
     known: bool
@@ -60,7 +60,7 @@ class Trial:
 
 
 def gathered(trials: Iterable[Trial]) -> Trials:
-    """Single trials as one; those of an empty map, which has no decision value, are left out."""
+    """Gather single trials; those on an empty map, which have no decision value, are left out."""
     rows = [
         (
             one.judgement.decision,
@@ -83,7 +83,7 @@ def gathered(trials: Iterable[Trial]) -> Trials:
 
 
 def joined(parts: Sequence[Trials], same_frames: bool = False) -> Trials:
-    """Several sets of trials as one; their frames are numbered on, unless they are the same in all of them."""
+    """Join several sets of trials; their frames are numbered consecutively unless all sets have the same frames."""
     shifted, first = [], 0
     for part in parts:
         shifted.append(part.frame + first)
@@ -92,13 +92,3 @@ def joined(parts: Sequence[Trials], same_frames: bool = False) -> Trials:
     names = ("decision", "margin", "known", "right")
     decision, margin, known, right = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     return Trials(decision, margin, known, right, np.concatenate(shifted))
-
-
-def area_under_roc(values: Values, positive: Flags) -> float | None:
-    """The chance that a positive outranks a negative (Mann and Whitney, 1947); ties count half, None with one kind."""
-    if positive.all() or not positive.any():
-        return None
-    _, group, sizes = np.unique(values, return_inverse=True, return_counts=True)
-    ranks = (np.cumsum(sizes) - (sizes - 1) / 2)[group]
-    count = int(positive.sum())
-    return float((ranks[positive].sum() - count * (count + 1) / 2) / (count * (len(values) - count)))

@@ -1,42 +1,45 @@
-"""Recognized, ambiguous or unknown: what the scores of one query against a map amount to.
+"""The verdict on a query, recognized, ambiguous or unknown, from its scores against a map.
 
-The raw score J / V does not travel between maps and conditions, so it is judged against the rest
-of the map.  The decision value is the geometric mean of the best score and of its lead over the best
-others that were examined as closely, d = √(s · (s - mean of the five best other places)), for neither is
-enough alone: in a map whose places are all alike strangers score high as well, and where nothing is
-alike a small score leads.  It asks for the top of the ranking only, so it is the same whether all of a map
-was scored or a shortlist.  A map of a few places says little about others, so it is filled up with
-imagined places that score as unrelated frames did when the encoder was made.
+Scores J / V of different maps and conditions cannot be compared, so the best score is compared with the others of the
+same map.  The decision value is the geometric mean of the best score s and of its lead over the best other places that
+were examined as closely,
 
-A decision value becomes a probability by the calibration's curve (``probability.py``).  Of two places that
-score alike one is right at most: P = curve(d) · (½ + ½ min(1, m / m₀)), m the lead over the best rival and m₀
-the margin under which an answer is ambiguous, so that half of it is left where there is no lead.
+    d = √(s · (s - mean of the five best other places)).
+
+Neither factor is enough alone: in a map whose places all look alike, unknown places score high, too, and where nothing
+looks alike a low score leads.  Only the top of the ranking is needed, so that the value is the same whether all of a
+map was scored or a shortlist.  As a map of a few places says little about others, imagined places are added to it;
+their scores are those of unrelated frames when the encoder was calibrated.
+
+The calibration's curve turns a decision value into a probability (``probability.py``).  Of two places that score alike
+at most one is right, so that
+
+    P = curve(d) · (½ + ½ min(1, m / m₀)),
+
+with the lead m over the best rival and the margin m₀ under which an answer is ambiguous: without a lead, half of the
+probability is left.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.probability import Curve
+from core.places import Neighborhood, Whereabouts
 
 Verdict = Literal["recognized", "ambiguous", "unknown"]
 
-NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
-
-NO_TIME = -(1 << 63)
-"""Stands for the timestamp of a place that has none; microseconds otherwise."""
-
 FEWEST_PLACES = 16
-"""Maps with fewer places that are no match are filled up to this with imagined ones."""
+"""Imagined places are added to maps with fewer other places than this."""
 
 TOP_PLACES = 5
-"""The best score is held against the mean of so many of the best others."""
+"""The best score is compared with the mean of this many of the best other places."""
 
 
 class Calibration(BaseModel):
@@ -62,11 +65,15 @@ class Calibration(BaseModel):
 
 
 def completed(own: Calibration | None, default: Calibration, second_stage: bool) -> Calibration:
-    """A map's own calibration, or its encoder's; one made before there were curves borrows the encoder's.
+    """The calibration to judge a map's queries by: its own, or else the default of its encoder.
+
+    A map's calibration from before there were curves borrows the encoder's curve.
 
     Args:
-        second_stage: of the encoder; without one the decision values of such a calibration are others than those
-            that the encoder's curve is for, and it stays without.
+        own: the map's; None: it has none.
+        default: the encoder's.
+        second_stage: whether the encoder has one.  Without it, the decision values of such an old calibration are not
+            those of the encoder's curve, so that none is borrowed.
     """
     if own is None:
         return default
@@ -76,91 +83,32 @@ def completed(own: Calibration | None, default: Calibration, second_stage: bool)
 
 
 @dataclass(frozen=True)
-class Neighborhood:
-    """What counts as the same place: within ``radius`` metres, or ``frames`` frames of a sequence."""
-
-    radius: float
-    frames: int
-
-
-@dataclass(frozen=True)
-class Whereabouts:
-    """Where n places are, one row each.
-
-    kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
-    position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
-    sequence: int32 [n], a code for the sequence's name; places without one share the code -1.
-    ordinal: int64 [n], order of enrolment within the sequence.
-    heading: float32 [n], degrees in [0, 360), counted as the pose's kind counts; NaN where it is not known.
-    timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
-
-    Heading and timestamp may be left out: nobody knows any.
-    """
-
-    kind: NDArray[np.int8]
-    position: NDArray[np.float64]
-    sequence: NDArray[np.int32]
-    ordinal: NDArray[np.int64]
-    heading: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
-    timestamp: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-
-    def __post_init__(self) -> None:
-        if len(self.heading) < len(self.kind):
-            object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
-        if len(self.timestamp) < len(self.kind):
-            object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def take(self, rows: ArrayLike) -> Whereabouts:
-        """The places ``rows`` (integers or a mask) in that order."""
-        chosen = np.asarray(rows)
-        return Whereabouts(
-            self.kind[chosen],
-            self.position[chosen],
-            self.sequence[chosen],
-            self.ordinal[chosen],
-            self.heading[chosen],
-            self.timestamp[chosen],
-        )
-
-    def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
-        """Which of the places are the same place as ``row``, itself included; bool [n].
-
-        Two poses of one kind are compared by distance; otherwise the places must be of one
-        sequence, at most so many frames apart.
-        """
-        near = self.sequence == self.sequence[row]
-        near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
-        kind = self.kind[row]
-        if kind != NO_POSE:
-            x, y, z = (self.position - self.position[row]).T
-            distance = np.sqrt(x * x + y * y + z * z)
-            near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
-        near[row] = True
-        return near
-
-
-@dataclass(frozen=True)
 class Judgement:
-    """A verdict and what it rests on; scores in the units of the encoder's score."""
+    """A verdict and the values that it rests on; None for values that do not exist.
+
+    score: of the best match.
+    decision: the decision value.
+    margin: the lead over the best rival.
+    rival: the position of the best rival in the ranking.
+    probability: that the best match is right; None for an empty map, and for a calibration without a curve.
+    """
 
     verdict: Verdict
     score: float | None
     decision: float | None
     margin: float | None
     rival: int | None
-    """Position of the best rival in the ranking."""
     probability: float | None = None
-    """That the best match is right; None for an empty map and a calibration without a curve."""
 
 
 def filled_up(scores: NDArray[np.float32], fewest: int, calibration: Calibration) -> NDArray[np.float64]:
-    """At least ``fewest`` scores of other places, best first: the missing ones are those of imagined places.
+    """Add the scores of imagined places to those of other places until there are ``fewest``.
 
     Args:
         scores: float32 [n], n >= 0, best first.
+
+    Returns:
+        float64 [max(n, fewest)], best first.
     """
     missing = fewest - len(scores)
     if missing <= 0:
@@ -171,45 +119,46 @@ def filled_up(scores: NDArray[np.float32], fewest: int, calibration: Calibration
 
 
 def standing_out(best: float, rest: NDArray[np.float32], calibration: Calibration, is_part: bool = False) -> float:
-    """The decision value of older calibrations of one stage, in standard deviations of the rest.
+    """The decision value of older calibrations without a second stage, in standard deviations of the rest.
 
-    It is (best - mean of the top of the rest) / standard deviation of the rest.
-
-    The best few of the rest grow with the number of places just as the best score of an unknown
-    place does, so the value means the same on a small map and on a large one.
+    It is (best - mean of the top of the rest) / standard deviation of the rest.  The top of the rest grows with the
+    number of places just as the best score of an unknown place does, so that the value means the same on small and
+    large maps.
 
     Args:
         best: the best score.
-        rest: float32 [n], n >= 0, best first: the scores of places that are not the best one's place.
-        calibration: says how the imagined places score.
-        is_part: ``rest`` are only the best; their spread is not that of all, for which the encoder's own stands in.
+        rest: float32 [n], n >= 0, best first: the scores of places other than the best match's.
+        calibration: has the scores of imagined places.
+        is_part: ``rest`` holds only the best of them, whose standard deviation is not that of all; the calibration's
+            background is used instead.
     """
     scores = filled_up(rest, FEWEST_PLACES, calibration)
     if is_part:
         return float((best - scores[:TOP_PLACES].mean()) / calibration.background_deviation)
-    # Equal scores throughout would make any difference infinite; the encoder's own spread bounds it.
+    # If all scores are equal, any difference would be infinite; the background's deviation bounds it.
     spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
     return float((best - scores[:TOP_PLACES].mean()) / spread)
 
 
 def leading(best: float, rest: NDArray[np.float32], calibration: Calibration) -> float:
-    """The decision value: √(best · (best - mean of the top of the rest)); 0 if negative.
+    """The decision value √(best · (best - mean of the top of the rest)); 0 if a factor is negative.
 
     Args:
         best: the best score.
-        rest: float32 [n], n >= 0, best first: of places that are not the best one's place and were compared as
-            closely: examined by the second stage, if there is one.
-        calibration: says how the imagined places score.
+        rest: float32 [n], n >= 0, best first: the scores of places other than the best match's that the second stage
+            has examined, too, if there is one.
+        calibration: has the scores of imagined places.
     """
     scores = filled_up(rest, TOP_PLACES, calibration)
     return float(np.sqrt(max(0.0, best) * max(0.0, best - scores[:TOP_PLACES].mean())))
 
 
 def probability_of(decision: float, margin: float | None, calibration: Calibration) -> float | None:
-    """That the best match is right: by the calibration's curve, shared with a rival that scores alike.
+    """The probability that the best match is right, by the calibration's curve and the lead over the best rival.
 
     Args:
-        margin: lead over the best rival, at least 0; None without a rival.
+        decision: the decision value.
+        margin: the lead over the best rival, at least 0; None without a rival.
 
     Returns:
         In (0, 1); None if the calibration has no curve.
@@ -230,20 +179,20 @@ def judge(
     examined: int | NDArray[np.bool_] = 0,
     is_part: bool = False,
 ) -> Judgement:
-    """The verdict on one query.
+    """Judge one query.
 
     Args:
-        scores: float32 [n], best first: the query against every place of the map, or against the best of them.
+        scores: float32 [n], best first: of the query against all places of the map, or against the best of them.
         whereabouts: of the same n places in the same order.
-        calibration: thresholds of the map or of the encoder.
-        neighborhood: which places are no rivals of each other.
+        calibration: of the map or of the encoder.
+        neighborhood: which places are the same place and so no rivals of each other.
         examined: which of the places the encoder's second stage has examined, bool [n], or how many of the first;
-            0: it has none.
+            0: it has no second stage.
         is_part: the scores are those of the best places alone.
 
     Returns:
-        ``unknown`` for an empty map and for a decision value under the threshold, ``ambiguous``
-        for a margin to the best rival under its limit, else ``recognized``.
+        ``unknown`` for an empty map and for a decision value under the threshold, ``ambiguous`` for a lead over the
+        best rival under the margin, else ``recognized``.
     """
     if len(scores) == 0:
         return Judgement("unknown", None, None, None, None)

@@ -1,1 +1,1 @@
-"""Compiled inner loops, and nothing else: what each computes is said by the room that calls it."""
+"""Compiled inner loops; the rooms that call them say in plain NumPy what they compute."""

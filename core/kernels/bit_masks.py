@@ -1,7 +1,7 @@
-"""Which of a block of values reach a threshold, as the bits of one integer: the processor compares sixteen at a time.
+"""Which of a block of values reach a threshold, as the bits of one integer.
 
-A compiled loop that collects the few values over a threshold looks at each; numba has no word for the comparison
-of a whole block, so that it is written here in LLVM's (and runs on any processor that LLVM knows).
+numba offers no comparison of a whole block of values, which the processor does sixteen at a time, so it is written
+here in LLVM's instructions; it runs on every processor that LLVM supports.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numba.extending import intrinsic
 ir: Any = cgutils.ir  # type: ignore[attr-defined]  # the LLVM that numba itself compiles with
 
 BLOCK = 64
-"""Values compared at a time, one bit each."""
+"""Values of a block, one bit each."""
 
 
 def _reaching(typingctx: Any, values: Any, start: Any, threshold: Any) -> Any:
-    """Bit i: is ``values[start + i] >= threshold``?  For i from 0 to 63, all within the array.
+    """Bit i is whether ``values[start + i] >= threshold``, for i from 0 to 63, all within the array.
 
-    ``values``: float32 [n], contiguous; ``start``: int64; ``threshold``: float32.  Returns uint64.
+    ``values`` is float32 [n], contiguous; ``start`` int64; ``threshold`` float32; the result uint64.
     """
     signature = types.uint64(values, types.int64, types.float32)
 
@@ -43,7 +43,7 @@ reaching: Any = intrinsic(_reaching)
 
 
 def _lowest_bit(typingctx: Any, bits: Any) -> Any:
-    """The place of the lowest bit that is set; uint64, not 0, to uint64."""
+    """The position of the lowest bit that is set; uint64, not 0, to uint64."""
     signature = types.uint64(types.uint64)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -56,7 +56,7 @@ lowest_bit: Any = intrinsic(_lowest_bit)
 
 
 def _set_bits(typingctx: Any, bits: Any) -> Any:
-    """How many bits are set; uint64 to uint64."""
+    """The number of bits that are set; uint64 to uint64."""
     signature = types.uint64(types.uint64)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

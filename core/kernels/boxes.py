@@ -1,7 +1,7 @@
-"""What lies in the boxes of regions (thesis, equation 3.4), compiled: sums of local descriptors, and their projections.
+"""The compiled sums of local descriptors over the boxes of regions (thesis, equations 3.4 and 4.4), and projections.
 
-Most boxes are small and summed directly.  When the others hold more cells together than a summed-area table has, it is
-filled, and each is four look-ups.
+``core.method.equations.regional_features`` says what is computed.  Most boxes are small and summed cell by cell.  If
+the larger ones together hold many cells, a summed-area table is filled, which takes four look-ups for a box.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from core.method.projection import finish_row, squared_length
+from core.kernels.projections import finish_row, squared_length
 
 FEW = 16
-"""Cells of a box that are summed as they are; the rounding of so few is far under that of a feature's length."""
+"""Boxes of at most this many cells are summed in float32; the rounding of so few terms is negligible."""
 
 
 @numba.njit(cache=True, nogil=True)
 def _fill(activations, table):  # type: ignore[no-untyped-def]
-    """The summed-area table: sums over all cells above and to the left; its first row and column stay zero."""
+    """Fill the summed-area table with the sums over all cells above and to the left; row and column 0 stay zero."""
     height, width, channels = activations.shape
     row = np.empty(channels, np.float64)
     for y in range(height):
@@ -30,7 +30,7 @@ def _fill(activations, table):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _add_few(cells, top, left, bottom, right, width, total):  # type: ignore[no-untyped-def]
-    """The sum over a small box, two cells at a time; float32 [X·Y, K] to [K]."""
+    """Put the sum over a small box into ``total``, two cells at a time; float32 [X·Y, K] to [K]."""
     for y in range(top, bottom):
         at, stop = y * width + left, y * width + right
         if y == top and stop - at == 1:
@@ -56,7 +56,7 @@ def _add_few(cells, top, left, bottom, right, width, total):  # type: ignore[no-
 
 @numba.njit(cache=True, nogil=True)
 def _is_tabled(boxes, cells):  # type: ignore[no-untyped-def]
-    """Whether the larger boxes hold so many cells that a table pays."""
+    """Whether the larger boxes hold so many cells that a summed-area table saves time."""
     many = 0
     for t in range(len(boxes)):
         area = (boxes[t, 2] - boxes[t, 0]) * (boxes[t, 3] - boxes[t, 1])
@@ -66,10 +66,13 @@ def _is_tabled(boxes, cells):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True, inline="always")
 def _sum_within(cells, width, box, tabled, table, exact, total):  # type: ignore[no-untyped-def]
-    """The sum over one box into ``total``, float32 [n], of the first n values of each cell.
+    """Put the sum over one box of the first n values of each cell into ``total``, float32 [n].
 
-    ``cells``: float32 [X·Y, K]; ``box``: int32 [4]; ``table``: of these cells, if ``tabled``; ``exact``: room for
-    float64 [K].
+    Args:
+        cells: float32 [X·Y, K].
+        box: int32 [4].
+        tabled: whether ``table`` holds the sums of these cells.
+        exact: workspace, float64 [K].
     """
     top, left, bottom, right = box[0], box[1], box[2], box[3]
     if (bottom - top) * (right - left) <= FEW:
@@ -94,8 +97,8 @@ def sums_within(activations, boxes, table, sums):  # type: ignore[no-untyped-def
     Args:
         activations: float32 [X, Y, K], contiguous.
         boxes: int32 [T, 4], top, left, bottom, right, half-open.
-        table: room for float64 [X + 1, Y + 1, K], the first row and column 0.
-        sums: float32 [T, K].
+        table: workspace, float64 [X + 1, Y + 1, K], with zeros in the first row and column.
+        sums: float32 [T, K], written.
     """
     height, width, channels = activations.shape
     cells, exact = activations.reshape(height * width, channels), np.empty(channels, np.float64)
@@ -110,12 +113,14 @@ def sums_within(activations, boxes, table, sums):  # type: ignore[no-untyped-def
 def projected_within(  # type: ignore[no-untyped-def]
     activations, products, boxes, table, products_table, shift, projected
 ):
-    """The same, projected: of the sums only their length is used, and the projection's products, summed alike.
+    """Put the projections of the sums into ``projected``.
+
+    A projection needs the length of a sum f and its product f W, which is the sum of the cells' products.
 
     Args:
-        products: float32 [X, Y, d], contiguous.
-        products_table: room for float64 [X + 1, Y + 1, d].
-        shift: float32 [d].
+        products: of the cells with the projection's matrix W, float32 [X, Y, d], contiguous.
+        products_table: workspace, float64 [X + 1, Y + 1, d], with zeros in the first row and column.
+        shift: m W, float32 [d].
         projected: float32 [T, values], written; at most d values.
     """
     height, width, channels = activations.shape

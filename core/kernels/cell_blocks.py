@@ -1,10 +1,11 @@
-"""Inner products of a few cells of one frame with whole rows of cells of another, and which of them are the best.
+"""Vector instructions for the second stage: inner products of a few cells with whole rows of cells, and their maxima.
 
-The inner products of a grid's cells take most of the time of the second stage, and only those within reach are asked
-for: a few cells of one frame against a few rows of the other's.  A vector holds a row of cells, one a lane, in words
-of several values; the other frame's values are repeated over all lanes.  What a word holds, the processor decides:
-four bytes where it multiplies those and adds them up at once, two halves where it does that with halves (every
-x86-64), else one value.  All are exact.  Written as LLVM's vector instructions, for numba has no word for them.
+The inner products of the grid's cells take most of the time of the second stage, and only those within reach are
+needed: a few cells of one frame against a few rows of the other.  A vector holds a row of cells, one in each lane, in
+words of several values; the other frame's values are repeated over all lanes.  The processor decides what a word holds:
+four bytes if one instruction multiplies and adds those, two half words if one does that with half words (every
+x86-64), else one value.  All are exact.  The loops are written in LLVM's vector instructions, which numba does not
+offer.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from core.kernels.codes import prefetch
 
 LANES = 16
 HELD = LANES - 1
-"""Cells of a vector.  The last lane holds zeros: bytes are held moved by 128, and it tells how much that added."""
+"""Cells of a vector.  The last lane holds zeros: as bytes are held with 128 added, it tells how much that adds."""
 
 CELLS, ROWS = 7, 3
-"""So many cells are compared with up to so many rows at a time: their sums fill the registers of AVX-512 …"""
+"""This many cells are compared with up to this many rows at a time: their sums fill the registers of AVX-512."""
 
 FEWER_CELLS = 5
-"""… and so many with one row those of other processors."""
+"""On other processors this many cells are compared with one row at a time."""
 
 MOVED = 0x80808080 - (1 << 32)
-"""Four bytes moved by 128, as a word."""
+"""Four zero bytes with 128 added, as a word."""
 
 LOWEST, HIGHEST = -(1 << 31), (1 << 31) - 1
 
@@ -39,14 +40,14 @@ _BYTES = LANES * 4
 
 
 def values_of_a_word(triple: str, features: str) -> int:
-    """How many values are multiplied and added at once, 4, 2 or 1, on a processor as LLVM names it."""
+    """How many values of a word are multiplied and added at once (4, 2 or 1) on a processor that LLVM describes so."""
     if "+avx512vnni" in features.split(","):
         return 4
     return 2 if "86" in triple.split("-")[0] else 1
 
 
 def has_wide_registers(features: str) -> bool:
-    """Whether each of 32 registers holds a vector."""
+    """Whether the processor has 32 registers of 512 bits, by LLVM's names of its features."""
     return "+avx512f" in features.split(",")
 
 
@@ -56,7 +57,7 @@ def _values(context: Any) -> int:
 
 
 def _generate_values(typing_context: Any) -> Any:
-    """The values of a word, where this is compiled for; int64."""
+    """The number of values of a word on the processor that this is compiled for; int64."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: tuple[Any, ...]) -> ir.Value:
         return _LONG(_values(context))
@@ -65,7 +66,7 @@ def _generate_values(typing_context: Any) -> Any:
 
 
 def _generate_is_wide(typing_context: Any) -> Any:
-    """Are registers wide, where this is compiled for?"""
+    """Whether the processor that this is compiled for has wide registers."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: tuple[Any, ...]) -> ir.Value:
         return ir.IntType(1)(has_wide_registers(context.codegen().magic_tuple()[2]))

@@ -1,10 +1,11 @@
-"""Connected cells of like activation, the strongest of a layer (thesis, equations 3.1–3.3 and 4.1–4.3), compiled.
+"""The compiled search for the strongest regions of a layer (thesis, equations 3.1–3.3 and 4.1–4.3).
 
-The maps stand channels last, as the network leaves them, and are read once, in that order: which cells are above
-the background becomes one bit each, so that what has no neighbour (most cells) is seen sixty-four channels at a time.
-A cell joins the regions of its neighbours that came before it (left of it, and in the row above), so that boxes and
-sums are complete when the last cell has been seen.  Only cells at or above the level where enough regions are
-complete are labelled: a region's mean lies within its level, so that none below can be among the strongest.
+``core.method.equations`` says what is computed.  The activations are channels last, as the network leaves them, and
+are read once in that order.  One bit a cell says whether it is above the background, so that cells without neighbours
+(most of them) are skipped 64 channels at a time.  A cell joins the regions of its earlier neighbours (to the left and
+in the row above), so that boxes and sums are complete after the last cell.  Only cells at or above the level that
+holds enough regions are labelled: the mean of a region lies within its level, so that no region below can be among
+the strongest.
 """
 
 from __future__ import annotations
@@ -15,39 +16,39 @@ import numpy as np
 from core.kernels.bit_masks import BLOCK, lowest_bit, reaching, set_bits
 
 HISTOGRAM_BINS = 1024
-"""Levels of the histogram that prunes; all higher levels share its last bin."""
+"""Levels of the histogram by which cells are left out; all higher levels share its last bin."""
 
 FIRST_GUESS = 2
 """Cells per wanted region in the first attempt to label few enough cells."""
 
 KEYS = 2048
-"""Different keys by which regions are sorted at first."""
+"""Buckets of the first, coarse sort of the regions."""
 
 SHORT_RUN = 32
-"""So many regions of one key are put into order one by one; more are sorted properly."""
+"""Buckets of at most this many regions are sorted by insertion, larger ones by merge sort."""
 
-# What is kept of each cell above the background, and of the region that begins with it.
+# The rows of the workspace: values of each cell above the background, and of the region that begins with it.
 CHANNEL, PARENT, SIZE, TOP, LEFT, BOTTOM, RIGHT, ORDER, SPARE, KEY = range(10)
 INTEGERS = 10
-"""Rows of int32 that :func:`strongest` needs, one column a cell."""
+"""Rows of int32 in the workspace of :func:`strongest`, one column a cell."""
 VALUE, LEVEL = range(2)
 SINGLES = 2
-"""Rows of float32 that it needs."""
+"""Rows of float32 in its workspace."""
 TOTAL, ENERGY = range(2)
 DOUBLES = 2
-"""Rows of float64 that it needs."""
+"""Rows of float64 in its workspace."""
 
 
 def bits_shape(height: int, width: int, channels: int) -> tuple[int, int]:
-    """Of the bits of a layer: cells, with a rim above, to the left and to the right, and blocks of channels."""
+    """The shape of a layer's bits: cells, with a border above, to the left and to the right, by blocks of channels."""
     return (height + 1) * (width + 2), -(-channels // BLOCK)
 
 
 @numba.njit(cache=True, nogil=True)
 def _foreground(activations, step, cells, singles, bits, firsts):  # type: ignore[no-untyped-def]
-    """Keep the cells of level 1 and above, row by row and within a cell by channel; how many there are.
+    """Collect the cells of level 1 and above, row by row and within a cell by channel; return how many there are.
 
-    ``bits`` says which they are, ``firsts`` which of those kept is the first of each block.
+    ``bits`` becomes 1 at those cells; ``firsts`` becomes the number of the first collected cell of each block.
     """
     height, width, channels = activations.shape
     found = 0
@@ -76,7 +77,7 @@ def _foreground(activations, step, cells, singles, bits, firsts):  # type: ignor
 
 @numba.njit(cache=True, nogil=True)
 def _keep_from(lowest, cells, singles, bits, firsts):  # type: ignore[no-untyped-def]
-    """Keep only the cells of level >= ``lowest``; how many there are."""
+    """Keep only the collected cells of level >= ``lowest``; return how many there are."""
     i, found = 0, 0
     for at in range(bits.shape[0]):
         for block in range(bits.shape[1]):
@@ -136,10 +137,10 @@ def _merge(cells, totals, into, other):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _label(count, shape, cells, singles, totals, bits, firsts):  # type: ignore[no-untyped-def]
-    """Join the cells that are kept to regions; how many regions there are."""
+    """Join the collected cells to regions; return how many regions there are."""
     height, width = shape
     parents, levels = cells[PARENT], singles[LEVEL]
-    for i in range(count):  # each by itself at first
+    for i in range(count):  # at first each cell is a region
         parents[i], cells[SIZE, i], totals[i] = i, 1, singles[VALUE, i]
         cells[BOTTOM, i], cells[RIGHT, i] = cells[TOP, i] + 1, cells[LEFT, i] + 1
     regions = count
@@ -171,7 +172,7 @@ def _label(count, shape, cells, singles, totals, bits, firsts):  # type: ignore[
 
 @numba.njit(cache=True, nogil=True)
 def _before(a, b, energies, channels):  # type: ignore[no-untyped-def]
-    """Does the region that begins with cell a come before that of cell b?"""
+    """Whether the region that begins with cell a comes before that of cell b."""
     if energies[a] != energies[b]:
         return energies[a] > energies[b]
     return channels[a] < channels[b] if channels[a] != channels[b] else a < b
@@ -179,7 +180,7 @@ def _before(a, b, energies, channels):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _settle(run, energies, channels):  # type: ignore[no-untyped-def]
-    """Put a run of regions of one key into order."""
+    """Sort the regions of one bucket."""
     if len(run) > SHORT_RUN:
         run.sort()  # by their first cells
         run[:] = run[np.argsort(channels[run], kind="mergesort")]
@@ -197,7 +198,7 @@ def _settle(run, energies, channels):  # type: ignore[no-untyped-def]
 def _sorted(count, wanted, cells, doubles):  # type: ignore[no-untyped-def]
     """The first cells of the ``wanted`` regions of highest energy, ties by channel, then by the first cell.
 
-    One pass by a coarse key; the runs of one key that matter are then put into order one by one.
+    The regions are first sorted into buckets by a coarse key; then the buckets that matter are sorted one by one.
     """
     energies, keys, channels = doubles[ENERGY], cells[KEY], cells[CHANNEL]
     found, least, most = 0, np.inf, 0.0
@@ -216,7 +217,7 @@ def _sorted(count, wanted, cells, doubles):  # type: ignore[no-untyped-def]
         ends[keys[i]] += 1
     for key in range(1, KEYS):
         ends[key] += ends[key - 1]
-    for t in range(found - 1, -1, -1):  # from the last one, so that the ends become the starts
+    for t in range(found - 1, -1, -1):  # backwards, so that the ends of the buckets become their starts
         i = cells[SPARE, t]
         ends[keys[i]] -= 1
         cells[ORDER, ends[keys[i]]] = i
@@ -234,19 +235,20 @@ def _sorted(count, wanted, cells, doubles):  # type: ignore[no-untyped-def]
 def strongest(  # type: ignore[no-untyped-def]
     activations, step, cells, singles, doubles, bits, firsts, boxes, energies, channels
 ):
-    """The regions of highest energy over all maps (eq. 3.3), as many as the results have room for.
+    """Find the N regions of highest energy over all feature maps (equations 3.3 and 4.3).
 
     Args:
         activations: float32 [X, Y, K], finite, contiguous.
         step: float32, over 0.
-        cells, singles, doubles: room to work in, of INTEGERS, SINGLES and DOUBLES rows and X·Y·K columns.
-        bits, firsts: uint64 and int32 of ``bits_shape``, the bits of the rim 0.
-        boxes: int32 [N, 4], becomes top, left, bottom, right, half-open.
-        energies: float32 [N], becomes the mean activations.
-        channels: int32 [N], becomes the feature maps.
+        cells, singles, doubles: workspace of INTEGERS, SINGLES and DOUBLES rows and X·Y·K columns.
+        bits, firsts: workspace, uint64 and int32 of ``bits_shape``, with zeros in the border of ``bits``.
+        boxes: int32 [N, 4], written: top, left, bottom, right, half-open.
+        energies: float32 [N], written: mean activations.
+        channels: int32 [N], written: feature maps.
 
     Returns:
-        How many there are, at most N: by falling energy, ties by first occurrence (map by map, then row by row).
+        How many regions there are, at most N, by falling energy; ties by first occurrence (map by map, then row by
+        row).
     """
     wanted = len(energies)
     guess = FIRST_GUESS * wanted

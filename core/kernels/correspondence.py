@@ -1,7 +1,8 @@
-"""Mutual best matches of the cells of one frame with those of many others, compiled: only what is within reach.
+"""The compiled search for the mutual nearest neighbours among the cells of one frame and of many others, within reach.
 
-The rows of a reference are gone through one after another, each against the rows of the query within reach.  Of each
-query cell the best so far is kept until all rows were seen; of each cell of the row it is known at once.
+``core.method.agreement.correspondences`` says what is computed.  The rows of a reference are compared one after
+another with the rows of the query within reach.  The best match of a reference cell is known when its row is done; the
+best match of a query cell is the best of all rows.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ from core.kernels.cell_blocks import (
 )
 
 WHOLE_WORDS = 4
-"""The values of a cell have to be a multiple of this."""
+"""The number of values of a cell must be a multiple of this."""
 
 LINE = 64
-"""Bytes that a cache fetches together."""
+"""Bytes of a cache line."""
 
 
 @numba.njit(cache=True, nogil=True)
 def _words_of(query, columns):  # type: ignore[no-untyped-def]
-    """Vectors of a query's rows, int32 [rows, parts, words, LANES]: HELD cells of a row and a zero in each part."""
+    """The query's rows as vectors, int32 [rows, parts, words, LANES]: each part has HELD cells of a row and a zero."""
     cells, length = query.shape
     values = values_a_word()
     zero = np.int32(MOVED if values == 4 else 0)
@@ -69,7 +70,7 @@ def _limits_of(columns, apart):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _words_given(address, width, words):  # type: ignore[no-untyped-def]
-    """The address of a reference row's words; where they are not four bytes each, they are put into ``words``."""
+    """The address of a reference row's words; unless a word is four bytes as they lie, it is put into ``words``."""
     values = values_a_word()
     if values == 4:
         return address
@@ -85,7 +86,7 @@ def _words_given(address, width, words):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _compare(held, limits, part, given, row, low, high, there, back):  # type: ignore[no-untyped-def]
-    """One row of a reference with one part of the query's rows low … high; what is best is kept in there and back."""
+    """Compare one row of a reference with one part of the query's rows low … high, and update there and back."""
     columns, steps = limits.shape[1], held.shape[2]
     stride = steps * 4
     size = CELLS if is_wide() else FEWER_CELLS
@@ -93,7 +94,7 @@ def _compare(held, limits, part, given, row, low, high, there, back):  # type: i
         size = 1
     u = 0
     while u < columns:
-        u = min(u, columns - size)  # the last ones once more rather than one by one
+        u = min(u, columns - size)  # the last group overlaps the one before it
         y = low
         while y < high:
             place = (
@@ -131,7 +132,7 @@ def _compare(held, limits, part, given, row, low, high, there, back):  # type: i
 
 @numba.njit(cache=True, nogil=True)
 def _keep_backs(back, part, highs, backs):  # type: ignore[no-untyped-def]
-    """Of each cell of a reference's row the best query cell of this part and those before it; ties to the lower."""
+    """Update the best query cell of each cell of a reference's row with those of one part; ties to the lower cell."""
     for u in range(len(back)):
         product, cell = highest(back[u].ctypes.data)
         if part == 0 or product > highs[u] or (product == highs[u] and cell < backs[u]):
@@ -140,7 +141,7 @@ def _keep_backs(back, part, highs, backs):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def _sum_of(there, backs, columns, cosine):  # type: ignore[no-untyped-def]
-    """Σ cos² over the cells of a reference that are the best matches of their best matches, in their order."""
+    """Σ cos² over the cells of a reference that are the best matches of their best matches."""
     total = np.zeros(1, np.float32)
     for cell in range(len(backs)):
         y, x = backs[cell] // columns, backs[cell] % columns
@@ -153,12 +154,13 @@ def _sum_of(there, backs, columns, cosine):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, nogil=True)
 def squared_sums(query, addresses, columns, rows_apart, columns_apart, cosine):  # type: ignore[no-untyped-def]
-    """Σ cos² over the mutual best matches of a query with each of k references; ties to the lower cell.
+    """Σ cos² over the mutual nearest neighbours of a query and each of k references; ties to the lower cell.
 
     Args:
         query: int8 [C, L]; C is a multiple of the columns, L of WHOLE_WORDS.
-        addresses: int64 [k], of the references, int8 [C, L] each.
-        cosine: float32, what an inner product is multiplied by.
+        addresses: int64 [k], of the first values of the references, int8 [C, L] each.
+        rows_apart, columns_apart: the reach.
+        cosine: float32, by which an inner product is multiplied to become a cosine.
 
     Returns:
         float32 [k].

@@ -1,7 +1,8 @@
-"""Inner products with descriptors of six bits a value, without unpacking them first.
+"""Inner products with descriptors of six bits a value, which are not unpacked first.
 
-Such a descriptor is blocks of 128 values, each with a scale; a value is (4 h + l - 32) times its block's scale, h being
-its upper four bits, kept two a byte, and l its lower two, kept four a byte, the first value in the lowest bits.
+Such a descriptor consists of blocks of 128 values, each with a scale.  A value is (4 h + l - 32) times its block's
+scale.  The upper four bits h are stored two values a byte, the lower two bits l four values a byte, with the first
+value in the lowest bits.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ def packed_products(query: Array, scales: Array, uppers: NDArray[np.uint8], lowe
     """Inner products of a query with n descriptors, float32 [n].
 
     Args:
-        query: float32 [128·b], zeros appended where D is less.
+        query: float32 [128·b], with zeros appended to its D values.
         scales: float32 [n, b].
-        uppers: uint8 [n, 64·b]; lowers: uint8 [n, 32·b]; rows may lie apart.
+        uppers: uint8 [n, 64·b]; the rows need not be adjacent in memory.
+        lowers: uint8 [n, 32·b], likewise.
     """
     blocks = query.reshape(-1, _FOURS, 4)
-    # What 32 stands for is the same in every descriptor, but for the scales.
+    # What the subtracted 32 contributes is the same for every descriptor, except for the scales.
     offsets = np.float32(32) * blocks.sum(axis=(1, 2), dtype=np.float32)
     made = np.empty(len(scales), np.float32)
     _products(np.ascontiguousarray(blocks.transpose(0, 2, 1)), offsets, scales, uppers, lowers, made)
@@ -34,7 +36,7 @@ def packed_products(query: Array, scales: Array, uppers: NDArray[np.uint8], lowe
 
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
 def _products(query, offsets, scales, uppers, lowers, made):  # type: ignore[no-untyped-def]
-    """``query``: float32 [b, 4, 32], of every block the first of each four values, then the second, and so on."""
+    """``query``: float32 [b, 4, 32], of every block the first of each group of four values, then the second, …"""
     for row in range(len(scales)):
         total = np.float32(0)
         for block in range(len(query)):

@@ -1,4 +1,4 @@
-"""Products of many short vectors with one matrix that never changes, at the processor's best."""
+"""Products of many short vectors with one matrix that never changes, by oneDNN."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from torch import Tensor
 Array = NDArray[np.float32]
 
 TYPICAL = 300
-"""Vectors multiplied at a time, as the order of the matrix is chosen for."""
+"""Number of vectors for which oneDNN chooses the matrix's layout."""
 
 
 class ConstantMatrix:
-    """x W + b, with W kept in the order that oneDNN's kernel reads it in; where there is none, NumPy's product.
+    """x W + b, with W in the layout that oneDNN's loop reads; where oneDNN has no such product, NumPy's is used.
 
     Args:
         matrix: W, float32 [K, d].
@@ -29,7 +29,7 @@ class ConstantMatrix:
         self._ordered = _ordered(matrix)
 
     def __call__(self, vectors: Array) -> Array:
-        """float32 [n, K] to float32 [n, d]."""
+        """Multiply vectors, float32 [n, K] to float32 [n, d]."""
         if self._ordered is None or len(vectors) == 0:
             products = np.asarray(vectors @ self._matrix, np.float32)
             return products if self._offset is None else products + self._offset
@@ -41,7 +41,7 @@ class ConstantMatrix:
 
 
 def _ordered(matrix: Array) -> Tensor | None:
-    """The matrix in oneDNN's order; None where this build of torch or this processor has no such product."""
+    """The matrix in oneDNN's layout; None if this build of torch or this processor has no such product."""
     try:
         with torch.inference_mode():
             transposed = torch.from_numpy(np.ascontiguousarray(matrix.T))

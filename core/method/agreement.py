@@ -1,31 +1,34 @@
-"""The second stage: do two frames agree cell by cell, with what moved having moved a little?
+"""The second stage: do two frames agree cell by cell, if what moved has moved only a little?
 
-VLAD forgets where in the frame a feature was.  For the first few candidates that it ranks, the local
-descriptors D^L of both frames are held against each other on the grid of cells: a cell of the query and a cell of
-the reference correspond when each is the other's best match within reach (mutual nearest neighbours, as the
-thesis's Figure 3.1 shows by eye), and each such pair adds the square of its cosine.
+VLAD forgets where in the frame a feature was.  For the first few candidates of its ranking, the local descriptors D^L
+of both frames (thesis, equations 3.1 and 4.1) are therefore compared on the grid of cells.  A cell of the query and a
+cell of the reference correspond when each is the other's best match within reach: they are mutual nearest neighbours,
+as the thesis's Figure 3.1 shows by eye.  :func:`correspondences` finds them in plain NumPy.  With the cosines c of the
+corresponding cells, C cells in all, a candidate's score grows by
+
+    share · 1/C Σ c²,
+
+which :func:`agreement` computes for many candidates at once with a compiled loop.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.kernels.correspondence import WHOLE_WORDS, squared_sums
-from core.method.cells import Cells as Cells
-from core.method.cells import ScatteredCells, in_one_block
+from core.kernels.projections import quantize
 
 Array = NDArray[np.float32]
+Cells = NDArray[np.int8]
+"""Local descriptors, quantised: int8 [C, L], or [k, C, L] of several frames."""
 
 RESOLUTION = 254.0
-"""Quantisation of local descriptors: values of half a unit and more, which hardly occur, become 127."""
-
-_COSINE = np.float32(1 / RESOLUTION**2)
-"""What the inner product of two cells' values is multiplied by to be their cosine."""
+"""Steps of 1 / RESOLUTION quantise the values of local descriptors; values of half a unit and more, which are rare,
+become 127."""
 
 
 class AgreementDefinition(BaseModel):
@@ -55,38 +58,35 @@ class AgreementDefinition(BaseModel):
 
     @property
     def length(self) -> int:
-        """L, the values of one cell."""
+        """L, the number of values of one cell."""
         return self.values * len(self.layers)
 
 
 def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> Cells:
-    """The projected unit features of C cells, int8 [C, L], so that inner products are weighted sums of cosines.
+    """Quantise the projected features of C cells, so that inner products are weighted sums of cosines.
+
+    A value v of a layer with the weight w becomes the whole number nearest to v · √w · RESOLUTION, from -127 to 127.
 
     Args:
         layers: float32 [C, values] each, rows of unit length or zero.
+
+    Returns:
+        int8 [C, L].
     """
     made = np.empty((len(layers[0]), sum(layer.shape[1] for layer in layers)), np.int8)
     start = 0
     for weight, layer in zip(definition.weights, layers, strict=True):
         stop = start + layer.shape[1]
-        _quantize(layer, np.sqrt(weight), made[:, start:stop])
+        quantize(layer, RESOLUTION * np.sqrt(weight), made[:, start:stop])
         start = stop
     return made
 
 
-@numba.njit(cache=True, nogil=True)
-def _quantize(values, factor, made):  # type: ignore[no-untyped-def]
-    """Values times a factor in steps of 1 / RESOLUTION; float32 [C, n] to int8."""
-    for c in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            made[c, i] = np.int8(min(127.0, max(-127.0, np.rint(values[c, i] * factor * RESOLUTION))))
-
-
 @dataclass(frozen=True)
 class Correspondences:
-    """Cells that are each other's best match.
+    """Cells of two frames that are each other's best match.
 
-    query, reference: int64 [n], cells of the two frames (row * columns + column).
+    query, reference: int64 [n], cells of the two frames (row * columns + column), ascending in the query.
     cosines: float32 [n], each over 0.
     """
 
@@ -95,24 +95,78 @@ class Correspondences:
     cosines: Array
 
 
-@numba.njit(cache=True, nogil=True)
-def _best_within(cosines, columns, rows_apart, columns_apart, best):  # type: ignore[no-untyped-def]
-    """For each cell of the first frame its best match within reach in the second; ties to the lower cell."""
-    cells = len(cosines)
-    rows = cells // columns
-    for cell in range(cells):
-        y, x = cell // columns, cell % columns
-        highest, found = np.float32(-np.inf), -1
-        for v in range(max(0, y - rows_apart), min(rows, y + rows_apart + 1)):
-            for u in range(max(0, x - columns_apart), min(columns, x + columns_apart + 1)):
-                value = cosines[cell, v * columns + u]
-                if value > highest:
-                    highest, found = value, v * columns + u
-        best[cell] = found
+def correspondences(query: Cells, reference: Cells, columns: int, reach: tuple[int, int]) -> Correspondences:
+    """The mutual nearest neighbours among the cells of two frames.
+
+    Args:
+        query, reference: int8 [C, L].
+        columns: of the grid; C is a multiple of it.
+        reach: rows and columns by which two corresponding cells may be apart.
+    """
+    products = query.astype(np.float64) @ reference.astype(np.float64).T  # C x C, exact
+    cells = np.arange(len(query))
+    row, column = np.divmod(cells, columns)
+    far = (np.abs(row[:, None] - row) > reach[0]) | (np.abs(column[:, None] - column) > reach[1])
+    products[far] = -np.inf
+    there, back = products.argmax(axis=1), products.argmax(axis=0)  # of equal products the lower cell's
+    best = products[cells, there]
+    mutual = (back[there] == cells) & (best > 0)
+    return Correspondences(cells[mutual], there[mutual], (best[mutual] / RESOLUTION**2).astype(np.float32))
+
+
+@dataclass(frozen=True)
+class ScatteredCells:
+    """The cells of k frames where they lie in memory, C cells of L values each: they need not be copied to be compared.
+
+    blocks: int8 [n, C, L] each, contiguous; at least one.
+    block: int64 [k], the block that holds a frame's cells.
+    row: int64 [k], the frame's position in that block.
+    """
+
+    blocks: tuple[Cells, ...]
+    block: NDArray[np.int64]
+    row: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """k, C and L."""
+        return len(self), *self.blocks[0].shape[1:]
+
+    def together(self) -> Cells:
+        """A copy in one array: int8 [k, C, L]."""
+        found = np.empty(self.shape, np.int8)
+        for position, (block, row) in enumerate(zip(self.block.tolist(), self.row.tolist(), strict=True)):
+            found[position] = self.blocks[block][row]
+        return found
+
+    def addresses(self) -> NDArray[np.int64]:
+        """The address of the first value of each frame, int64 [k]; valid as long as this object lives.
+
+        Raises:
+            IndexError: a block has no such row.
+            ValueError: a block is not contiguous, or has another shape.
+        """
+        lengths = np.array([len(block) for block in self.blocks])
+        if len(self) and (self.row.min() < 0 or (self.row >= lengths[self.block]).any()):
+            raise IndexError("a block of cells has no such row")
+        for block in self.blocks:
+            if block.shape[1:] != self.shape[1:] or block.dtype != np.int8 or not block.flags.c_contiguous:
+                raise ValueError("blocks of cells are alike and contiguous")
+        firsts = np.array([block.ctypes.data for block in self.blocks], np.int64)
+        return np.asarray(firsts[self.block] + self.row * int(np.prod(self.shape[1:])))
+
+
+def in_one_block(cells: Cells) -> ScatteredCells:
+    """Cells that lie in one array: int8 [k, C, L], copied only if it is not contiguous."""
+    count = len(cells)
+    return ScatteredCells((np.ascontiguousarray(cells, np.int8),), np.zeros(count, np.int64), np.arange(count))
 
 
 def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, definition: AgreementDefinition) -> Array:
-    """What each candidate gains: ``share`` times the mean over cells of its mutual matches' squared cosines.
+    """What each candidate's score gains: ``share`` times the mean over all cells of the squared cosines.
 
     Args:
         query: int8 [C, L].
@@ -120,10 +174,10 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
         columns: of the grid; C is a multiple of it.
 
     Returns:
-        float32 [k], at least 0, at most ``share`` but for rounding.
+        float32 [k], at least 0 and, except for rounding, at most ``share``.
 
     Raises:
-        ValueError: the cells of the query and of the candidates are not alike, or not of such a grid.
+        ValueError: the query's cells and the candidates' have different shapes, or do not fill such a grid.
     """
     if query.shape != candidates.shape[1:] or len(query) % columns:
         shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
@@ -134,32 +188,21 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
         candidates = np.pad(candidates, [(0, 0), (0, 0), (0, missing)])
         query = np.pad(query, [(0, 0), (0, missing)])
     lying = candidates if isinstance(candidates, ScatteredCells) else in_one_block(candidates)
-    asked = np.require(query, np.int8, ["C", "W"])  # numba would compile anew for what cannot be written
-    sums: Array = squared_sums(asked, lying.addresses(), columns, *definition.reach, _COSINE)
+    asked = np.require(query, np.int8, ["C", "W"])  # numba would compile the loop again for a read-only array
+    sums: Array = squared_sums(asked, lying.addresses(), columns, *definition.reach, np.float32(1 / RESOLUTION**2))
     return sums * np.float32(definition.share / len(query))
 
 
-def correspondences(query: Cells, reference: Cells, columns: int, definition: AgreementDefinition) -> Correspondences:
-    """Which cell of the query answers to which of the reference; both int8 [C, L]."""
-    cosines = (reference.astype(np.float32) @ query.astype(np.float32).T) * _COSINE  # reference x query
-    there, back = np.empty(len(query), np.int64), np.empty(len(query), np.int64)
-    _best_within(cosines.T, columns, *definition.reach, there)
-    _best_within(cosines, columns, *definition.reach, back)
-    cells = np.arange(len(query))
-    values = cosines[there, cells]
-    mutual = (back[there] == cells) & (values > 0)
-    return Correspondences(cells[mutual], there[mutual], values[mutual])
-
-
 def reranked(scores: Array, gains: Array) -> tuple[NDArray[np.int64], Array]:
-    """The order of a ranking once its first places have gained, and the scores in that order.
+    """Sort a ranking again after its first places have gained.
 
     Args:
         scores: float32 [n], best first.
         gains: float32 [k], k <= n, at least 0, of the first k.
 
     Returns:
-        int64 [n], positions in the old ranking, and float32 [n], best first; equal scores keep their order.
+        int64 [n], positions in the old ranking, and float32 [n], their scores, best first; equal scores keep their
+        order.
     """
     raised = scores.copy()
     raised[: len(gains)] += gains

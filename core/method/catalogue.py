@@ -1,14 +1,12 @@
-"""The encoders installed on a machine: those packaged here and those of the user's directory.
+"""The encoders installed on a machine: the packaged ones and those in the user's directory.
 
-An encoder is one file ``<name>.encoder.safetensors`` (vocabulary, projections, golden values, definition,
-calibration) that names a network file ``<network>.network.safetensors`` beside it or among the
-packaged ones.
+An encoder is a file ``<name>.encoder.safetensors`` with its vocabulary, projections, golden values, definition and
+calibration.  It names a network file ``<network>.network.safetensors`` in the same folder or among the packaged ones.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import threading
 from collections.abc import Mapping
@@ -21,6 +19,7 @@ from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from core.disk.files import replacing
 from core.errors import InvalidModel, UnknownEncoder
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
@@ -75,11 +74,11 @@ def save_encoder(
     network: str,
     training: dict[str, Any],
 ) -> Path:
-    """Write ``<name>.encoder.safetensors``, whole or not at all.
+    """Write ``<name>.encoder.safetensors``, complete or not at all.
 
     Args:
         network: name of the network file that the encoder uses.
-        training: how the vocabulary was made (images, features, seed …), for the reader.
+        training: how the vocabulary was made (images, features, seed …), for information.
 
     Raises:
         InvalidModel: the encoder's name cannot name a file.
@@ -111,10 +110,10 @@ def save_encoder(
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:
-    """Give an encoder file another default calibration; nothing else of it changes, nor its identity.
+    """Replace the default calibration in an encoder file; nothing else changes, and its identity stays.
 
     Raises:
-        InvalidModel: it cannot be read.
+        InvalidModel: the file cannot be read.
     """
     header = _read_header(path).model_copy(update={"calibration": calibration})
     try:
@@ -127,10 +126,11 @@ def save_calibration(path: Path, calibration: Calibration) -> None:
 
 def _write(path: Path, tensors: Mapping[str, NDArray[Any]], header: _Header) -> None:
     """The file of an encoder, whole or not at all."""
-    partial = path.with_name(path.name + ".tmp")
-    save_file(dict(tensors), partial, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))})
-    partial.chmod(0o644)
-    os.replace(partial, path)
+    with replacing(path) as temporary:
+        save_file(
+            dict(tensors), temporary, {"format": FORMAT, "header": canonical_json(header.model_dump(mode="json"))}
+        )
+        temporary.chmod(0o644)
 
 
 def _read_header(path: Path) -> _Header:
@@ -148,11 +148,11 @@ def _read_header(path: Path) -> _Header:
 
 
 def load_encoder(path: Path, network: Path) -> Encoder:
-    """Build the encoder of a file on the network of another.
+    """Load an encoder from its file and the file of its network.
 
     Raises:
-        InvalidModel: a file is missing or damaged, or the parts do not give the identity that the
-            encoder was saved with.
+        InvalidModel: a file is missing or damaged, or the parts do not have the identity with which the encoder was
+            saved.
     """
     header = _read_header(path)
     try:
@@ -187,9 +187,9 @@ class EncoderCatalogue:
     """Finds encoders by name or identity and loads each once; thread-safe.
 
     Args:
-        models_dir: the user's directory, which need not exist; its encoders cannot take a packaged
-            name.
-        precision, device: how forward passes are computed, as :meth:`core.method.encoder.Encoder.settle` takes them.
+        models_dir: the user's directory, which need not exist; an encoder in it that has the name of a packaged one is
+            ignored.
+        precision, device: how forward passes are computed; see :meth:`core.method.encoder.Encoder.settle`.
     """
 
     def __init__(
@@ -211,10 +211,10 @@ class EncoderCatalogue:
         return found
 
     def network_file(self, name: str) -> Path:
-        """The file of a network.
+        """The path of a network's file.
 
         Raises:
-            InvalidModel: there is none of that name.
+            InvalidModel: no network of that name is installed.
         """
         for folder in self._folders:
             path = folder / f"{name}{NETWORK_SUFFIX}"
@@ -223,7 +223,7 @@ class EncoderCatalogue:
         raise InvalidModel(f"no network named {name!r} is installed; its file would be {name}{NETWORK_SUFFIX}.")
 
     def describe(self) -> list[EncoderSummary]:
-        """All installed encoders by name, damaged ones too; no weights are read."""
+        """All installed encoders by name, including damaged ones; no weights are read."""
         return [self._summary(name, path) for name, path in self._files().items()]
 
     def _summary(self, name: str, path: Path) -> EncoderSummary:
@@ -248,7 +248,7 @@ class EncoderCatalogue:
         """The full identity of an installed encoder.
 
         Raises:
-            UnknownEncoder: none has this name or identity; the text says what to do.
+            UnknownEncoder: no encoder has this name or identity; the text says what to do.
             InvalidModel: its file is damaged.
         """
         return _read_header(self._find(name_or_identity)).identity
@@ -268,12 +268,12 @@ class EncoderCatalogue:
         return files[name]
 
     def get(self, name_or_identity: str) -> Encoder:
-        """The encoder itself, loaded on first use.
+        """The encoder, loaded at its first use.
 
         Raises:
-            UnknownEncoder: none has this name or identity.
-            InvalidModel: its files are missing or damaged, or this machine lacks the precision or device asked for.
-            GoldenMismatch: the precision asked for changes its descriptors.
+            UnknownEncoder: no encoder has this name or identity.
+            InvalidModel: its files are missing or damaged, or this machine lacks the requested precision or device.
+            GoldenMismatch: the requested precision changes its descriptors too much.
         """
         path = self._find(name_or_identity)
         with self._lock:

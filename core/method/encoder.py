@@ -1,4 +1,4 @@
-"""From a frame to its descriptors: backbone, regions, fusion, VLAD (thesis, Figure 4.1); cells for the second stage."""
+"""The encoder, from a frame to its descriptors: backbone, regions, fusion, VLAD (thesis, Figure 4.1), and its cells."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
-from core.method.cells import ScatteredCells
+from core.method.agreement import AgreementDefinition, Cells, ScatteredCells, agreement, local_descriptors
+from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
-from core.method.matching import scores
 from core.method.regions import Regions
-from core.method.vlad import Normalization, Words, aggregate
+from core.method.vlad import Words, aggregate, scores
 from core.method.vocabulary import Vocabulary
 from core.networks.forward import Device, Precision, has_bfloat16
 from core.networks.identity import json_digest, tensors_digest
@@ -32,10 +31,10 @@ from core.threads import each
 Array = NDArray[np.float32]
 
 FRAMES_A_PASS = 4
-"""Frames that share a forward pass at most: more gain nothing, and their maps would not stay in the caches."""
+"""At most this many frames share a forward pass; with more, their maps would not stay in the caches."""
 
 GOLDEN_COSINE = 0.999
-"""How close a machine's or a faster path's descriptors must come to the golden ones."""
+"""Least cosine of the descriptors of a machine, or of a lower precision, to the golden ones."""
 
 
 class EncoderDefinition(FeatureDefinition):
@@ -48,7 +47,7 @@ class EncoderDefinition(FeatureDefinition):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The layers that the backbone must return: those whose regions are fused, then those only compared."""
+        """The layers that the backbone must return: those whose regions are fused, then those of the second stage."""
         further = () if self.agreement is None else self.agreement.layers
         return self.layers + tuple(layer for layer in further if layer not in self.layers)
 
@@ -63,11 +62,11 @@ class EncoderDefinition(FeatureDefinition):
 
 @dataclass(frozen=True)
 class Encoding:
-    """What a frame becomes.
+    """An encoded frame.
 
-    descriptor: float32 [D]; zeros where the frame has no region.
-    local: int8 [C, L], local descriptors of the C cells for the second stage, zeros where the frame has no region;
-        [0, 0] without one.
+    descriptor: float32 [D]; zeros if the frame has no region.
+    local: int8 [C, L], local descriptors of the C cells for the second stage, zeros if the frame has no region;
+        [0, 0] for an encoder without a second stage.
     milliseconds: of the stages ``forward``, ``regions`` and ``vlad``; the last includes the local descriptors.
     """
 
@@ -78,18 +77,18 @@ class Encoding:
 
 
 class Encoder:
-    """M-Region-VLAD, or Region-VLAD with one layer: a frame to one vector of V·K values, K of a projected feature
-    if features are projected, and to the local descriptors of its cells if there is a second stage.
+    """M-Region-VLAD, or Region-VLAD if there is one layer.
 
-    Thread-safe: encoding changes nothing.
+    A frame becomes one vector of V·K values (K is that of the projected features if features are projected) and, if
+    there is a second stage, the local descriptors of its cells.  Thread-safe: encoding changes nothing.
 
     Args:
-        name: what users call it.
+        name: by which users choose the encoder.
         extractor: backbone and regions.
-        vocabulary: trained on the features of just this extractor.
-        calibration: the default that a map uses until it has its own.
-        golden: what the canary frame gave where the encoder was made: float [D], its descriptor, and
-            int8 [C, L], its local descriptors.
+        vocabulary: trained on the features of this extractor.
+        calibration: the default for maps that have none of their own.
+        golden: the descriptor, float [D], and the local descriptors, int8 [C, L], of the canary frame on the machine
+            where the encoder was made.
 
     Raises:
         WrongVocabulary: the vocabulary was trained for another extractor.
@@ -138,30 +137,30 @@ class Encoder:
 
     @property
     def candidates(self) -> int:
-        """How many of the best matches the second stage examines."""
+        """How many of the best matches the second stage examines; 0 without one."""
         stage = self.definition.agreement
         return 0 if stage is None else stage.candidates
 
     def agreement(self, query: Cells, candidates: Cells | ScatteredCells) -> Array:
-        """What the second stage adds to the candidates' scores, at least 0; int8 [C, L], [k, C, L] to float32 [k]."""
+        """What the second stage adds to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
         stage = self.definition.agreement
         if stage is None:
             return np.zeros(len(candidates), np.float32)
         return agreement(query, candidates, self.grid[1], stage)
 
     def encode(self, pixels: Pixels, mask: Mask | None = None) -> Encoding:
-        """Encode one frame, H x W x 3 uint8 BGR of any size, but for what a mask covers; its pass has all cores."""
+        """Encode one frame, uint8 [H, W, 3], BGR, of any size; a mask hides a part of it.  The pass uses all cores."""
         return self._encode([pixels], [mask])[0]
 
     def encode_batch(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[Encoding]:
-        """Encode frames, a few to a forward pass and a pass to a core: more frames a second than one by one.
+        """Encode frames, a few in each forward pass and one pass on each core, which is faster than one by one.
 
         Args:
-            frames: H x W x 3 uint8 BGR each, of any sizes.
-            masks: of each frame what not to see; None: all is seen.
+            frames: uint8 [H, W, 3] each, BGR, of any sizes.
+            masks: one for each frame, None for a frame that is not masked; None: no frame is masked.
 
         Raises:
-            ValueError: there is another number of masks than of frames.
+            ValueError: the number of masks is not that of the frames.
         """
         hidden = [None] * len(frames) if masks is None else masks
         if len(hidden) != len(frames):
@@ -189,9 +188,10 @@ class Encoder:
     def describe(
         self, activations: Sequence[Array], forward: float = 0.0, products: Mapping[str, Array] | None = None
     ) -> Encoding:
-        """Encode a frame whose activations are known, as ``extractor.activations`` gives them.
+        """Encode a frame whose activations are known.
 
         Args:
+            activations: of each output, float32 [X, Y, K], as ``extractor.activations`` gives them.
             forward: milliseconds that they and the products took.
             products: as ``extractor.products`` gives them, if they are known.
         """
@@ -207,9 +207,9 @@ class Encoder:
         return Encoding(descriptor, local, regions, times)
 
     def local(self, activations: Sequence[Array], products: Mapping[str, Array]) -> Cells:
-        """The local descriptors of a frame that has a region, as :attr:`Encoding.local`.
+        """The local descriptors of a frame that has a region, int8 [C, L], as in :attr:`Encoding.local`.
 
-        Whatever a frame without regions excites, it is like no other: its descriptors are zero.
+        A frame without regions has no local descriptors: it is like no other frame.
         """
         stage = self.definition.agreement
         if stage is None:
@@ -218,23 +218,27 @@ class Encoder:
         return local_descriptors(cells, stage)
 
     def scores_from_inner_products(self, inner_products: Array) -> Array:
-        """Inner products of descriptors, any shape, as the scores that users see: of places not examined further."""
+        """Scores from inner products of descriptors, float32 of any shape, of places that the second stage has not
+        examined."""
         first = scores(inner_products, self.definition.words, self.definition.normalization)
         stage = self.definition.agreement
         return first if stage is None else first * np.float32(1 - stage.share)
 
     def score(self, a: Encoding, b: Encoding) -> float:
-        """The score of two frames: J / V (eq. 4.13) or the inner product, shared with their agreement if it counts."""
+        """The score of two frames: J / V (equation 4.13) or the inner product; with a second stage, also agreement."""
         product = np.array(a.descriptor @ b.descriptor, np.float32)
         return float(self.scores_from_inner_products(product) + self.agreement(a.local, b.local[np.newaxis])[0])
 
     def with_agreement(self, scores: Array, queries: Cells, references: Cells) -> Array:
-        """The scores after the second stage: of each query those of the best ``candidates`` have gained.
+        """Apply the second stage to the best ``candidates`` of each query; without one, return the scores.
 
         Args:
             scores: float32 [Q, R].
             queries: int8 [Q, C, L], their local descriptors.
             references: int8 [R, C, L].
+
+        Returns:
+            float32 [Q, R].
         """
         if not self.candidates:
             return scores
@@ -245,23 +249,26 @@ class Encoder:
         return raised
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
-        """Cells (rows, columns) of the maps of each layer in use."""
+        """Rows and columns of the maps of each layer in use."""
         return self.extractor.layer_grids()
 
     def settle(self, precision: Precision | Literal["auto"] = "auto", device: Device = "cpu") -> Precision:
-        """Choose how forward passes are computed, before the first frame is encoded; the precision now in use.
+        """Choose how forward passes are computed, before the first frame is encoded.
 
-        A lower precision is used only where it makes no difference that counts: descriptors of one identity are
-        held against each other, whichever machine made them.
+        A lower precision is used only if it hardly changes descriptors: those of one encoder identity are compared
+        with each other, whichever machine made them.
 
         Args:
-            precision: "auto" takes bfloat16 where the processor multiplies it and the descriptors of a few frames
-                come as close to those of float32 as ``GOLDEN_COSINE``.
+            precision: "auto" takes bfloat16 if the processor multiplies it and the descriptors of a few frames have a
+                cosine of at least ``GOLDEN_COSINE`` to those of float32.
             device: of the forward pass; on a GPU it is float32.
 
+        Returns:
+            The precision now in use.
+
         Raises:
-            InvalidModel: this machine has not what was asked for.
-            GoldenMismatch: bfloat16 was asked for, and the descriptors do not stand it.
+            InvalidModel: this machine lacks the precision or the device.
+            GoldenMismatch: bfloat16 was asked for, and it changes the descriptors too much.
         """
         self.extractor.compute("float32", device)
         lower = has_bfloat16() and isinstance(self.extractor.backbone, ShallowNetwork)
@@ -286,20 +293,20 @@ class Encoder:
                 raise GoldenMismatch(f"{self.name} gives a cosine of {cosine:.4f} to {what} on this machine.")
 
     def check_golden(self) -> None:
-        """Encode the canary frame and compare.
+        """Encode the canary frame and compare its descriptors with the golden ones.
 
         Raises:
-            GoldenMismatch: the cosine to the golden descriptor is under 0.999, or there is none.
+            GoldenMismatch: a cosine to the golden values is under ``GOLDEN_COSINE``, or there are no golden values.
         """
         if self._golden is None:
             raise GoldenMismatch(f"{self.name} has no golden values.")
         made = self.encode(canary_frame())
         self._hold_against(made, *self._golden, "its golden values")
-        self.agreement(made.local, made.local[np.newaxis])  # compiled now, as all else is, and not by the first query
+        self.agreement(made.local, made.local[np.newaxis])  # compile the second stage now, not in the first query
 
 
 def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
-    """Of two arrays of one shape, flattened; 1 where both are empty."""
+    """The cosine of two arrays of one shape, flattened; 1 if both are empty, 0 if the shapes differ."""
     if found.shape != golden.shape:
         return 0.0
     a, b = found.astype(np.float64).ravel(), golden.astype(np.float64).ravel()
@@ -307,14 +314,14 @@ def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
 
 
 def encoder_identity(name: str, definition: EncoderDefinition, vocabulary: Vocabulary) -> str:
-    """``<name>@<sha256>`` over every field that can change a descriptor, tensors by content."""
+    """``<name>@<sha256>`` over everything that can change a descriptor, tensors by content."""
     centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
     fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": content_of(definition)}
     return f"{name}@{json_digest(fields)}"
 
 
 def canary_frame() -> Pixels:
-    """A 480 x 640 BGR picture made of integers alone: stripes, blocks and a ramp."""
+    """A picture of stripes, blocks and a ramp, uint8 [480, 640, 3], computed with integers, so the same everywhere."""
     y, x = np.mgrid[0:480, 0:640]
     blue = (x * 3 + y) % 256
     green = ((x // 40 + y // 30) % 2) * 120 + (x * y // 97) % 90

@@ -1,9 +1,9 @@
-"""Why two frames score as they do: words, regions and cells that carried the score (thesis, section 3.4.3).
+"""Why two frames score as they do: what words, regions and cells contribute to the score (thesis, section 3.4.3).
 
-The score of an encoder with two stages is a sum, and both of its parts are sums again: the first over
-the words of the vocabulary (eqs. 3.13, 4.13), the second over the cells that choose each other
-(``agreement.py``).  Between the regions of one word and its part v_u of the VLAD stand a power and a
-norm, so a region has no share by itself; what is said of it is how much the score would lose without it.
+The score of an encoder with two stages is the sum of two sums: the first over the words of the vocabulary (equations
+3.13 and 4.13), the second over the corresponding cells (``agreement.py``).  A region has no share of its own, since
+its residual passes through a power and a norm with the others of its word; for a region it is told how much the score
+would lose without it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from core.method.agreement import Cells, Correspondences, correspondences
 from core.method.encoder import Encoder
+from core.method.equations import assign, power, residuals, unit_length
 from core.method.regions import Regions
-from core.method.vlad import assign, normalize, power, residuals
 
 Array = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -24,10 +24,11 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Shown:
-    """What is known of a frame that is explained.
+    """One of the two frames of an explanation.
 
-    descriptor: float32 [D].  local: int8 [C, L].
-    regions: None where the frame itself is not at hand, as for a place of which no picture is kept.
+    descriptor: float32 [D].
+    local: int8 [C, L], its local descriptors.
+    regions: None if the frame itself is not available, as for a place without a stored picture.
     """
 
     descriptor: Array
@@ -37,14 +38,14 @@ class Shown:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The score of a frame a against a frame b, taken apart.
+    """The parts of the score of a frame a against a frame b.
 
-    words: float32 [V], what each word adds to the score (j_u, as it counts).
-    losses: of a and of b, float32 [T], what the score would lose without each region; negative: it would gain.
-        None where a frame's regions are not known.
-    answers: int64 [n, 2], regions of a and of b that are each other's nearest among those of their word.
-    cells: which cell of a answers to which of b; none without a second stage.
-    gains: float32, what each pair of cells adds to the score.
+    words: float32 [V], what each word adds to the score (its j_u, scaled as in the score).
+    losses: of a and of b, float32 [T], what the score would lose without each region; negative if it would gain.
+        None if a frame's regions are not known.
+    answers: int64 [n, 2], regions of a and of b of one word that are each other's nearest.
+    cells: the corresponding cells of a and b; none without a second stage.
+    gains: float32 [n], what each pair of cells adds to the score.
     """
 
     words: Array
@@ -60,10 +61,10 @@ class Explanation:
 
 
 def explain(encoder: Encoder, a: Shown, b: Shown) -> Explanation:
-    """Take the score of two frames apart; for the parts to add up both stages must have been applied to them.
+    """Split the score of two frames into parts; they add up to the score that both stages give.
 
     Args:
-        encoder: that of both descriptors.
+        encoder: of both frames.
     """
     shape = encoder.centers.shape
     products = np.einsum("vk,vk->v", a.descriptor.reshape(shape), b.descriptor.reshape(shape))
@@ -84,11 +85,11 @@ def _cells(encoder: Encoder, a: Cells, b: Cells) -> Correspondences:
     if stage is None or not a.any() or not b.any():
         none = np.empty(0, np.int64)
         return Correspondences(none, none, np.empty(0, np.float32))
-    return correspondences(a, b, encoder.grid[1], stage)
+    return correspondences(a, b, encoder.grid[1], stage.reach)
 
 
 def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
-    """What the score loses without each region of ``frame``; float32 [T]."""
+    """What the score would lose without each region of ``frame``; float32 [T]."""
     if frame.regions is None:
         return None
     features, centers, definition = frame.regions.features, encoder.centers, encoder.definition
@@ -101,10 +102,10 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
     whole = power(sums, definition.gamma)
     products = np.einsum("tk,tk->t", without, against[words])
     if definition.normalization == "intra":
-        reduced = np.einsum("tk,tk->t", normalize(without, "intra"), against[words])
-        parts = np.einsum("vk,vk->v", normalize(whole, "intra"), against)[words]
+        reduced = np.einsum("tk,tk->t", unit_length(without), against[words])
+        parts = np.einsum("vk,vk->v", unit_length(whole), against)[words]
     else:
-        # The other words' parts stay, but the norm of the whole is another.
+        # The parts of the other words stay, but the norm of the whole changes.
         by_word, squares = np.einsum("vk,vk->v", whole, against), np.einsum("vk,vk->v", whole, whole)
         left = by_word.sum() - by_word[words] + products
         norms = np.sqrt(np.maximum(0, squares.sum() - squares[words] + np.einsum("tk,tk->t", without, without)))
@@ -114,10 +115,10 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
 
 
 def _answers(encoder: Encoder, a: Regions | None, b: Regions | None) -> Indices:
-    """Regions of one word that are each other's nearest by cosine, best first; int64 [n, 2]."""
+    """Regions of a and of b of one word that are each other's nearest by cosine, best first; int64 [n, 2]."""
     if a is None or b is None or not len(a) or not len(b):
         return np.empty((0, 2), np.int64)
-    cosines = normalize(a.features, "intra") @ normalize(b.features, "intra").T  # T_a x T_b
+    cosines = unit_length(a.features) @ unit_length(b.features).T  # T_a x T_b
     apart = assign(a.features, encoder.centers)[:, None] != assign(b.features, encoder.centers)[None, :]
     cosines[apart] = -np.inf
     there, back = cosines.argmax(axis=1), cosines.argmax(axis=0)

@@ -15,8 +15,9 @@ from torch import Tensor
 from core.errors import InvalidModel
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels, contrast, prepare
+from core.method.equations import unit_length
 from core.method.projection import Projection
-from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums, unit_length
+from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
 from core.networks.backbone import Backbone
 from core.networks.forward import CudaPass, Device, Precision, fused_pass
 from core.networks.identity import json_digest, tensors_digest
@@ -55,22 +56,23 @@ class FeatureDefinition(BaseModel):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The layers that the backbone must return: first those whose regions are fused."""
+        """The layers that the backbone must return, those whose regions are fused first."""
         return self.layers
 
     def projected(self) -> dict[str, int]:
-        """How many values of each layer's projection are in use."""
+        """How many values of each layer's projection are used."""
         return {} if self.projection is None else dict.fromkeys(self.layers, self.projection)
 
 
 class FeatureExtractor:
-    """Frames to regions of interest with their features, T x K.
+    """Computes the regions of interest of frames and their features, [T, K].
 
     Args:
-        projections: by layer; as many as the definition asks for.
+        projections: by layer, of those layers for which the definition needs one.
 
     Raises:
-        InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or short.
+        InvalidModel: the backbone does not return the layers of the definition, or a projection is missing or has too
+            few values.
     """
 
     def __init__(
@@ -93,17 +95,17 @@ class FeatureExtractor:
         if definition.projected():
             parts["projections"] = tensors_digest(projection_tensors(self.projections))
         self.origin = json_digest(parts)
-        """Identity of the features: what a vocabulary must have been trained on."""
+        """The identity of the features; a vocabulary must have been trained on features of the same identity."""
 
     def compute(self, precision: Precision = "float32", device: Device = "cpu") -> None:
-        """Let forward passes be computed so from now on; a plugged network computes as it does itself.
+        """Choose how forward passes are computed from now on; a plugged network computes in its own way.
 
         Raises:
-            InvalidModel: this machine cannot.
+            InvalidModel: this machine or this network cannot compute so.
         """
         network = self.backbone
         self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
-        """The network as it is computed here: B x 3 x H x W to one B x K x X x Y for each output, float32 all."""
+        """The forward pass in use: float32 [B, 3, H, W] to one float32 [B, K, X, Y] for each output."""
         if isinstance(network, ShallowNetwork):
             made = CudaPass(network) if device == "cuda" else fused_pass(network, precision)
             if made is None and precision != "float32":
@@ -113,7 +115,7 @@ class FeatureExtractor:
             raise InvalidModel("a plugged network runs on the CPU in float32, unless it takes itself elsewhere.")
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
-        """For each frame the rectified maps of each output, float32 [X, Y, K], as :meth:`maps` gives them for all."""
+        """Of each frame the rectified maps of each output, float32 [X, Y, K]; see :meth:`maps`."""
         maps = self.maps(frames, masks)
         return [[layer[index] for layer in maps] for index in range(len(frames))]
 
@@ -121,8 +123,9 @@ class FeatureExtractor:
         """Of each output the rectified maps of all frames, float32 [B, X, Y, K]; zeros for a blank frame.
 
         Args:
-            masks: of each frame what not to see: the network is shown its mean colour there, and cells that
-                are covered by half or more stay zero, so that they bear no region and no local descriptor.
+            frames: uint8 [H, W, 3] each, BGR.
+            masks: of each frame, or None.  The network is shown its mean colour where a mask covers the frame, and
+                cells that are covered by half or more are zero, so that they have no region and no local descriptor.
         """
         hidden = [None] * len(frames) if masks is None else masks
         shown = self.backbone.input
@@ -144,7 +147,7 @@ class FeatureExtractor:
         return maps
 
     def products(self, activations: Sequence[Array]) -> dict[str, Array]:
-        """Of each projected layer what its projection makes of its cells; float32 [..., X, Y, d] by layer.
+        """The products of the cells with the projection's matrix, of each projected layer: float32 [..., X, Y, d].
 
         Args:
             activations: of each output, of one frame or of several, float32 [..., X, Y, K].
@@ -158,10 +161,11 @@ class FeatureExtractor:
         }
 
     def regions(self, activations: Sequence[Array], products: Mapping[str, Array] | None = None) -> Regions:
-        """The regions of all layers of one frame, fused (eqs. 4.4, 4.5).
+        """The regions of all layers of one frame, fused (equations 4.4 and 4.5).
 
         Args:
-            products: as :meth:`products` gives them, if they are known.
+            activations: of each output, float32 [X, Y, K].
+            products: the result of :meth:`products`, if it is known.
         """
         definition = self.definition
         fused = activations[: len(definition.layers)]
@@ -173,7 +177,7 @@ class FeatureExtractor:
         return replace(found, features=unit_length(found.features)) if definition.unit_features else found
 
     def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:
-        """The regional features projected, float32 [T, values]."""
+        """The projected regional features, float32 [T, values]."""
         features = np.empty((len(found), values), np.float32)
         parts = found.parts(len(fused))
         for name, layer, part in zip(self.definition.layers, fused, parts, strict=True):
@@ -184,12 +188,12 @@ class FeatureExtractor:
     def projected_cells(
         self, activations: Sequence[Array], products: Mapping[str, Array], layers: Sequence[str], values: int
     ) -> list[Array]:
-        """The projected local descriptors D^L of some layers of one frame, float32 [C, values] each."""
+        """The projected local descriptors D^L of the given layers of one frame, float32 [C, values] each."""
         maps = dict(zip(self.definition.outputs, activations, strict=True))
         return [self.projections[name].finish(_cells(products[name]), _cells(maps[name]), values) for name in layers]
 
     def layer_grids(self) -> dict[str, tuple[int, int]]:
-        """Cells (rows, columns) of each layer's maps at the network's input size."""
+        """Rows and columns of each layer's maps at the network's input size."""
         shown = self.backbone.input
         blank = np.zeros((shown.height, shown.width, 3), np.uint8)
         maps = self.activations([blank])[0]
@@ -197,17 +201,17 @@ class FeatureExtractor:
 
 
 def _cells(layer: Array) -> Array:
-    """Maps, float32 [..., X, Y, K], as local descriptors, [n, K]."""
+    """The local descriptors of maps: float32 [..., X, Y, K] to [n, K]."""
     return layer.reshape(-1, layer.shape[-1])
 
 
 def content_of(definition: BaseModel, fields: set[str] | None = None) -> dict[str, Any]:
-    """What a definition says; choices that came with later versions are left out where not made."""
+    """A definition as JSON, for identities; fields that are None are left out, so that later versions may add some."""
     return definition.model_dump(mode="json", include=fields, exclude_none=True)
 
 
 def projection_tensors(projections: Mapping[str, Projection]) -> dict[str, torch.Tensor]:
-    """``<layer>.mean`` and ``<layer>.matrix`` of each."""
+    """The tensors of projections by name: ``<layer>.mean`` and ``<layer>.matrix``."""
     tensors: dict[str, torch.Tensor] = {}
     for layer, projection in projections.items():
         tensors[f"{layer}.mean"] = torch.from_numpy(projection.mean)

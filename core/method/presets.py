@@ -1,7 +1,7 @@
-"""The encoders that placerec knows by name, as definitions; their vocabularies are trained on these.
+"""The definitions of the packaged encoders; their vocabularies are trained for these.
 
-The quantisation steps fit the packaged network, whose activations are of the order of one; a
-network with Caffe's scale (tens to hundreds) wants a step of 1.0.
+The quantisation steps fit the packaged network, whose activations are of the order of one.  A network with Caffe's
+scale (tens to hundreds) needs a step of 1.0.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PRESETS: dict[str, EncoderDefinition] = {
             share=0.75,
         ),
     ),
-    # The same as the thesis has it: regional features as they are, and nothing after the VLAD.
+    # The same as in the thesis: regional features as they are, and no second stage.
     "m-region-vlad-thesis": EncoderDefinition(
         layers=("conv3", "conv4"),
         regions=300,
@@ -42,7 +42,7 @@ PRESETS: dict[str, EncoderDefinition] = {
         gamma=0.5,
         normalization="intra",
     ),
-    # Thesis, chapter 3: N = 400 regions of conv3, V = 256; plain VLAD, nothing added.
+    # Thesis, chapter 3: N = 400 regions of conv3, V = 256, without a second stage.
     "region-vlad": EncoderDefinition(
         layers=("conv3",),
         regions=400,

@@ -1,8 +1,8 @@
-"""A linear view of a feature in which the same spot looks alike under any light, and different spots do not.
+"""A linear projection of features under which the same spot looks alike in any light, and different spots do not.
 
-Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
-The differences between a cell's feature and that of the same cell under other conditions span what does not
-matter; features are whitened by their covariance, and of what is then left the directions of most spread are kept.
+This is Fisher's discriminant (Fisher, 1936; as learned whitening of local descriptors: Mikolajczyk and Matas, 2007).
+The differences between a cell's feature and that of the same cell under other conditions show which directions do not
+matter.  Features are whitened by the covariance of these differences, and the directions of largest variance are kept.
 """
 
 from __future__ import annotations
@@ -10,35 +10,48 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from core.kernels.products import ConstantMatrix
+from core.kernels.projections import finish_rows
+from core.method.equations import unit_length
 
 Array = NDArray[np.float32]
 
 SHRINKAGE = 0.5
-"""Share of the mean variance added to every direction's, so that quiet directions are not blown up into noise."""
+"""This share of the mean variance is added to that of every direction, so that whitening does not amplify noise."""
 
 
 @dataclass(frozen=True)
 class Projection:
-    """From a feature of K values to one of fewer.
+    """A projection of features from K values to fewer.
 
-    mean: float32 [K], of unit-length features.
-    matrix: float32 [K, d], columns by falling importance, so that the first ones are a projection too.
+    mean: m, float32 [K], the mean of unit-length features.
+    matrix: W, float32 [K, d], columns by falling importance, so that the first columns are a projection, too.
     """
 
     mean: Array
     matrix: Array
 
     def __call__(self, features: Array, values: int) -> Array:
-        """Unit-length projections of n features, float32 [n, K] to [n, values]; zero stays zero."""
-        return self.finish(self.products(features), features, values)
+        """Project features f to unit-length p ∝ (f/|f| - m) W; a zero row stays zero.
+
+        The encoder computes the same from products that it already has (:meth:`finish`).
+
+        Args:
+            features: float32 [n, K].
+            values: how many columns of W to use.
+
+        Returns:
+            float32 [n, values].
+        """
+        projected = unit_length((unit_length(features) - self.mean) @ self.matrix[:, :values])
+        projected[~features.any(axis=1)] = 0
+        return projected
 
     def products(self, features: Array) -> Array:
-        """f W, float32 [n, K] to [n, d]: linear, so that a sum of features has the sum of their products."""
+        """f W of features f, float32 [n, K] to [n, d]; the product of a sum of features is the sum of products."""
         return self._product(features)
 
     @cached_property
@@ -51,51 +64,23 @@ class Projection:
         return np.asarray(self.mean @ self.matrix, np.float32)
 
     def finish(self, products: Array, features: Array, values: int) -> Array:
-        """Unit-length projections of n features whose products are known; float32 [n, values].
-
-        (f/|f| - m) W = f W / |f| - m W.
+        """Project features whose products are known: (f/|f| - m) W = f W / |f| - m W, then to unit length.
 
         Args:
-            products: float32 [n, d].
-            features: float32 [n, K].
+            products: f W, float32 [n, d].
+            features: f, float32 [n, K].
+            values: how many columns of W to use.
+
+        Returns:
+            float32 [n, values].
         """
         projected = np.empty((len(features), values), np.float32)
-        _finish(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
+        finish_rows(np.ascontiguousarray(products), np.ascontiguousarray(features), self.shift, projected)
         return projected
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def squared_length(feature):  # type: ignore[no-untyped-def]
-    """|f|²; float32 [K]."""
-    square = np.float32(0)
-    for k in range(len(feature)):
-        square += feature[k] * feature[k]
-    return square
-
-
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
-def finish_row(products, square, shift, projected):  # type: ignore[no-untyped-def]
-    """One row of :meth:`Projection.finish`; float32 [d], |f|² and float32 [d] to float32 [values]."""
-    inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
-    square = np.float32(0)
-    for d in range(len(projected)):
-        value = products[d] * inverse - shift[d]
-        projected[d] = value
-        square += value * value
-    again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
-    for d in range(len(projected)):
-        projected[d] *= again
-
-
-@numba.njit(cache=True, nogil=True)
-def _finish(products, features, shift, projected):  # type: ignore[no-untyped-def]
-    """Row by row, as :meth:`Projection.finish`, into ``projected``, float32 [n, values]."""
-    for i in range(len(features)):
-        finish_row(products[i], squared_length(features[i]), shift, projected[i])
-
-
 def fit_projection(clear: Array, changed: Array, values: int) -> Projection:
-    """The projection under which pairs agree best in relation to all features' spread.
+    """Fit the projection under which pairs differ least, relative to the variance of all features.
 
     Args:
         clear, changed: float32 [n, K], unit-length features of the same n cells under two conditions.

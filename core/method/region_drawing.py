@@ -14,35 +14,38 @@ from core.method.encoder import Encoder
 from core.method.regions import Regions
 
 LONGEST_SIDE = 1280
-"""A drawing is not larger than this, in pixels."""
+"""The longest side of a drawing, in pixels."""
 
 COLOURS = ((60, 200, 255), (255, 140, 60), (120, 220, 90), (200, 90, 230))
-"""BGR, one a layer, in turn."""
+"""The colours of the layers, BGR, used in turn."""
 
 
 @lru_cache(maxsize=16)
 def layer_grids(encoder: Encoder) -> dict[str, tuple[int, int]]:
-    """Rows and columns of each layer that regions come from; found by a forward pass, once."""
+    """Rows and columns of each layer that regions come from; one forward pass finds them."""
     grids = encoder.layer_grids()
     return {layer: grids[layer] for layer in encoder.definition.layers}
 
 
 def strongest(regions: Regions, limit: int | None) -> NDArray[np.int64]:
-    """Indices of the ``limit`` regions of highest energy, all if None, in the order that they stand in."""
+    """Indices of the ``limit`` regions of highest energy, ascending; of all regions if ``limit`` is None."""
     if limit is None or limit >= len(regions):
         return np.arange(len(regions))
     return np.sort(np.argsort(-regions.energies, kind="stable")[:limit])
 
 
 def boxes(regions: Regions, grids: list[tuple[int, int]], width: float, height: float) -> NDArray[np.float64]:
-    """left, top, right, bottom of each region in pixels; float64 [T, 4].
+    """The boxes of regions in pixels of the frame.
 
-    The frame was resized whole, so a layer's cells are spread evenly over it; what a cell really
-    sees is wider (its receptive field).
+    The whole frame was resized, so that a layer's cells are spread evenly over it.  The receptive field of a cell is
+    larger than its box.
 
     Args:
         grids: rows and columns of each layer.
         width, height: of the frame, pixels.
+
+    Returns:
+        float64 [T, 4], left, top, right, bottom.
     """
     cells = np.array([grids[layer] for layer in regions.layers], np.float64).reshape(-1, 2)
     scale = np.array([height, width]) / cells  # T x 2, pixels per cell
@@ -51,12 +54,15 @@ def boxes(regions: Regions, grids: list[tuple[int, int]], width: float, height: 
 
 
 def draw(pixels: Pixels, regions: Regions, chosen: NDArray[np.int64], grids: list[tuple[int, int]]) -> bytes:
-    """A PNG of the frame, shrunk if it is large, with a rectangle for each chosen region.
+    """Draw a rectangle for each chosen region on the frame, which is shrunk if it is large.
 
     Args:
-        pixels: H x W x 3 uint8, BGR.
+        pixels: uint8 [H, W, 3], BGR.
         chosen: indices of regions.
         grids: rows and columns of each layer.
+
+    Returns:
+        A PNG file.
     """
     height, width = pixels.shape[:2]
     factor = min(1.0, LONGEST_SIDE / max(height, width))

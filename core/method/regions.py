@@ -1,12 +1,8 @@
-"""Regions of interest: connected cells of like activation, and what lies in their boxes.
+"""Regions of interest and their features (thesis, equations 3.1–3.5 for one layer and 4.1–4.5 for several).
 
-Thesis, equations 3.1–3.4 (one layer) and 4.1–4.5 (several layers).  A region is an 8-connected
-group of cells of one feature map whose activations have the same quantised level
-``floor(activation / step)``; level 0 and below is background.
-
-The pass is pruned without changing its result: division and floor are monotonic, so every cell of
-a higher level exceeds every cell of a lower one, and so do the means of their regions.  Only the
-cells at or above the level where ``count`` regions are complete are ever labelled (``components.py``).
+A region is an 8-connected group of cells of one feature map whose activations have the same quantised level
+``floor(activation / step)``; level 0 and below is background.  ``equations.py`` states this in plain NumPy; here the
+compiled loops of ``core.kernels.components`` and ``core.kernels.boxes`` compute it.
 """
 
 from __future__ import annotations
@@ -25,18 +21,18 @@ from core.kernels.components import DOUBLES, INTEGERS, SINGLES, bits_shape, stro
 Activations = NDArray[np.float32]
 
 SHAPES = 8
-"""Shapes of layers for which a thread keeps room to work in."""
+"""A thread keeps a workspace for layers of at most this many shapes."""
 
 
 @dataclass(frozen=True)
 class Regions:
-    """T regions of one frame: layer by layer, by falling energy within a layer.
+    """T regions of one frame, layer by layer, and within a layer by falling energy.
 
     boxes: int32 [T, 4], top, left, bottom, right in cells of the layer's grid, half-open.
-    energies: float32 [T], mean activation inside the region (eq. 3.2).
+    energies: float32 [T], mean activation inside the region (equation 3.2).
     channels: int32 [T], the feature map of each region.
-    layers: int32 [T], index of the layer among those fused.
-    features: float32 [T, K], regional features (eq. 3.4).
+    layers: int32 [T], the index of its layer among those fused.
+    features: float32 [T, K], regional features (equation 3.4).
     """
 
     boxes: NDArray[np.int32]
@@ -49,14 +45,14 @@ class Regions:
         return len(self.energies)
 
     def parts(self, layers: int) -> list[slice]:
-        """Where the regions of each of so many layers stand."""
+        """The range of each layer's regions, for this many layers."""
         ends = np.searchsorted(self.layers, np.arange(layers + 1)).tolist()
         return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
 @dataclass(frozen=True)
 class _Room:
-    """What a pass over a layer works in; fresh pages would cost as much as the pass itself."""
+    """The arrays that a pass over a layer works in; allocating them anew would cost as much time as the pass itself."""
 
     cells: NDArray[np.int32]
     singles: NDArray[np.float32]
@@ -67,13 +63,13 @@ class _Room:
 
 
 class _Workspace(threading.local):
-    """The rooms of one thread, by the shape of the layer; an encoder has few."""
+    """The working arrays of one thread, by the shape of the layer."""
 
     def __init__(self) -> None:
         self._rooms: dict[tuple[int, ...], _Room] = {}
 
     def room(self, shape: tuple[int, ...]) -> _Room:
-        """The room for activations of this shape."""
+        """The working arrays for activations of this shape."""
         found = self._rooms.get(shape)
         if found is None:
             if len(self._rooms) >= SHAPES:
@@ -96,7 +92,7 @@ _workspace = _Workspace()
 
 
 def find_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
-    """As :func:`extract_regions`, but without the features: float32 [T, 0]."""
+    """Find the regions as :func:`extract_regions` does, but without their features: those are float32 [T, 0]."""
     if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
         raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
     room = count * len(layers)
@@ -123,13 +119,13 @@ def find_regions(layers: Sequence[Activations], steps: Sequence[float], count: i
 
 
 def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
-    """The ``count`` strongest regions of each layer and their features, fused (eqs. 3.1–3.4, 4.1–4.5).
+    """Find the ``count`` strongest regions of each layer and their features, fused (equations 3.1–3.5 and 4.1–4.5).
 
     Args:
-        layers: of one frame, each float32 [X, Y, K], rectified and finite, channels last; K is the
-            same for all, X and Y need not be.
+        layers: of one frame, each float32 [X, Y, K], rectified and finite, channels last; K is the same for all, X and
+            Y need not be.
         steps: quantisation step q > 0 of each layer, in units of its activations.
-        count: N, per layer; fewer are returned where a layer has fewer.
+        count: N, per layer.
 
     Returns:
         At most N regions a layer; none for a blank frame.
@@ -147,10 +143,15 @@ def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count
 
 
 def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | None = None) -> NDArray[np.float32]:
-    """The sum of a layer's local descriptors, float32 [X, Y, K], in each box, int32 [T, 4]; float32 [T, K].
+    """The regional features (equation 3.4): the sum of a layer's local descriptors in each box.
 
     Args:
-        out: where to put them, float32 [T, K]; None: a new array.
+        grid: the layer's activations, float32 [X, Y, K].
+        boxes: int32 [T, 4], top, left, bottom, right, half-open.
+        out: where to put the sums, float32 [T, K]; None: a new array.
+
+    Returns:
+        float32 [T, K].
     """
     if out is None:
         out = np.empty((len(boxes), grid.shape[2]), np.float32)
@@ -161,20 +162,16 @@ def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | Non
 def projected_box_sums(
     layer: Activations, products: Activations, boxes: NDArray[np.int32], shift: NDArray[np.float32], out: Activations
 ) -> None:
-    """Put unit-length projections of the sums of :func:`box_sums` into ``out``, float32 [T, values].
+    """Project the sums of :func:`box_sums` to unit length (``projection.py``), into ``out``.
 
-    A projection of sums is a sum of projections, so that only the length is needed of the sums themselves.
+    The product of a sum is the sum of the cells' products, so that of the sum itself only its length is needed.
 
     Args:
         layer: float32 [X, Y, K].
-        products: of its cells with a projection's matrix, float32 [X, Y, d].
-        shift: of the mean, float32 [d].
+        products: of its cells with the projection's matrix, float32 [X, Y, d].
+        boxes: int32 [T, 4].
+        shift: the projection's mean times its matrix, float32 [d].
+        out: float32 [T, values], values <= d.
     """
     tables = _workspace.room(layer.shape).table, _workspace.room(products.shape).table
     projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, *tables, shift, out)
-
-
-def unit_length(features: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Each row of float32 [T, K] divided by its length; a zero row stays zero."""
-    lengths = np.sqrt(np.einsum("tk,tk->t", features, features))[:, None]
-    return np.divide(features, lengths, out=np.zeros_like(features), where=lengths > 0)

@@ -1,4 +1,4 @@
-"""The visual words against which regional features are described (thesis, sections 3.3 and 4.2)."""
+"""The visual words relative to which regional features are described (thesis, equations 3.6 and 4.6)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,25 @@ from numpy.typing import NDArray
 from core.errors import InvalidModel
 
 ITERATIONS = 30
+"""Iterations of k-means."""
+
 POINTS_PER_WORD = 4096
+"""k-means draws at most this many features for each word."""
+
 FEATURES_PER_FRAME = 150
+"""At most this many features of a frame are pooled."""
 
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """V words and the features they were learned from.
+    """V words, and which features they were learned from.
 
     centers: float32 [V, K].
-    origin: identity of the feature extractor (weights, layers, N, step …); the vocabulary is
-        refused for any other.
+    origin: identity of the feature extractor (weights, layers, N, steps, …); an encoder refuses the vocabulary for any
+        other.
+
+    Raises:
+        InvalidModel: the centers are not a finite matrix.
     """
 
     centers: NDArray[np.float32]
@@ -34,10 +42,12 @@ class Vocabulary:
 
 
 def train_vocabulary(features: NDArray[np.float32], words: int, seed: int, origin: str) -> Vocabulary:
-    """k-means over pooled regional features from k-means++ starts, the same for the same seed.
+    """Cluster pooled regional features with k-means (equations 3.6 and 4.6), starting from k-means++.
+
+    The same seed gives the same words.
 
     Args:
-        features: float32 [T, K] of many frames.
+        features: float32 [T, K], of many frames.
         words: V.
         seed: of the initial centres.
         origin: identity of the extractor that made the features.
@@ -65,12 +75,15 @@ def train_vocabulary(features: NDArray[np.float32], words: int, seed: int, origi
 def pool_features(
     frames: Iterable[NDArray[np.float32]], seed: int, per_frame: int = FEATURES_PER_FRAME
 ) -> NDArray[np.float32]:
-    """A random share of the features of each frame, so that memory stays bounded; float32 [T, K].
+    """Draw some of the features of each frame, so that memory stays bounded.
 
     Args:
         frames: for each frame its regional features, float32 [T_i, K]; T_i may be 0.
-        seed: of the choice.
-        per_frame: features kept of a frame at most.
+        seed: of the draw.
+        per_frame: at most this many features of a frame are kept.
+
+    Returns:
+        float32 [T, K].
 
     Raises:
         InvalidModel: no frame has a feature.

@@ -1,1 +1,1 @@
-"""Networks: definitions, forward passes, identities, and the import of files that others have trained."""
+"""Networks: definitions, forward passes, identities, and the import of networks trained with other software."""

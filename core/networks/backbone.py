@@ -1,4 +1,4 @@
-"""What an encoder asks of a network, and how any torch network is plugged in."""
+"""The interface that an encoder needs of a network, and an adapter for any torch network."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from core.frames.preprocessing import InputDefinition
 
 
 class Backbone(Protocol):
-    """A network whose rectified activations of some layers an encoder reads."""
+    """A network that gives an encoder the rectified activations of some of its layers."""
 
     @property
     def input(self) -> InputDefinition:
-        """What the network wants to see."""
+        """The input that the network expects."""
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The layers that a call returns, in that order."""
+        """The names of the layers whose activations a call returns, in that order."""
 
     def describe(self) -> dict[str, Any]:
-        """Everything besides the weights that can change an activation, as JSON."""
+        """Everything besides the weights that can change an activation, as values for JSON."""
 
     def weights(self) -> Mapping[str, Tensor]:
-        """The tensors in use."""
+        """The tensors in use, by name."""
 
     def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
-        """B x 3 x H x W float32 to one B x K x X x Y tensor for each output."""
+        """Compute the activations: float32 [B, 3, H, W] to one float32 [B, K, X, Y] for each output."""
 
 
 class PluggedNetwork:
-    """Any torch module as a backbone: name its layers, its input and how it is normalised.
+    """Makes any torch module a backbone.
 
     Args:
-        module: put into evaluation mode; it may do more than its outputs need.
-        outputs: names of submodules as in ``module.named_modules()``, each giving B x K x X x Y.
-        shown: input size, mean, scale, channel order.
-        description: what else distinguishes the network (its class, its version): part of the identity.
-        rectify: clip the outputs at zero, for layers that are read before their rectifier.
+        module: is put into evaluation mode; it may compute more than the outputs need.
+        outputs: names of submodules as in ``module.named_modules()``, each with an output [B, K, X, Y].
+        shown: the input that the module expects.
+        description: what else distinguishes the network (its class, its version); part of the identity.
+        rectify: clip the outputs at zero, for layers that come before their rectifier.
 
     Raises:
         InvalidModel: an output is not a submodule.

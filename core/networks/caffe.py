@@ -1,7 +1,7 @@
-"""Networks as Caffe stores them (Jia et al., 2014), turned into ours without changing a weight.
+"""Importing networks from Caffe's files (Jia et al., 2014), without changing a weight.
 
-Of a network its convolutional trunk is taken: from the input through convolutions, rectifiers, pooling and
-local response normalization to the last of them that no inner product comes before.
+Only the convolutional trunk is imported: convolutions, rectifiers, pooling and local response normalization, from the
+input to the first inner product.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _HEADS = {
 
 _LAYER_NAME = re.compile(r"[A-Za-z0-9_/+-]{1,64}")
 MAX_SIDE = 4096
-"""Of an input, a kernel, a stride or a border, in pixels."""
+"""Upper limit of an input, a kernel, a stride or a border, in pixels."""
 
 MAX_CHANNELS = 65_536
 
@@ -42,24 +42,24 @@ def import_caffe(
     name: str | None = None,
     input_size: tuple[int, int] | None = None,
 ) -> tuple[NetworkDefinition, dict[str, Tensor]]:
-    """The convolutional trunk of a Caffe network in our format.
+    """Import the convolutional trunk of a Caffe network.
 
-    Layers, their order and all their parameters are taken from the model's own description, its input
-    size too (``input_param``, ``input_shape``, ``input_dim``, else the crop size of its training data).
+    Layers, their order and all their parameters are taken from the model's own description, as is its input size
+    (``input_param``, ``input_shape``, ``input_dim``, else the crop size of its training data).
 
     Args:
         model: the ``.caffemodel``.
-        mean: its mean file, ``.npy`` or ``.binaryproto``, or the mean of each channel as the network sees them;
-            without one the model must name its mean values.
-        name: of the definition; without one made of the file's name.
-        input_size: height and width in pixels, if the model does not say them or others are wanted.
+        mean: its mean file, ``.npy`` or ``.binaryproto``, or the mean of each channel in the network's order; None if
+            the model has its mean values.
+        name: of the definition; None: the file's name.
+        input_size: height and width in pixels, if the model does not have them or others are wanted.
 
     Returns:
         The definition, and ``<convolution>.weight`` (K x C/groups x h x w) and ``<convolution>.bias`` (K),
         float32, for each of its convolutions.
 
     Raises:
-        InvalidModel: a file cannot be read, or the network has something that our format cannot say exactly.
+        InvalidModel: a file cannot be read, or our format cannot express a part of the network exactly.
     """
     network = read_caffemodel(model)
     trunk = _find_trunk(network)
@@ -84,13 +84,13 @@ def import_caffe(
 
 
 def _is_head(layer: CaffeLayer) -> bool:
-    """Whether what a layer makes is no map of activations any more, or is of use in training only."""
+    """Whether a layer's output is not a map of activations any more, or serves training only."""
     whole_map = layer.type == "Pooling" and layer.part("pooling").integer(12) != 0
     return layer.type in _HEADS or layer.type.endswith("Loss") or whole_map
 
 
 def _find_trunk(network: CaffeNetwork) -> list[CaffeLayer]:
-    """The chain of layers from the input on; what hangs on it behind an inner product or a loss is left out.
+    """The chain of layers from the input on; layers after an inner product or a loss are left out.
 
     Raises:
         InvalidModel: the chain has a layer of a type that our format does not know, or forks and goes on.
@@ -164,7 +164,7 @@ def _named_scale(layers: Sequence[CaffeLayer]) -> float:
 
 
 def _translate(layer: CaffeLayer) -> Layer:
-    """The layer in our words, with Caffe's default for each parameter that it leaves out."""
+    """The layer in our format, with Caffe's defaults for missing parameters."""
     if not _LAYER_NAME.fullmatch(layer.name) or hasattr(nn.ModuleDict(), layer.name):
         raise InvalidModel(f"The network's {layer} has a name that our format cannot bear.")
     match layer.type:

@@ -1,7 +1,7 @@
-"""The files of Caffe (Jia et al., 2014): what a ``.caffemodel`` says of its layers, and arrays of numbers.
+"""Caffe's files (Jia et al., 2014): the description and the weights of layers, and mean images.
 
-A ``.caffemodel`` is a protobuf message that describes each layer beside its weights.  Two generations are
-read: ``layer`` (since 2014, types by name) and ``layers`` (before, types by number).
+A ``.caffemodel`` is a protobuf message with a description of each layer and its weights.  Two generations are read:
+``layer`` (since 2014, types by name) and ``layers`` (before, types by number).
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ _OLD_TYPES = {
 class CaffeLayer:
     """A layer of either generation, as the file describes it.
 
-    ``type`` is its name in the newer generation.  ``bottoms`` and ``tops`` are the blobs that it reads and makes.
+    ``type`` is the type's name in the newer generation.  ``bottoms`` and ``tops`` are the blobs that the layer reads
+    and writes.
     """
 
     name: str
@@ -58,7 +59,7 @@ class CaffeLayer:
         return self.content.message(self.fields[key]) if key in self.fields else Message()
 
     def arrays(self) -> list[NDArray[np.float32]]:
-        """Its weights, read from the disk only now."""
+        """Its weights, which are read from the disk only now."""
         blobs = self.content.messages(self.fields["blobs"])
         return [read_array(blob, f"Array {place} of {self}") for place, blob in enumerate(blobs)]
 
@@ -68,7 +69,7 @@ class CaffeLayer:
 
 @dataclass(frozen=True)
 class CaffeNetwork:
-    """What a ``.caffemodel`` holds: its layers in order, and its input if it is described outside of them."""
+    """The contents of a ``.caffemodel``: its layers in order, and its input if that is described outside of them."""
 
     input: str | None
     input_shape: tuple[int, ...]
@@ -76,7 +77,7 @@ class CaffeNetwork:
 
 
 def read_caffemodel(path: Path) -> CaffeNetwork:
-    """The description of a network; its weights stay on the disk until they are asked for.
+    """Read the description of a network; its weights stay on the disk until they are needed.
 
     Raises:
         InvalidModel: the file cannot be read or is damaged.
@@ -104,7 +105,7 @@ def _read_layer(content: Message, fields: dict[str, int]) -> CaffeLayer:
 
 
 def map_file(path: Path) -> memoryview:
-    """The bytes of a file without reading them yet.
+    """Map a file into memory, without reading it yet.
 
     Raises:
         InvalidModel: there is no such file, or it is empty.
@@ -120,7 +121,7 @@ def read_array(blob: Message, title: str) -> NDArray[np.float32]:
     """The numbers of a BlobProto in its shape, new (``shape``) or old (num, channels, height, width).
 
     Raises:
-        InvalidModel: there are more or fewer numbers than the shape wants, or some are not finite.
+        InvalidModel: the number of values does not fit the shape, or some are not finite.
     """
     if 7 in blob:
         shape = tuple(blob.message(7).integers(1))

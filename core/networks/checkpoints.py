@@ -1,8 +1,8 @@
 """PyTorch checkpoints and safetensors files as plain tensors by name.
 
-Three layouts are read: safetensors; the zip of PyTorch since 1.6 (``data.pkl`` beside one entry for each run
-of numbers); and the older one (pickles, then the runs of numbers in a row), in which many published networks
-still come.  ``core.networks.pickles`` reads what describes them without running it.
+Three layouts are read: safetensors; the zip file of PyTorch since 1.6 (``data.pkl`` and one entry for each storage);
+and the older one (pickles, then the storages one after another), which many published networks still have.
+``core.networks.pickles`` reads the descriptions of tensors without executing them.
 """
 
 from __future__ import annotations
@@ -23,13 +23,15 @@ from core.errors import InvalidModel
 from core.networks.pickles import Description, Storage, TensorView, Value, read_pickle
 
 MAX_DESCRIPTION = 16 * 2**20
-"""Bytes of a pickle that describes tensors; that of a network with a thousand of them has 200 kB."""
+"""Largest pickle that describes tensors, in bytes; that of a network with a thousand tensors has 200 kB."""
 
 MAX_TENSORS = 100_000
+
 MAX_DEPTH = 16
-"""Dictionaries within dictionaries."""
+"""Deepest nesting of dictionaries."""
+
 MAX_NAME = 500
-"""Characters of a joined name."""
+"""Longest joined name, in characters."""
 
 _LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 _LEGACY_VERSION = 1001
@@ -38,9 +40,9 @@ Bytes = Callable[[Storage], memoryview]
 
 
 class Checkpoint(Mapping[str, Tensor]):
-    """Tensors by name, each read when it is asked for.
+    """Tensors by name, each read when it is looked up.
 
-    Dictionaries within dictionaries are joined by dots: ``state_dict.encoder.0.weight``.
+    The keys of nested dictionaries are joined by dots: ``state_dict.encoder.0.weight``.
     """
 
     def __init__(self, views: Mapping[str, TensorView], numbers: Bytes) -> None:
@@ -84,10 +86,10 @@ class _Safetensors(Mapping[str, Tensor]):
 
 
 def read_checkpoint(path: Path) -> Mapping[str, Tensor]:
-    """The tensors of a file of one of the three layouts, told apart by its first bytes.
+    """Open a file of one of the three layouts, which differ in their first bytes.
 
     Raises:
-        InvalidModel: it cannot be read, is of another layout, is damaged, or holds more than plain tensors.
+        InvalidModel: the file cannot be read, has another layout, is damaged, or holds more than plain tensors.
     """
     try:
         with path.open("rb") as file:
@@ -109,15 +111,15 @@ def read_checkpoint(path: Path) -> Mapping[str, Tensor]:
 
 
 def under(checkpoint: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """The tensors whose name starts with ``prefix``, by the rest of their name; read now."""
+    """Read the tensors whose name starts with ``prefix``, by the rest of their name."""
     return {name.removeprefix(prefix): checkpoint[name] for name in checkpoint if name.startswith(prefix)}
 
 
 def as_float(tensor: Tensor, what: str, *shape: int | None) -> Tensor:
-    """A tensor of a file as float32 of a shape, None for any side.
+    """Convert a tensor to float32 and check its shape; None stands for a side of any length.
 
     Raises:
-        InvalidModel: it has another shape, or values that are not finite.
+        InvalidModel: the tensor has another shape, or values that are not finite.
     """
     if tensor.ndim != len(shape) or any(s not in (None, have) for s, have in zip(shape, tensor.shape, strict=True)):
         wanted = " x ".join("any" if side is None else str(side) for side in shape)

@@ -1,9 +1,9 @@
-"""The forward pass of a shallow network at the processor's best: each convolution and its rectifier in one step.
+"""A faster forward pass of a shallow network: each convolution and its rectifier are one step.
 
-torch's own pass puts the weights into the order that the processor's kernel wants at every call, and walks over
-each map once more to rectify it.  Here both are done once and for all, or within the convolution (oneDNN), and a
-max-pooling walks over channels-last maps without keeping where each maximum came from.  Kernels of 3 x 3 and 5 x 5
-are done with half the multiplications (``winograd.py``), which rounds otherwise than torch's own sums.
+torch's own pass brings the weights into the processor's layout at every call, and reads each map once more to rectify
+it.  Here the weights are brought into that layout once, oneDNN rectifies within the convolution, and max-pooling reads
+channels-last maps without recording where each maximum came from.  Kernels of 3 x 3 and 5 x 5 take half the
+multiplications (``winograd.py``), which round differently from torch's own sums.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import copy
 from collections.abc import Callable
 from typing import Literal
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
 
 from core.errors import InvalidModel
+from core.kernels.pooling import max_pool
 from core.networks.convolution import LAST, FusedConvolution
 from core.networks.network import Convolution, Pooling, Relu, ShallowNetwork
 from core.networks.winograd import fast_convolution
@@ -27,15 +27,15 @@ Device = Literal["cpu", "cuda"]
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 AGREEMENT = 1e-4
-"""How far a fused float32 pass may be from torch's own, as a share of the largest activation."""
+"""Largest difference of a fused float32 pass from torch's own, as a share of the largest activation."""
 
 
 class FusedPass:
-    """A :class:`ShallowNetwork` as one chain of fused steps; called as the network is.
+    """A :class:`ShallowNetwork` as a chain of fused steps; it is called like the network.
 
     Args:
-        network: whose weights are copied; what becomes of it later does not matter.
-        precision: of weights and activations; the outputs are float32 in any.
+        network: its weights are copied, so that later changes to it have no effect.
+        precision: of weights and activations; the outputs are always float32.
 
     Raises:
         RuntimeError: this build of torch or this processor lacks the fused convolution.
@@ -78,7 +78,7 @@ class MaxPooling:
         self._kernel, self._stride, self._ceil = layer.kernel, layer.stride, layer.ceil
 
     def _size(self, cells: int) -> int:
-        """Rows or columns of the output; every window starts within the map."""
+        """The rows or columns of the output; every window starts within the map."""
         over = cells - self._kernel
         size = 1 + (-(-over // self._stride) if self._ceil else over // self._stride)
         return size - 1 if (size - 1) * self._stride >= cells else size
@@ -87,41 +87,15 @@ class MaxPooling:
         maps = x.permute(0, 2, 3, 1).contiguous().numpy()
         count, height, width, channels = maps.shape
         pooled = np.empty((count, self._size(height), self._size(width), channels), np.float32)
-        _max_pooled(maps, self._kernel, self._stride, pooled)
+        max_pool(maps, self._kernel, self._stride, pooled)
         return torch.from_numpy(pooled).permute(0, 3, 1, 2)
 
 
-@numba.njit(cache=True, nogil=True)
-def _max_pooled(maps, kernel, stride, pooled):  # type: ignore[no-untyped-def]
-    """Maxima over windows that are cut off at the lower and right edge; float32 [B, X, Y, K] both."""
-    count, height, width, channels = maps.shape
-    for b in range(count):
-        for y in range(pooled.shape[1]):
-            top, bottom = y * stride, min(height, y * stride + kernel)
-            for x in range(pooled.shape[2]):
-                left, right = x * stride, min(width, x * stride + kernel)
-                row = pooled[b, y, x]
-                if bottom - top == 3 and right - left == 3:  # CaffeNet's windows, all at once
-                    for k in range(channels):
-                        upper = max(max(maps[b, top, left, k], maps[b, top, left + 1, k]), maps[b, top, left + 2, k])
-                        v = top + 1
-                        middle = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
-                        v = top + 2
-                        lower = max(max(maps[b, v, left, k], maps[b, v, left + 1, k]), maps[b, v, left + 2, k])
-                        row[k] = max(max(upper, middle), lower)
-                else:
-                    row[:] = maps[b, top, left]
-                    for v in range(top, bottom):
-                        for u in range(left, right):
-                            for k in range(channels):
-                                row[k] = max(row[k], maps[b, v, u, k])
-
-
 def fused_pass(network: ShallowNetwork, precision: Precision = "float32") -> FusedPass | None:
-    """The fused pass of a network, tried once; None where this machine lacks it or it comes to other values.
+    """Make the fused pass of a network and try it once; None if this machine lacks it, or if it gives other values.
 
     Args:
-        precision: of bfloat16 nothing is checked but that it runs: its user holds the descriptors against float32's.
+        precision: bfloat16 is only checked to run; its user must compare the descriptors with those of float32.
     """
     shown = network.input
     image = torch.rand(1, 3, shown.height, shown.width, generator=torch.Generator().manual_seed(0)) - 0.5
@@ -137,13 +111,13 @@ def fused_pass(network: ShallowNetwork, precision: Precision = "float32") -> Fus
 
 
 def has_bfloat16() -> bool:
-    """Whether the processor multiplies bfloat16, twice as fast as float32; elsewhere it would only be imitated."""
+    """Whether the processor multiplies bfloat16, twice as fast as float32; on others it is emulated."""
     supported = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
     return supported is not None and bool(supported())
 
 
 class CudaPass:
-    """A network on the first CUDA device, in float32 proper; called as the network is, with the outputs on the CPU.
+    """A network on the first CUDA device, in full float32; it is called like the network, with outputs on the CPU.
 
     Raises:
         InvalidModel: torch finds no CUDA device.
@@ -152,7 +126,7 @@ class CudaPass:
     def __init__(self, network: ShallowNetwork) -> None:
         if not torch.cuda.is_available():
             raise InvalidModel("torch finds no CUDA device on this machine; use the device cpu.")
-        # torch allows cuDNN a mantissa of ten bits, under which regions change.
+        # By default torch allows cuDNN a mantissa of ten bits, which changes regions.
         torch.backends.cudnn.allow_tf32 = False
         copied = copy.deepcopy(network)
         self._network = copied.to("cuda", memory_format=LAST)  # type: ignore[call-overload]

@@ -12,17 +12,17 @@ from torch import Tensor
 
 
 def canonical_json(value: Any) -> str:
-    """JSON with sorted keys, no white space and no NaN: the same text for the same value."""
+    """JSON with sorted keys, without white space and NaN: the same text for the same value."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
 
 
 def json_digest(value: Any) -> str:
-    """SHA-256 of the canonical JSON of ``value``, in hexadecimal."""
+    """The SHA-256 of the canonical JSON of ``value``, hexadecimal."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
 def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 over names, dtypes, shapes and values, in the order of names; hexadecimal."""
+    """The SHA-256 over names, dtypes, shapes and values, in the order of names; hexadecimal."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()

@@ -1,8 +1,8 @@
 """The shallow CaffeNet-family backbone: its definition, its layers, its forward pass.
 
-A network is described by data (:class:`NetworkDefinition`), so that HybridNet, AMOSNet, CaffeNet,
-AlexNet365 and our own distilled network are five descriptions of one module.  Only the layers up
-to the deepest one in use are built, and only their weights are loaded (thesis, section 4.3).
+A network is described by data (:class:`NetworkDefinition`), so that HybridNet, AMOSNet, CaffeNet, AlexNet365 and the
+packaged distilled network are five descriptions of one module.  Only the layers up to the deepest one in use are built,
+and only their weights are loaded (thesis, section 4.3).
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class NetworkDefinition(BaseModel):
         return tuple(layer for layer in self.layers if isinstance(layer, Convolution))
 
     def truncated(self, names: Iterable[str]) -> NetworkDefinition:
-        """This network cut after the deepest of the convolutions (and its rectifier) or poolings ``names``.
+        """This network, cut off after the deepest of the convolutions (and its rectifier) or poolings ``names``.
 
         Raises:
             InvalidModel: a name is not that of a convolution or pooling of this network.
@@ -125,7 +125,7 @@ def caffenet_definition(
     """The CaffeNet layout (Jia et al., 2014): conv1 96 · conv2 256 · conv3 384 · conv4 384 · conv5 256.
 
     Args:
-        normalize: with the two local response normalizations (our distilled network has none).
+        normalize: with the two local response normalizations (the packaged network has none).
         norm_before_pool: AlexNet's order instead of CaffeNet's.
         depth: how many of the five convolutions to keep.
         scale: factor on the mean-subtracted 0–255 pixels.
@@ -150,10 +150,7 @@ def caffenet_definition(
 
 
 class LocalResponseNormalization(nn.Module):
-    """x / (k + α/n · Σ x²)^β over n neighbouring channels, as Caffe computes it.
-
-    torch's own layer divides α by n just so, so this only fixes the parameter names.
-    """
+    """x / (k + α/n · Σ x²)^β over n neighbouring channels, as both Caffe and torch compute it."""
 
     def __init__(self, layer: Normalization) -> None:
         super().__init__()
@@ -185,8 +182,8 @@ class ShallowNetwork(nn.Module):
     """A sequential network whose rectified convolutions and poolings can be read by name.
 
     Args:
-        definition: the layers; cut it with :meth:`NetworkDefinition.truncated` first.
-        outputs: the convolutions and poolings to return, in the order wanted.
+        definition: the layers; those after the deepest output are left out.
+        outputs: the convolutions and poolings to return, in this order.
 
     Raises:
         InvalidModel: an output is not a convolution or pooling of the definition.
@@ -206,7 +203,7 @@ class ShallowNetwork(nn.Module):
             raise InvalidModel(f"layer {layer.name} of {self.definition.name!r} cannot be built: {error}") from error
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:  # B x 3 x H x W
-        """Activations of the named convolutions after their rectifier, and of the poolings, each B x K x X x Y."""
+        """The activations of the outputs (convolutions after their rectifier, and poolings), each [B, K, X, Y]."""
         found: dict[str, Tensor] = {}
         x, open_name = images, ""
         for layer in self.definition.layers:
@@ -223,19 +220,19 @@ class ShallowNetwork(nn.Module):
 
     @property
     def input(self) -> InputDefinition:
-        """What the network wants to see."""
+        """The input that the network expects."""
         return self.definition.input
 
     def describe(self) -> dict[str, Any]:
-        """Everything besides the weights that can change an activation; the name cannot."""
+        """Everything besides the weights that can change an activation, as values for JSON; not the name."""
         return self.definition.model_dump(mode="json", exclude={"name"}) | {"outputs": list(self.outputs)}
 
     def weights(self) -> dict[str, Tensor]:
-        """``<layer>.weight`` and ``<layer>.bias`` of each convolution in use."""
+        """The tensors ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use."""
         return {key.removeprefix("stages."): tensor for key, tensor in self.state_dict().items()}
 
     def load_weights(self, weights: Mapping[str, Tensor]) -> None:
-        """Take ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use; ignore deeper ones.
+        """Load ``<layer>.weight`` and ``<layer>.bias`` of each convolution in use; deeper ones are ignored.
 
         Raises:
             InvalidModel: a tensor is missing, has another shape, or is not finite.
@@ -266,7 +263,7 @@ def save_network(path: Path, definition: NetworkDefinition, weights: Mapping[str
 
 
 def read_definition(path: Path) -> NetworkDefinition:
-    """The definition in a network file; no weights are read.
+    """Read the definition in a network file, without the weights.
 
     Raises:
         InvalidModel: the file is missing, damaged or of another format.
@@ -282,10 +279,10 @@ def read_definition(path: Path) -> NetworkDefinition:
 
 
 def load_network(path: Path, outputs: Iterable[str]) -> ShallowNetwork:
-    """Build the network of a file as deep as ``outputs`` needs, with just those weights read.
+    """Load a network from its file, only as deep as the outputs need.
 
     Raises:
-        InvalidModel: the file or an output name is not usable.
+        InvalidModel: the file or an output name cannot be used.
     """
     network = ShallowNetwork(read_definition(path), outputs)
     try:
@@ -295,5 +292,5 @@ def load_network(path: Path, outputs: Iterable[str]) -> ShallowNetwork:
     except (OSError, SafetensorError) as error:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
     network.load_weights(weights)
-    # Frames arrive channels last, and the region pass reads the maps that way.
+    # The input is channels last in memory, and the region pass reads the maps in that layout.
     return network.eval().requires_grad_(False).to(memory_format=torch.channels_last)  # type: ignore[call-overload]

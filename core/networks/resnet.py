@@ -1,7 +1,7 @@
-"""ResNet-50 up to its third group of blocks, conv4_x (He, Zhang, Ren, Sun: CVPR 2016), on which DELF stands.
+"""ResNet-50 up to its third group of blocks, conv4_x (He, Zhang, Ren, Sun: CVPR 2016), the backbone of DELF.
 
-The layout is that of torchvision's network as a ``Sequential``: 0 the first convolution, 1 its normalization,
-4, 5 and 6 the groups.  Channel counts are those of the weights.
+The layout is that of torchvision's network as a ``Sequential``: 0 is the first convolution, 1 its normalization, and
+4, 5 and 6 are the groups.  The weights determine the numbers of channels.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from core.errors import InvalidModel
 from core.networks.checkpoints import as_float
 
 GROUPS = ((4, 3, 1), (5, 4, 2), (6, 6, 2))
-"""Place in the file, blocks and stride of each group."""
+"""The number in the file, the count of blocks and the stride of each group."""
 
 EPSILON = 1e-5
 
 
 @dataclass(frozen=True)
 class Convolution:
-    """A convolution with the normalization behind it multiplied in: K x C x k x k and K."""
+    """A convolution that includes the normalization after it: weight [K, C, k, k] and bias [K]."""
 
     weight: Tensor
     bias: Tensor
@@ -35,7 +35,7 @@ class Convolution:
 
 @dataclass(frozen=True)
 class Block:
-    """A bottleneck: 1 x 1, 3 x 3, 1 x 1, and what came in is added, through ``shortcut`` if its shape changes."""
+    """A bottleneck: convolutions of 1 x 1, 3 x 3 and 1 x 1; the input is added, through ``shortcut`` if needed."""
 
     narrow: Convolution
     see: Convolution
@@ -49,7 +49,7 @@ class Block:
 
 
 class ResNet50:
-    """B x 3 x H x W to the rectified maps of conv4_x, B x K x H/16 x W/16.
+    """Computes the rectified maps of conv4_x: float32 [B, 3, H, W] to [B, K, H/16, W/16].
 
     Args:
         weights: by the names of the layout, ``0.weight``, ``1.running_mean``, ``4.0.conv1.weight`` and so on.

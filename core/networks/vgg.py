@@ -1,7 +1,7 @@
-"""VGG-16 up to conv5_3 (Simonyan and Zisserman, 2015), on which several of the compared systems stand.
+"""VGG-16 up to conv5_3 (Simonyan and Zisserman, 2015), the backbone of several of the compared systems.
 
-Thirteen 3 x 3 convolutions in five blocks, a 2 x 2 pooling between blocks.  Channel counts are those of the
-weights, 64 · 128 · 256 · 512 · 512 in the published networks.
+It has thirteen 3 x 3 convolutions in five blocks, with a 2 x 2 pooling between blocks.  The weights determine the
+numbers of channels, 64 · 128 · 256 · 512 · 512 in the published networks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ IMAGENET_BGR = (103.939, 116.779, 123.68)
 
 
 def torchvision_indices() -> dict[str, int]:
-    """Where torchvision's ``vgg16().features`` has each convolution: rectifiers and poolings count too."""
+    """The index of each convolution in torchvision's ``vgg16().features``, which counts rectifiers and poolings."""
     indices: dict[str, int] = {}
     place = 0
     for block, count in enumerate(BLOCKS, 1):
@@ -44,13 +44,13 @@ def load_vgg16(
     rectified: bool,
     ceil: bool = False,
 ) -> ShallowNetwork:
-    """The network as deep as conv5_3.
+    """Build the network up to conv5_3.
 
     Args:
-        weights: ``conv1_1.weight`` (K x C x 3 x 3), ``conv1_1.bias`` (K) and so on.
-        outputs: convolutions to return, rectified all but perhaps the last.
-        rectified: whether conv5_3 is rectified; NetVLAD reads it before.
-        ceil: Caffe's rounding of pooled sizes; of sizes that are multiples of 16 it changes nothing.
+        weights: ``conv1_1.weight`` [K, C, 3, 3], ``conv1_1.bias`` [K] and so on.
+        outputs: the convolutions to return; all but conv5_3 are always rectified.
+        rectified: whether conv5_3 is rectified; NetVLAD reads it before its rectifier.
+        ceil: Caffe's rounding of pooled sizes, which makes no difference for sizes that are multiples of 16.
 
     Raises:
         InvalidModel: a tensor is missing, of another shape, or not finite.
@@ -71,6 +71,6 @@ def load_vgg16(
 
 
 def forward(network: ShallowNetwork, pixels: Pixels) -> tuple[Tensor, ...]:
-    """The maps of the network's outputs of one frame, each float32 [K, X, Y]."""
+    """The maps of the network's outputs for one frame, float32 [K, X, Y] each."""
     image = torch.from_numpy(np.ascontiguousarray(prepare(pixels, network.input))).permute(2, 0, 1)[None]
     return tuple(maps[0] for maps in network(image))

@@ -1,8 +1,8 @@
-"""A map asked what it would answer to frames whose place is known, and calibrated by what it answers; no HTTP.
+"""Calibration of a map: queries whose place is known are searched for, and the answers tell when to believe one.
 
-Every frame is asked twice: of the map as it is, and of the map as it would be without that place, so that there are
-as many unknown places as known ones.  Without it means without all that is near it, three times as far as counts as
-the same place: the next frames of a walk show the same corner still.
+Every query is searched for twice: in the map as it is, and in the map without the query's place, so that there are as
+many unknown places as known ones.  With the place everything is left out that lies within three times the distance that
+counts as the same place, for the next frames of a traverse still show the same corner.
 """
 
 from __future__ import annotations
@@ -16,40 +16,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
-from core.judgement.map_calibration import Recalibration, Target, recalibrate
+from core.judgement.calibration import FittedCalibration, Target, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered
-from core.judgement.verdict import NO_POSE, Calibration, Neighborhood, judge
+from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import neighborhood_of, second_stage
+from core.places import NO_POSE, Neighborhood
+from core.recognition.stages import agree, neighborhood_of
 from core.storage import Map, Ranking, Snapshot
 
 Item = TypeVar("Item")
 Flags = NDArray[np.bool_]
-Advance = Callable[[int, int], None]
-"""Called with the frames asked so far, and with all of them."""
+ProgressCallback = Callable[[int, int], None]
+"""Called with the number of queries done, and the number of all queries."""
 
-GUARD = 3
-"""How many times as far as the same place reaches are left out with it."""
+GUARD_FACTOR = 3
+"""Without a place all places within so many times the same-place distance are left out."""
 
 TOGETHER = 16
-"""Queries searched for at a time."""
+"""The number of queries that are searched for at a time."""
 
 FEW_FRAMES = 50
+"""A calibration from fewer frames comes with a warning."""
 
 FROM_ITSELF = (
     "The frames are the map's own: one walk in one light. A second visit differs more, so the probabilities are too "
     "high; calibrate from a second traverse or from labelled frames as soon as there are any."
 )
+"""The warning of a calibration from the map's own frames."""
 
 
 @dataclass(frozen=True)
-class Question:
-    """One frame whose place is known; masks are bool [rows] of the snapshot.
+class LabelledQuery:
+    """One query whose place is known.
 
-    true: what shows its place; none of it: the map lacks the place.
-    absent: what is not in the map when it is asked, as the frame itself.
-    around: what is left out besides, to make its place unknown.
+    descriptor: float32 [D].
+    local: the local descriptors, int8 [C, L].
+    true: bool [rows], the rows of the snapshot that show the query's place; none, if the map lacks it.
+    absent: bool [rows], rows that are always left out, such as the query's own.
+    around: bool [rows], rows that are left out as well to make the place unknown.
     """
 
     descriptor: NDArray[np.float32]
@@ -60,48 +65,59 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Questions:
-    """What a map is asked: ``count`` questions, made one by one; ``allowed``, bool [rows], bounds the search."""
+class LabelledQueries:
+    """The queries of a calibration.
+
+    count: how many there are.
+    made: the queries; each is read when it is needed.
+    allowed: bool [rows], the rows that are searched; None: all.
+    """
 
     count: int
-    made: Iterator[Question]
+    made: Iterator[LabelledQuery]
     allowed: Flags | None = None
 
 
-def labelled(map_: Map, snapshot: Snapshot, encodings: Sequence[Encoding], places: Sequence[str | None]) -> Questions:
-    """Frames that somebody has labelled, each with the id of the place that it shows, None for one the map lacks.
-
-    Raises:
-        UnknownPlace: the map has no place of an id.
-    """
-    rows = _rows_of(map_, snapshot, [place for place in places if place is not None])
-    near = _Nearness(snapshot, neighborhood_of(map_))
-    nothing = np.zeros(snapshot.rows, np.bool_)
-
-    def made() -> Iterator[Question]:
-        for encoding, place in zip(encodings, places, strict=True):
-            if place is None:
-                yield Question(encoding.descriptor, encoding.local, nothing, nothing, nothing)
-            else:
-                row = rows[place]
-                yield Question(encoding.descriptor, encoding.local, near(row), nothing, near(row, GUARD))
-
-    return Questions(len(encodings), made())
-
-
-def second_traverse(
-    map_: Map, snapshot: Snapshot, sequence: str, pairs: Mapping[str, str | None] | None, most: int
-) -> Questions:
-    """The frames of one sequence of a map, asked of all the others; truth by pose, or as stated.
+def queries_from_labels(
+    map_: Map, snapshot: Snapshot, encodings: Sequence[Encoding], places: Sequence[str | None]
+) -> LabelledQueries:
+    """The queries of a calibration from labelled frames.
 
     Args:
-        pairs: of places of the sequence to those that show the same among the others, None for one that they lack;
-            without it the poses tell.
-        most: frames to ask, spread evenly.
+        encodings: the frames, encoded by the map's encoder.
+        places: for each frame the id of the place that it shows; None if the map lacks the place.
 
     Raises:
-        UnknownSequence, UnknownPlace: the map has none of this name, or id.
-        CalibrationImpossible: the frames have no poses, and no pairs are stated.
+        UnknownPlace: the map has no place of one of the ids.
+    """
+    rows = _rows_of(map_, snapshot, [place for place in places if place is not None])
+    near = _SamePlace(snapshot, neighborhood_of(map_))
+    nothing = np.zeros(snapshot.rows, np.bool_)
+
+    def made() -> Iterator[LabelledQuery]:
+        for encoding, place in zip(encodings, places, strict=True):
+            if place is None:
+                yield LabelledQuery(encoding.descriptor, encoding.local, nothing, nothing, nothing)
+            else:
+                row = rows[place]
+                yield LabelledQuery(encoding.descriptor, encoding.local, near(row), nothing, near(row, GUARD_FACTOR))
+
+    return LabelledQueries(len(encodings), made())
+
+
+def queries_from_traverse(
+    map_: Map, snapshot: Snapshot, sequence: str, pairs: Mapping[str, str | None] | None, most: int
+) -> LabelledQueries:
+    """The queries of a calibration from a second traverse: the frames of one sequence, searched for in all others.
+
+    Args:
+        pairs: for places of the sequence the id of a place of another sequence that shows the same, or None if there
+            is none; without ``pairs`` the poses tell which places are the same.
+        most: the largest number of queries; they are spread evenly over the sequence.
+
+    Raises:
+        UnknownSequence, UnknownPlace: the map has no sequence of this name, or no place of one of the ids.
+        CalibrationImpossible: the frames have no poses, and ``pairs`` is None.
     """
     members = _members(map_, sequence)
     asked = members if pairs is None else list(pairs)
@@ -110,7 +126,7 @@ def second_traverse(
     rows = _rows_of(map_, snapshot, members + [place for place in (pairs or {}).values() if place is not None])
     own = np.zeros(snapshot.rows, np.bool_)
     own[[rows[place] for place in members]] = True
-    near = _Nearness(snapshot, neighborhood_of(map_))
+    near = _SamePlace(snapshot, neighborhood_of(map_))
     if pairs is None:
         asked = [place for place in asked if snapshot.whereabouts.kind[rows[place]] != NO_POSE]
         if not asked:
@@ -120,94 +136,115 @@ def second_traverse(
     asked = _spread(asked, most)
     nothing = np.zeros(snapshot.rows, np.bool_)
 
-    def made() -> Iterator[Question]:
+    def made() -> Iterator[LabelledQuery]:
         for place in asked:
             row = rows[place]
             partner = row if pairs is None else (None if (shown := pairs[place]) is None else rows[shown])
             true = nothing if partner is None else near(partner) & ~own
-            around = nothing if partner is None else near(partner, GUARD)
-            yield Question(*_stored(snapshot, row), true, own, around)
+            around = nothing if partner is None else near(partner, GUARD_FACTOR)
+            yield LabelledQuery(*_stored(snapshot, row), true, own, around)
 
-    return Questions(len(asked), made(), snapshot.alive & ~own)
+    return LabelledQueries(len(asked), made(), snapshot.alive & ~own)
 
 
-def map_itself(map_: Map, snapshot: Snapshot, most: int) -> Questions:
-    """The map's own frames, each asked of the others.
+def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQueries:
+    """The queries of a calibration from the map itself: its own frames, each searched for among the others.
 
-    A frame's place counts as known by its farther neighbours only, those in the outer half of what is the same place,
-    where there are any: the very next frame is too easy.
+    The neighbours in the inner half of the same-place distance are left out, if there are farther ones: the very next
+    frame would be too easy to recognize.
+
+    Args:
+        most: the largest number of queries; they are spread evenly over the map.
     """
-    near = _Nearness(snapshot, neighborhood_of(map_))
+    near = _SamePlace(snapshot, neighborhood_of(map_))
     asked = _spread(np.flatnonzero(snapshot.alive).tolist(), most)
 
-    def made() -> Iterator[Question]:
+    def made() -> Iterator[LabelledQuery]:
         for row in asked:
             same, itself = near(row), np.zeros(snapshot.rows, np.bool_)
             itself[row] = True
             inner = near(row, 0.5)
             absent = inner if (same & ~inner).any() else itself
-            yield Question(*_stored(snapshot, row), same & ~absent, absent, near(row, GUARD))
+            yield LabelledQuery(*_stored(snapshot, row), same & ~absent, absent, near(row, GUARD_FACTOR))
 
-    return Questions(len(asked), made())
-
-
-def ask(
-    map_: Map, encoder: Encoder, snapshot: Snapshot, questions: Questions, base: Calibration, advance: Advance
-) -> Trials:
-    """The answers to all questions, with each place in the map and without it.
-
-    Raises:
-        StorageFailure: the map's files cannot be read.
-    """
-    found: list[Trial] = []
-    number = 0
-    while several := list(islice(questions.made, TOGETHER)):
-        descriptors = np.stack([question.descriptor for question in several])
-        for question, ranking in zip(several, snapshot.search_batch(descriptors, questions.allowed), strict=True):
-            there = question.true & snapshot.alive & ~question.absent
-            cases = [question.absent] if not there.any() else [question.absent, question.absent | question.around]
-            for left_out in cases:
-                known = bool((there & ~left_out).any())
-                found += _trial(map_, encoder, snapshot, question, ranking, left_out, base, known, number)
-            number += 1
-            advance(number, questions.count)
-    return gathered(found)
+    return LabelledQueries(len(asked), made())
 
 
-def calibrated(
+def run_trials(
     map_: Map,
     encoder: Encoder,
     snapshot: Snapshot,
-    questions: Questions,
-    target: Target,
-    source: str,
-    advance: Advance = lambda _done, _total: None,
-) -> Recalibration:
-    """A calibration of a map by what it answers to questions; nothing is stored.
+    queries: LabelledQueries,
+    base: Calibration,
+    advance: ProgressCallback,
+) -> Trials:
+    """The answers to all queries, each with its place in the map and without it.
+
+    Args:
+        base: the calibration by which the answers are judged.
 
     Raises:
-        CalibrationImpossible: the answers do not tell when to believe them.
         StorageFailure: the map's files cannot be read.
+        Others: what ``advance`` raises.
+    """
+    found: list[Trial] = []
+    number = 0
+    while batch := list(islice(queries.made, TOGETHER)):
+        descriptors = np.stack([query.descriptor for query in batch])
+        for query, ranking in zip(batch, snapshot.search_batch(descriptors, queries.allowed), strict=True):
+            there = query.true & snapshot.alive & ~query.absent
+            cases = [query.absent] if not there.any() else [query.absent, query.absent | query.around]
+            for left_out in cases:
+                known = bool((there & ~left_out).any())
+                found += _trial(map_, encoder, snapshot, query, ranking, left_out, base, known, number)
+            number += 1
+            advance(number, queries.count)
+    return gathered(found)
+
+
+def calibrate_map(
+    map_: Map,
+    encoder: Encoder,
+    snapshot: Snapshot,
+    queries: LabelledQueries,
+    target: Target,
+    source: str,
+    advance: ProgressCallback = lambda _done, _total: None,
+) -> FittedCalibration:
+    """A calibration of a map from its answers to queries; nothing is stored.
+
+    Args:
+        target: what the calibration has to reach, such as a precision.
+        source: is noted in the calibration.
+
+    Raises:
+        CalibrationImpossible: the answers do not allow one.
+        StorageFailure: the map's files cannot be read.
+        Others: what ``advance`` raises.
     """
     base = encoder.calibration.model_copy(update={"decision": "leading"})
-    return recalibrate(ask(map_, encoder, snapshot, questions, base, advance), base, target, source)
+    return fit_map_calibration(run_trials(map_, encoder, snapshot, queries, base, advance), base, target, source)
 
 
-def warnings_on(found: Recalibration, method: str) -> list[str]:
-    """What the owner of a map should know of its calibration."""
-    told = [FROM_ITSELF] if method == "map" else []
+def calibration_warnings(found: FittedCalibration, method: str) -> list[str]:
+    """Sentences that the owner of a map should read about its calibration."""
+    warnings = [FROM_ITSELF] if method == "map" else []
     if found.measurement.frames < FEW_FRAMES:
-        told.append(f"It rests on {found.measurement.frames} frames; {FEW_FRAMES} or more make it steadier.")
+        warnings.append(f"It rests on {found.measurement.frames} frames; {FEW_FRAMES} or more make it steadier.")
     held = found.measurement.cross_validated
     if not held.precision.of:
-        told.append("No answer of the cross-validation was recognized: the threshold is out of reach for most frames.")
+        warnings.append(
+            "No answer of the cross-validation was recognized: the threshold is out of reach for most frames."
+        )
     elif held.recall.value is not None and held.recall.value < 0.25:
-        told.append(f"Only {held.recall.value:.0%} of the frames whose place is known are recognized at this target.")
-    return told
+        warnings.append(
+            f"Only {held.recall.value:.0%} of the frames whose place is known are recognized at this target."
+        )
+    return warnings
 
 
-class _Nearness:
-    """What is the same place as a row, farther or nearer than the map says; bool [rows]."""
+class _SamePlace:
+    """The rows that are the same place as a row, within a multiple of the map's same-place distance; bool [rows]."""
 
     def __init__(self, snapshot: Snapshot, neighborhood: Neighborhood) -> None:
         self._whereabouts, self._neighborhood = snapshot.whereabouts, neighborhood
@@ -221,21 +258,21 @@ def _trial(
     map_: Map,
     encoder: Encoder,
     snapshot: Snapshot,
-    question: Question,
+    query: LabelledQuery,
     ranking: Ranking,
     left_out: Flags,
     base: Calibration,
     known: bool,
     number: int,
 ) -> list[Trial]:
-    """One question to the map without some rows; nothing if no place is left."""
+    """The answer to one query in the map without the rows ``left_out``; empty if no place is left."""
     kept = ~left_out[ranking[0]]
     remaining: Ranking = ranking[0][kept], ranking[1][kept]
     if not len(remaining[0]):
         return []
-    scored = second_stage(map_, encoder, snapshot, question.local, remaining)
-    judgement = judge(scored.ordered, scored.whereabouts, base, neighborhood_of(map_), scored.examined)
-    return [Trial(judgement, known, known and bool(question.true[scored.rows[0]]), number)]
+    candidates = agree(map_, encoder, snapshot, query.local, remaining)
+    judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
+    return [Trial(judgement, known, known and bool(query.true[candidates.rows[0]]), number)]
 
 
 def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:
@@ -244,14 +281,14 @@ def _stored(snapshot: Snapshot, row: int) -> tuple[NDArray[np.float32], Cells]:
 
 
 def _spread(values: list[Item], most: int) -> list[Item]:
-    """At most so many of them, evenly spread."""
+    """At most ``most`` of the values, evenly spread."""
     chosen = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
     return [values[index] for index in np.unique(chosen)]
 
 
 def _rows_of(map_: Map, snapshot: Snapshot, places: Sequence[str]) -> dict[str, int]:
     rows = map_.rows_of(list(places))
-    # One that was enrolled since is not in the snapshot.
+    # A place that was enrolled after the snapshot was taken is not in it.
     found = {place: row for place, row in zip(places, rows, strict=True) if row is not None and row < snapshot.rows}
     if missing := [place for place in places if place not in found]:
         raise UnknownPlace(f"The map has no place {missing[0][:128]!r}.")

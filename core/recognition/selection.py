@@ -1,4 +1,4 @@
-"""From what a caller knows to the rows of a map that a search may choose from, and how they weigh."""
+"""What a caller knows of a place (filters and priors), and the rows of a map that a search may therefore find."""
 
 from __future__ import annotations
 
@@ -13,13 +13,18 @@ from core.storage import Map, Snapshot
 from core.storage.attributes import Scalar
 
 TRUST = 0.9
-"""Of a soft prior whose caller names none."""
+"""The probability that a prior is right, if the caller states none."""
 
 
 @dataclass(frozen=True)
-class Recent:
-    """The robot's own last frames, which are not to be found again: of ``sequence`` the last ``frames`` places, and
-    those less than ``seconds`` from ``moment`` (microseconds since 1970 UTC)."""
+class RecentFrames:
+    """The robot's own last frames, which a query leaves out.
+
+    sequence: the sequence to which the robot adds its frames.
+    frames: so many of the last places of the sequence are left out.
+    moment: the time of the query, microseconds since 1970 UTC.
+    seconds: places of the sequence less than so many seconds from ``moment`` are left out.
+    """
 
     sequence: str
     frames: int = 0
@@ -28,8 +33,13 @@ class Recent:
 
 
 @dataclass(frozen=True)
-class Knowledge:
-    """Things that are true of the place asked for; all of them."""
+class Conditions:
+    """Conditions on a place; all of them have to hold.
+
+    geometry: conditions on pose and time.
+    sequences: the place belongs to one of these; None: to any.
+    metadata: the place's metadata has these values.
+    """
 
     geometry: tuple[Constraint, ...] = ()
     sequences: tuple[str, ...] | None = None
@@ -39,7 +49,7 @@ class Knowledge:
         return bool(self.geometry or self.sequences is not None or self.metadata)
 
     def constraints(self, map_: Map) -> list[Constraint]:
-        """All but the metadata, as they stand in this map."""
+        """The conditions on pose, time and sequence as constraints on the rows of a map."""
         found = list(self.geometry)
         if self.sequences is not None:
             found.insert(0, InSequences(tuple(map_.attributes.sequence_codes(self.sequences).values())))
@@ -47,11 +57,11 @@ class Knowledge:
 
 
 @dataclass(frozen=True)
-class Choice:
-    """What of a snapshot may be found.
+class SearchScope:
+    """Which rows of a snapshot a search may find, and their prior weights.
 
-    allowed: bool [rows]; None: everything.
-    weights: float64 [rows], at most 0, to be added to the log odds of a place; None: nothing.
+    allowed: bool [rows]; None: all rows.
+    weights: float64 [rows], at most 0, the log prior that is added to the log odds of a place; None: no prior.
     """
 
     allowed: Flags | None = None
@@ -59,67 +69,67 @@ class Choice:
 
     @property
     def favoured(self) -> Flags | None:
-        """Of what is allowed the rows whose weight is more than half lost; None without weights."""
+        """The allowed rows that the prior favours, whose weight is nearer to 0 than to the lowest; None if no prior."""
         if self.weights is None:
             return None
         favoured = self.weights >= self.weights.min() / 2
         return favoured if self.allowed is None else favoured & self.allowed
 
 
-EVERYTHING = Choice()
+WHOLE_MAP = SearchScope()
 
 
 @dataclass(frozen=True)
 class Selection:
-    """What a query is to choose from.
+    """What is known of the place that a query shows.
 
-    filters: what must be true of a place; places of which it is not are not read.
-    prior: what is true with the probability ``trust``.
-    recent: the caller's own last frames, left out.
-    without: the id of a place that is left out.
+    filters: conditions that have to hold; other places are not searched.
+    prior: conditions that hold with the probability ``trust``; other places lose odds.
+    recent: the robot's own last frames, which are left out.
+    excluded: the id of a place that is left out.
     """
 
-    filters: Knowledge = Knowledge()
-    prior: Knowledge = Knowledge()
+    filters: Conditions = Conditions()
+    prior: Conditions = Conditions()
     trust: float = TRUST
-    recent: Recent | None = None
-    without: str | None = None
+    recent: RecentFrames | None = None
+    excluded: str | None = None
 
     def __bool__(self) -> bool:
-        return bool(self.filters or self.prior or self.recent or self.without)
+        return bool(self.filters or self.prior or self.recent or self.excluded)
 
-    def choice(self, map_: Map, snapshot: Snapshot) -> Choice:
-        """What of a snapshot of the map may be found; the map is not read from disk for what is in memory.
+    def scope(self, map_: Map, snapshot: Snapshot) -> SearchScope:
+        """Which rows of a snapshot of the map may be found, and their weights; only metadata is read from disk.
 
         Raises:
-            StorageFailure: its metadata cannot be read.
+            StorageFailure: the metadata cannot be read.
         """
-        return Choice(self._allowed(map_, snapshot), self._weights(map_, snapshot))
+        return SearchScope(self._allowed(map_, snapshot), self._weights(map_, snapshot))
 
     def _allowed(self, map_: Map, snapshot: Snapshot) -> Flags | None:
-        if not (self.filters or self.recent or self.without):
+        if not (self.filters or self.recent or self.excluded):
             return None
         constraints = self.filters.constraints(map_)
-        if (lately := self._lately(map_)) is not None:
-            constraints.append(lately)
+        if (not_recent := self._not_recent(map_)) is not None:
+            constraints.append(not_recent)
         allowed = holding(constraints, snapshot.whereabouts)
         if self.filters.metadata:
-            # What is in memory first: it leaves the fewer rows to be looked up on disk.
+            # The constraints, which are in memory, come first: fewer rows are then looked up on disk.
             rows = _rows_with(map_, snapshot, self.filters.metadata, np.flatnonzero(allowed) if constraints else None)
             among, allowed = allowed, np.zeros(snapshot.rows, np.bool_)
             allowed[rows] = among[rows]
-        if self.without is not None:
-            (row,) = map_.rows_of([self.without])
+        if self.excluded is not None:
+            (row,) = map_.rows_of([self.excluded])
             if row is not None and row < len(allowed):
                 allowed[row] = False
         return allowed
 
-    def _lately(self, map_: Map) -> NotLately | None:
+    def _not_recent(self, map_: Map) -> NotLately | None:
         if self.recent is None:
             return None
         code = map_.attributes.sequence_codes([self.recent.sequence]).get(self.recent.sequence)
         if code is None:
-            return None  # it is the first frame of its sequence
+            return None  # the map has no place of the sequence yet
         oldest = map_.attributes.oldest_of_last(code, self.recent.frames) if self.recent.frames else None
         moment = self.recent.moment if self.recent.seconds else None
         return NotLately(code, oldest, moment, round(1e6 * self.recent.seconds))
@@ -138,6 +148,6 @@ class Selection:
 def _rows_with(
     map_: Map, snapshot: Snapshot, metadata: Mapping[str, Scalar], among: NDArray[np.int64] | None = None
 ) -> NDArray[np.int64]:
-    """Rows of the snapshot; those of places written since are left out."""
+    """The rows of the snapshot whose metadata has these values; places that were stored later are left out."""
     rows = map_.attributes.rows_with(metadata, among)
     return rows[rows < snapshot.rows]

@@ -1,4 +1,4 @@
-"""Durable maps: what is acknowledged is on disk, what is on disk is checked, what is searched is in memory."""
+"""Durable maps: a write that has returned is on disk, whatever is read from disk is checked, searches run in memory."""
 
 from core.storage.atlas import Atlas
 from core.storage.files.row_formats import NewPrecision

@@ -1,10 +1,11 @@
-"""The data directory: all maps, each in a folder of its own, and the lock that makes them ours.
+"""The data directory: all maps, each in a folder of its own, and a lock that keeps other processes out.
 
-LOCK                       held for as long as the atlas is open
-FORMAT                     the version of this arrangement
-maps/<id>/map.sqlite       record, places, sequences, pictures, and which rows count
-maps/<id>/descriptors-….seg, ….index   descriptors, and what large maps are searched by
-maps/.unlisted-<id>/…      a map that is being made, and is not listed before it is whole
+LOCK                              locked as long as the atlas is open
+FORMAT                            the version of this layout
+maps/<id>/map.sqlite              the map's record, its places, sequences and pictures, and which descriptor rows count
+maps/<id>/descriptors-….seg       descriptors
+maps/<id>/….index                 codes and lists by which large maps are searched
+maps/.unlisted-<id>/…             a map that is being built; it is listed when it is complete
 """
 
 from __future__ import annotations
@@ -19,51 +20,51 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
+from core.disk.files import Damage, FolderLock, disk_errors, make_folder, sync_file, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.places import check_map_id
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
-from core.storage.files.disk import Damage, FolderLock, make_folder, refusals, sync_file, sync_folder, write_file
 from core.storage.files.row_formats import HALF, Precision
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from core.storage.records import MapRecord, MapSettings, VerifyReport
-from core.storage.verification import Progress, inspect_folder, untold
+from core.storage.verification import Progress, inspect_folder, no_progress
 
 log = logging.getLogger(__name__)
 
 FORMAT = "placerec data 1\n"
 _MAPS = "maps"
-# No map id begins with a dot, so these can never be taken for maps.
+# No map id begins with a dot, so these folders are never mistaken for maps.
 _HALF_MADE, _HALF_REMOVED = ".making-", ".removing-"
 
 
 class Atlas:
-    """All maps.  Every method may be called from any thread; one process has the directory at a time."""
+    """All maps of a data directory.  Any thread may call any method; one process uses the directory at a time."""
 
     def __init__(self, directory: Path, rows_per_segment: int = ROWS_PER_SEGMENT) -> None:
-        """Take the directory, make it if need be, and read the record of every map.
+        """Lock the directory, make it if it is missing, and read the record of every map.
 
         Args:
-            rows_per_segment: of the maps that will be made; those there are keep theirs.
+            rows_per_segment: rows of a full segment file of new maps; existing maps keep theirs.
 
         Raises:
-            DataDirectoryLocked: another process has it.
+            DataDirectoryLocked: another process uses it.
             DataDirectoryTooNew: a later version of placerec wrote it, or one of its maps.
             StorageFull, StorageFailure: the disk refuses.
         """
         self._directory = directory
         self._folder = directory / _MAPS
         self._rows_per_segment = rows_per_segment
-        self._making = threading.Lock()  # held by the one that makes or deletes a map
+        self._making = threading.Lock()  # held while a map is made or deleted
         self._maps: dict[str, Map] = {}
         self._unlisted: dict[str, Map] = {}
         self._reserved: set[str] = set()
-        # Maps that could not be read at the start, and why: their files are damaged, or the disk refused.
+        # Maps that could not be read at the start, and why: damaged files, or errors of the disk.
         self._damaged: dict[str, str] = {}
         self._refused: dict[str, str] = {}
         self._closed = False
-        with refusals(f"open the data directory {directory}"):
+        with disk_errors(f"open the data directory {directory}"):
             make_folder(directory)
             self._lock = FolderLock(directory / "LOCK")
             try:
@@ -88,7 +89,7 @@ class Atlas:
             raise DataDirectoryTooNew(
                 f"{self._directory} was written by a later version of placerec ({found.strip()})."
             )
-        raise StorageFailure(f"{path} is not placerec's: is this the right directory?")
+        raise StorageFailure(f"{path} was not written by placerec: is this the right directory?")
 
     def _scan(self) -> None:
         for folder in sorted(self._folder.iterdir()):
@@ -102,7 +103,7 @@ class Atlas:
 
     def _adopt_unlisted(self, folder: Path) -> None:
         try:
-            with refusals(f"open map {folder.name!r}"):
+            with disk_errors(f"open map {folder.name!r}"):
                 self._unlisted[folder.name.removeprefix(UNLISTED)] = Map(folder, *read_record(folder))
         except Damage as damage:
             log.error("Removing the unfinished map %s: %s", folder.name, damage)
@@ -113,13 +114,13 @@ class Atlas:
     def _adopt(self, folder: Path) -> None:
         self._refused.pop(folder.name, None)
         try:
-            with refusals(f"open map {folder.name!r}"):
+            with disk_errors(f"open map {folder.name!r}"):
                 self._maps[folder.name] = Map(folder, *read_record(folder))
         except Damage as damage:
             log.error("Map %s is quarantined: %s", folder.name, damage)
             self._damaged[folder.name] = str(damage)
         except (StorageFull, StorageFailure) as refusal:
-            # The others serve; this one is tried again when it is asked for.
+            # The other maps are served; this one is tried again when it is used.
             log.error("Map %s cannot be opened: %s", folder.name, refusal)
             self._refused[folder.name] = str(refusal)
 
@@ -133,20 +134,20 @@ class Atlas:
         unlisted: bool = False,
         precision: Precision = HALF,
     ) -> Map:
-        """Make an empty map, bound to an encoder for life; it is durable when this returns.
+        """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
-            unlisted: it is found by :meth:`unlisted` alone, over a restart too, until it is published.
-            precision: how its descriptors are kept, for good.
+            unlisted: only :meth:`unlisted` finds the map, also after a restart, until it is published.
+            precision: how its descriptors are stored; this cannot be changed later.
 
         Raises:
-            InvalidIdentifier: the id does not have the form of one.
-            MapExists: it is taken, be it by a damaged map.
+            InvalidIdentifier: the id is malformed.
+            MapExists: the id is taken, possibly by a damaged map.
             StorageFull, StorageFailure.
         """
         check_map_id(map_id)
-        # Refuses what no file can hold.
+        # Raises ValueError for values that no segment file can hold.
         Layout(dimension, encoder_identity, self._rows_per_segment, local_shape, precision)
         now = datetime.now(UTC)
         record = MapRecord(
@@ -161,7 +162,7 @@ class Atlas:
             updated_at=now,
             **(settings or MapSettings()).model_dump(),
         )
-        with self._making, refusals(f"create map {map_id!r}"):
+        with self._making, disk_errors(f"create map {map_id!r}"):
             self._expect_open()
             self._expect_free(map_id)
             folder = self._folder / map_id
@@ -181,19 +182,19 @@ class Atlas:
 
     def _expect_free(self, map_id: str) -> None:
         if map_id in self._maps or (self._folder / map_id).exists():
-            raise MapExists(f"There is a map {map_id!r} already.")
+            raise MapExists(f"There is already a map {map_id!r}.")
         if map_id in self._unlisted or map_id in self._reserved:
             raise MapExists(f"A map {map_id!r} is being made.")
 
     @contextmanager
     def building(self, map_id: str) -> Iterator[Path]:
-        """The path of a folder to be made within, which is listed as a map when the block ends without an error.
+        """The path of a folder that the block makes; it is listed as a map when the block ends without an error.
 
-        Before that nobody finds it, and a crash leaves nothing of it.  The id is taken meanwhile.
+        Until then the map is not found, and a crash leaves nothing of it.  The id is reserved meanwhile.
 
         Raises:
-            InvalidIdentifier: the id does not have the form of one.
-            MapExists: it is taken.
+            InvalidIdentifier: the id is malformed.
+            MapExists: the id is taken.
             StorageFull, StorageFailure.
         """
         check_map_id(map_id)
@@ -203,7 +204,7 @@ class Atlas:
             self._reserved.add(map_id)
         unfinished = self._folder / f"{_HALF_MADE}{map_id}-{secrets.token_hex(4)}"
         try:
-            with refusals(f"make map {map_id!r}"):
+            with disk_errors(f"make map {map_id!r}"):
                 yield unfinished
                 with self._making:
                     self._expect_open()
@@ -221,17 +222,17 @@ class Atlas:
             shutil.rmtree(unfinished, ignore_errors=True)
 
     def unlisted(self) -> dict[str, Map]:
-        """The maps that are being made, by the ids that they will have."""
+        """The maps that are being built, by id."""
         return self._unlisted.copy()
 
     def publish(self, map_id: str) -> Map:
-        """List a map that is whole now, from one moment to the next; durable when this returns.
+        """List a map that was being built and is now complete; durable when this returns.
 
         Raises:
-            UnknownMap: none of this id is being made.
+            UnknownMap: no map of this id is being built.
             StorageFull, StorageFailure.
         """
-        with self._making, refusals(f"publish map {map_id!r}"):
+        with self._making, disk_errors(f"publish map {map_id!r}"):
             self._expect_open()
             made = self._unlisted.get(map_id)
             if made is None:
@@ -250,20 +251,20 @@ class Atlas:
         return listed
 
     def abandon(self, map_id: str) -> None:
-        """Remove a map that was being made, for good; nothing happens if there is none.
+        """Delete a map that was being built; nothing happens if there is none.
 
         Raises:
-            StorageFull, StorageFailure: it is still being made.
+            StorageFull, StorageFailure: the map is still there.
         """
-        with self._making, refusals(f"remove map {map_id!r}"):
+        with self._making, disk_errors(f"remove map {map_id!r}"):
             made = self._unlisted.get(map_id)
             if made is None:
                 return
-            removed = self._put_away(made, self._folder / f"{UNLISTED}{map_id}", self._unlisted)
+            removed = self._rename_removed(made, self._folder / f"{UNLISTED}{map_id}", self._unlisted)
         shutil.rmtree(removed, ignore_errors=True)
 
-    def _put_away(self, found: Map | None, folder: Path, among: dict[str, Map]) -> Path:
-        """Close a map and take it from its like, durably; where its folder is now, which any start would remove."""
+    def _rename_removed(self, found: Map | None, folder: Path, among: dict[str, Map]) -> Path:
+        """Close a map, rename its folder durably to a name that the next start would delete, and return that path."""
         map_id = folder.name.removeprefix(UNLISTED)
         removed = self._folder / f"{_HALF_REMOVED}{map_id}-{secrets.token_hex(4)}"
         if found is not None:
@@ -271,7 +272,7 @@ class Atlas:
         try:
             os.rename(folder, removed)
         except FileNotFoundError:
-            log.warning("The folder of map %s was gone already.", map_id)
+            log.warning("The folder of map %s was already gone.", map_id)
         except OSError:
             if found is not None:
                 among[map_id] = Map(folder, found.record, found.count_places())
@@ -281,7 +282,7 @@ class Atlas:
         return removed
 
     def get(self, map_id: str) -> Map:
-        """A map, ready to serve; its first use reads it from disk.
+        """A map, ready for use; its first use reads it from disk.
 
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
@@ -291,12 +292,12 @@ class Atlas:
         return found
 
     def opened(self, map_id: str) -> Map | None:
-        """A map that serves and was read from disk before; None where :meth:`get` has to say more. Never waits."""
+        """A map that is in service and was read from disk before; None otherwise.  This never waits."""
         found = self._maps.get(map_id)
         return found if found is not None and found.is_open else None
 
     def find(self, map_id: str) -> Map:
-        """A map as it is listed: its record and the number of its places, for which it is not read from disk.
+        """A map whose record and number of places can be used without reading it from disk.
 
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
@@ -320,7 +321,7 @@ class Atlas:
         return UnknownMap(f"There is no map {map_id[:80]!r}.")
 
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
-        """A page of maps by id, quarantined ones left out, and the cursor of the next page.
+        """A page of the maps' records by id, without quarantined maps, and the cursor of the next page.
 
         Raises:
             InvalidCursor.
@@ -335,13 +336,13 @@ class Atlas:
         return [maps[map_id].record for map_id in page[:limit]], more
 
     def quarantined(self) -> dict[str, str]:
-        """The maps that are out of service, and why."""
+        """Why maps are out of service, by id."""
         in_use = {map_id: found.damage for map_id, found in self._maps.copy().items()}
         found_later = {map_id: reason for map_id, reason in in_use.items() if reason is not None}
         return {**self._damaged, **self._refused, **found_later}
 
-    def verify(self, map_id: str, progress: Progress = untold) -> VerifyReport:
-        """Read all of a map again, be it in service or quarantined, and say what is damaged.
+    def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
+        """Read all files of a map again, whether it is in service or quarantined, and report what is damaged.
 
         Raises:
             UnknownMap, StorageFailure.
@@ -353,31 +354,31 @@ class Atlas:
         return report.model_copy(update={"ok": False, "problems": [reason, *report.problems]})
 
     def delete(self, map_id: str) -> None:
-        """Forget a map, a quarantined one too; nothing of it comes back when this has returned.
+        """Delete a map, which may be quarantined; the deletion is durable when this returns.
 
         Raises:
             UnknownMap, StorageFull, StorageFailure.
         """
-        with self._making, refusals(f"delete map {map_id!r}"):
+        with self._making, disk_errors(f"delete map {map_id!r}"):
             self._expect_open()
             found = self._maps.get(map_id)
             if found is None and map_id not in self.quarantined():
                 raise self._absent(map_id)
-            removed = self._put_away(found, self._folder / map_id, self._maps)
+            removed = self._rename_removed(found, self._folder / map_id, self._maps)
             self._damaged.pop(map_id, None)
             self._refused.pop(map_id, None)
-        # What cannot be removed now is removed at the next start.
+        # What cannot be deleted now is deleted at the next start.
         shutil.rmtree(removed, ignore_errors=True)
 
     def check_writable(self) -> None:
-        """Write, sync and remove a small file, as the maps will have to.
+        """Write, sync and delete a small file, to see that maps could be written.
 
         Raises:
             StorageFull, StorageFailure.
         """
         self._expect_open()
         probe = self._directory / f".probe-{secrets.token_hex(4)}"
-        with refusals(f"write to {self._directory}"):
+        with disk_errors(f"write to {self._directory}"):
             try:
                 probe.write_bytes(b"\x00" * 4096)
                 sync_file(probe)
@@ -387,7 +388,7 @@ class Atlas:
                     probe.unlink()
 
     def close(self) -> None:
-        """Let what is under way end, close all maps, and give the directory back."""
+        """Wait for reads and writes under way, close all maps, and release the lock on the directory."""
         with self._making:
             self._closed = True
             for found in [*self._maps.values(), *self._unlisted.values()]:

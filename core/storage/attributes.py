@@ -1,4 +1,4 @@
-"""Places found by what was said of them: sequences by name, rows by metadata."""
+"""Looking up the sequences of a map by name and its rows by metadata, for filtered searches."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 Scalar = str | int | float | bool | None
 
 FEW = 5000
-"""Rows that are sooner looked up one by one than all rows with a value are read."""
+"""Up to so many rows are looked up one by one, which is faster than reading all rows with a value."""
 
 _WANTED = (
     " v.key = f.key AND v.kind = CASE f.type WHEN 'true' THEN 'boolean' WHEN 'false' THEN 'boolean'"
     " WHEN 'integer' THEN 'number' WHEN 'real' THEN 'number' ELSE f.type END AND v.value = coalesce(f.atom, 0)"
 )
-# One text with all rows in it: making a Python object of each takes several times as long.
+# All rows as one text: a Python object for each takes several times as long.
 _ALL = f"SELECT group_concat(v.row) FROM json_each(?) f JOIN place_values v ON{_WANTED}"
 _AMONG = (
     "SELECT group_concat(v.row) FROM json_each(?) f CROSS JOIN json_each(?) r CROSS JOIN place_values v"
@@ -28,37 +28,37 @@ _AMONG = (
 
 
 class Attributes:
-    """Look-ups in the indexes of one map; from any thread.
+    """Looks up sequences and rows in the database of one map.  Any thread may use it.
 
     Args:
-        reading: gives a connection to the map's database; what it raises is raised here.
+        reading: opens a connection to the map's database; every method may raise what it raises.
     """
 
     def __init__(self, reading: Callable[[], AbstractContextManager[sqlite3.Connection]]) -> None:
         self._reading = reading
 
     def sequence_codes(self, names: Sequence[str]) -> dict[str, int]:
-        """The codes of those of the sequences that there are, as ``Whereabouts.sequence`` has them."""
+        """The codes of sequences (``Whereabouts.sequence``) by name; names that do not exist are left out."""
         query = "SELECT name, code FROM sequences WHERE name IN (SELECT value FROM json_each(?))"
         with self._reading() as connection:
             return dict(connection.execute(query, (json.dumps(list(names)),)).fetchall())
 
     def oldest_of_last(self, sequence: int, frames: int) -> int | None:
-        """The least ordinal among a sequence's last ``frames`` places; None if there is no such place."""
+        """The smallest ordinal among the last ``frames`` places of a sequence; None if it has no places."""
         query = "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE sequence = ? ORDER BY ordinal DESC LIMIT ?)"
         with self._reading() as connection:
             (ordinal,) = connection.execute(query, (sequence, frames)).fetchone()
         return None if ordinal is None else int(ordinal)
 
     def rows_with(self, metadata: Mapping[str, Scalar], among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Rows of the places whose metadata has these values under these keys; int64 [n], ascending.
+        """Rows of the places whose metadata has these values under these keys: int64 [n], ascending.
 
-        Numbers are equal as numbers (1 is 1.0), and true is not 1.  Only top-level values are found, and
-        of text only what has at most ``schema.LONGEST_INDEXED`` characters.
+        Numbers are compared as numbers (1 equals 1.0), and true is not 1.  Only values at the top level are found, and
+        only text of at most ``schema.LONGEST_INDEXED`` characters.
 
         Args:
-            metadata: at least one.
-            among: the rows to choose from, if they are known; few are looked up one by one.
+            metadata: at least one key with its value.
+            among: the rows to choose from; None: all.
         """
         found = None if among is None else np.unique(among)
         with self._reading() as connection:

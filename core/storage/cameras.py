@@ -1,4 +1,4 @@
-"""The cameras of a map: what of their pictures is ignored, at enrolment and at every query."""
+"""The cameras of a map, and the masks that are ignored in their frames at enrolment and in queries."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
 from core.frames.masks import Mask
 from core.places import Camera, Timestamp
-from core.storage.database import row_checksums as seals
+from core.storage.database import row_checksums
 from core.storage.database.ledger import moment_text
-from core.storage.files.disk import Damage
 from core.storage.writing import Write
 
 MOST_CAMERAS = 256
-"""Of one map."""
+"""Cameras of one map."""
 
 
 class CameraRecord(BaseModel):
@@ -38,21 +38,23 @@ Access = Callable[[], AbstractContextManager[Connected]]
 
 
 class Cameras:
-    """All cameras of one map; from any thread.  They are few and asked for by every frame, so they stay in memory.
+    """All cameras of one map, which are few and needed by every frame, so they stay in memory.  Any thread may use it.
+
+    Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
-        reading: gives a connection to the map's database.
-        writing: gives a write to the map, which is committed at its end.  What both raise is raised here.
+        reading: opens a connection to the map's database.
+        writing: begins a write to the map, which is committed at its end.
     """
 
     def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
         self._reading, self._writing = reading, writing
         self._known: dict[str, CameraRecord] | None = None
-        self._changes = 0  # counted, so that what was read before one is not taken for what is there after it
-        self._lock = threading.Lock()  # of both; held for no reading or writing, which wait for locks of their own
+        self._changes = 0  # counts changes, so that a reading that began before a change is not kept
+        self._lock = threading.Lock()  # of both; never held while reading or writing, which take other locks
 
     def all(self) -> list[CameraRecord]:
-        """By name."""
+        """All cameras by name."""
         return sorted(self._records().values(), key=lambda camera: camera.name)
 
     def find(self, name: str) -> CameraRecord:
@@ -67,7 +69,7 @@ class Cameras:
         return found
 
     def mask(self, name: str | None) -> Mask | None:
-        """What to ignore in a frame of a camera; nothing if none is named.
+        """What to ignore in a frame of a camera; None without a name.
 
         Raises:
             UnknownCamera: the map has none of this name.
@@ -75,10 +77,10 @@ class Cameras:
         return None if name is None else self.find(name).mask
 
     def put(self, name: str, mask: Mask | None) -> tuple[CameraRecord, bool]:
-        """Make a camera or replace its mask; durable when this returns.  Returns whether it is new, too.
+        """Make a camera or replace its mask, durably; returns the camera and whether it is new.
 
         Raises:
-            InvalidField: the map has too many.
+            InvalidField: the map has too many cameras.
         """
         made = CameraRecord(name=name, mask=mask, updated_at=datetime.now(UTC))
         with self._writing() as write:
@@ -89,12 +91,12 @@ class Cameras:
                 "INSERT OR REPLACE INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)",
                 (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
             )
-            seals.seal(write.connection, "cameras", "name = ?", name)
+            row_checksums.write_checksums(write.connection, "cameras", "name = ?", name)
         self._forget_known()
         return made, name not in known
 
     def forget(self, name: str) -> None:
-        """Delete a camera; the places that it took stay as they are.
+        """Delete a camera; its places stay as they are.
 
         Raises:
             UnknownCamera: the map has none of this name.
@@ -123,7 +125,7 @@ class Cameras:
 def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
     found = {}
     for name, mask, moment, seal in connection.execute("SELECT name, mask, updated_at, seal FROM cameras").fetchall():
-        if not seals.is_sound((name, mask, moment), seal):
+        if not row_checksums.is_sound((name, mask, moment), seal):
             raise Damage(f"map.sqlite: camera {name!r} does not match its checksum")
         kept = None if mask is None else Mask.model_validate_json(mask)
         found[name] = CameraRecord(name=name, mask=kept, updated_at=moment)

@@ -1,107 +1,152 @@
-"""One map: its places on disk and its snapshot in memory, kept in step."""
+"""One map: its places on disk, and the snapshot in memory that is searched."""
 
 from __future__ import annotations
 
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
+from core.disk.files import Damage, disk_errors
 from core.errors import (
+    InvalidImage,
     MapQuarantined,
+    NoThumbnail,
     PlacerecError,
     RevisionMismatch,
     StorageFailure,
     UnknownMap,
     UnknownSequence,
 )
+from core.frames.images import Limits, decode, encode_thumbnail
 from core.places import Place, PlaceFields
-from core.storage import pages
-from core.storage.archives.capture import Capturing
+from core.storage.archives.exporter import Exporter
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
 from core.storage.database import ledger
 from core.storage.database.connections import DatabaseClosed
-from core.storage.database.segment_table import NamedSegment, named_segments
-from core.storage.failed_writes import Doubts
-from core.storage.files.disk import Damage, refusals
+from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, open_map
-from core.storage.patches import patched_fields, patched_record
-from core.storage.pictures import small_picture
-from core.storage.recent_places import Memo
-from core.storage.records import Change, Enrolment, MapRecord, SequenceSummary, VerifyReport
+from core.storage.pagination import page_of_places, page_of_sequences
+from core.storage.records import (
+    Change,
+    Enrolment,
+    MapRecord,
+    SameFrame,
+    SequenceSummary,
+    VerifyReport,
+    patched_fields,
+    patched_record,
+)
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import IndexStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
-from core.storage.verification import Progress, inspect, untold
-from core.storage.writing import Write, check_enrolment
+from core.storage.verification import Progress, inspect, no_progress
+from core.storage.writing import FailedWrites, Write, check_enrolment
 
 log = logging.getLogger(__name__)
 
 
+MOST_RECENT = 1024
+"""Places of a map that are remembered after they were read …"""
+
+LONGEST_METADATA = 1000
+"""… unless their metadata has more characters, so that all together take five megabytes at most."""
+
+_ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
+"""A picture that was accepted is shown whatever today's limits are; no service can be set to accept a larger one."""
+
+
+class RecentPlaces:
+    """Places of a map that were read since its last write, by row; a query of the same place need not read them again.
+
+    They are forgotten with every write, so that no place is ever returned as it was before.  Any thread may use this.
+    """
+
+    def __init__(self) -> None:
+        self._kept: tuple[object, dict[int, Place]] = (object(), {})
+
+    def places(self, state: object, rows: Iterable[int]) -> dict[int, Place]:
+        """The places of ``rows`` that were read in this state of the map (``Database.state``)."""
+        of, places = self._kept
+        if of is not state:
+            return {}
+        found = ((row, places.get(row)) for row in rows)
+        return {row: place for row, place in found if place is not None}
+
+    def keep(self, state: object, places: Mapping[int, Place]) -> None:
+        """Remember places that were read after the map was found in this state."""
+        small = {row: place for row, place in places.items() if len(str(place.metadata)) <= LONGEST_METADATA}
+        of, kept = self._kept
+        if of is not state or len(kept) + len(small) > MOST_RECENT:
+            self._kept = (state, dict(list(small.items())[:MOST_RECENT]))
+        else:
+            kept.update(small)
+
+
 class Map:
-    """The places of one environment.  Every method may be called from any thread.
+    """The places of one environment.  Any thread may call any method.
 
-    One thread writes at a time.  A write returns when it is synced, and every snapshot taken from
-    then on shows it; reads and searches never wait for it.
+    One thread writes at a time.  A write returns when it is synced, and every later snapshot contains it; reads and
+    searches never wait for a write.
 
-    Any method may raise MapQuarantined (the map turns out to be damaged), StorageFailure (the disk
-    refuses) and UnknownMap (it was deleted meanwhile); those that write also StorageFull.  A write
-    that raises has changed nothing.
+    Any method may raise MapQuarantined (the map is found to be damaged), StorageFailure (the disk refuses) and
+    UnknownMap (the map was deleted meanwhile); methods that write may also raise StorageFull.  A write that raises has
+    changed nothing.
     """
 
     def __init__(self, folder: Path, record: MapRecord, places: int = 0) -> None:
-        """The map in ``folder``, of which record and number of places are known; the rest is read on first use."""
+        """The map in ``folder``; all but its record and its number of places is read on first use."""
         self._folder = folder
         self._record = record
         self._places = places
-        self._lock = threading.RLock()  # held by the one that writes, opens or closes
+        self._lock = threading.RLock()  # held while the map is written, opened or closed
         self._opened: OpenMap | None = None
         self._snapshot: Snapshot | None = None
         self._damage: str | None = None
         self._end: PlacerecError | None = None
-        self._doubts = Doubts(folder)
-        self._memo = Memo()
+        self._failed_writes = FailedWrites(folder)
+        self._recent_places = RecentPlaces()
         self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
-        self.capturing = Capturing(folder, self._reading, lambda: self._opened, self._guarded)
+        self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
 
     @property
     def record(self) -> MapRecord:
-        """As of the last edit."""
+        """The map's record as of its last edit."""
         return self._record
 
     @property
     def damage(self) -> str | None:
-        """Why the map is quarantined; None while it serves."""
+        """Why the map is quarantined; None while it is in service."""
         return self._damage
 
     def check_serving(self) -> None:
-        """Raise MapQuarantined if the map is damaged, as far as is known."""
+        """Raise MapQuarantined if the map is known to be damaged."""
         if self._damage is not None:
             raise self._quarantined()
 
     @property
     def is_open(self) -> bool:
-        """Whether it serves and was read from disk."""
+        """Whether the map is in service and was read from disk."""
         return self._opened is not None
 
     def open(self) -> None:
-        """Read the map from disk, unless that was done already."""
+        """Read the map from disk, unless that was done before."""
         self._expect_open()
 
     def close(self, deleted: bool = False) -> None:
-        """Let the reads and the write under way end, and refuse further ones."""
-        with self._lock:  # from here on it is not opened any more
+        """Wait for the reads and the write under way, and refuse further ones."""
+        with self._lock:  # from here on the map is not opened again
             name = self._folder.name
             if self._end is None:
                 self._end = (
@@ -115,7 +160,7 @@ class Map:
                 return
             if indexer is not None and last is not None and not deleted:
                 with suppress(Damage, OSError, sqlite3.Error), opened.database.reading() as connection:
-                    indexer.keep_tail(last, named_segments(connection, opened.layout))
+                    indexer.keep_tail(last, segment_entries(connection, opened.layout))
             opened.database.close()
 
     def _expect_open(self) -> OpenMap:
@@ -141,13 +186,13 @@ class Map:
 
     @contextmanager
     def _guarded(self, action: str) -> Iterator[None]:
-        """Name the refusals of the disk; take a map that is damaged out of service."""
+        """Turn errors of the disk into ours; quarantine the map if it is damaged."""
         try:
-            with refusals(f"{action} map {self._folder.name!r}"):
+            with disk_errors(f"{action} map {self._folder.name!r}"):
                 yield
         except (Damage, StorageFailure) as damage:
             if self._end is not None:
-                raise type(self._end)(*self._end.args) from damage  # its files are gone, as they must be
+                raise type(self._end)(*self._end.args) from damage  # a closed or deleted map's files may be gone
             if isinstance(damage, StorageFailure):
                 raise
             self._quarantine(damage)
@@ -169,7 +214,7 @@ class Map:
             yield
 
     def _indexed(self, opened: OpenMap) -> IndexedMap:
-        """What is needed of the map to build what it is searched by."""
+        """What the indexer needs of the map."""
 
         def publish(change: Callable[[Snapshot], Snapshot]) -> Snapshot:
             with self._lock:
@@ -178,20 +223,38 @@ class Map:
                 self._snapshot = change(self._snapshot)
                 return self._snapshot
 
-        def named() -> Sequence[NamedSegment]:
+        def entries() -> Sequence[SegmentEntry]:
             with self._reading() as connection:
-                return named_segments(connection, opened.layout)
+                return segment_entries(connection, opened.layout)
 
-        return IndexedMap(lambda: self._record.index, self.snapshot, publish, named, self._quarantine)
+        return IndexedMap(lambda: self._record.index, self.snapshot, publish, entries, self._quarantine)
 
     def index_status(self) -> IndexStatus:
-        """How the map is searched; it is not read from disk for it."""
+        """How the map is searched; this does not read it from disk."""
         indexer = self.indexer
         found = None if indexer is None else indexer.status(lambda: self._snapshot)
         return unopened(self._record.index, self._places) if found is None else found
 
+    def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
+        """Build the codes and lists of a large map again from its descriptors; searches use the present ones meanwhile.
+
+        A map that is searched exactly has neither, so nothing is done.
+
+        Args:
+            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+
+        Raises:
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+        self.open()
+        if (indexer := self.indexer) is not None:
+            with disk_errors(f"read map {self._record.id!r}"), suppress(Stopped):
+                indexer.rebuild(progress)
+        self.open()  # raises if the map was closed meanwhile
+        return self.index_status()
+
     def storage_status(self) -> StorageStatus:
-        """What the map takes on disk."""
+        """How much room the map takes on disk."""
         with self._guarded("read"):
             return storage_of(self._folder, self._record.precision, self.count_places())
 
@@ -204,7 +267,7 @@ class Map:
                 return
             except DatabaseClosed:
                 pass
-        self._expect_open()  # says why
+        self._expect_open()  # raises the reason
         raise StorageFailure(f"Map {self._folder.name!r} was closed.")
 
     # Writing
@@ -214,8 +277,8 @@ class Map:
         with self._lock:
             opened, before = self._expect_open(), self.snapshot()
             with self._guarded("write to"):
-                opened.remains.clear(before)  # it may be this room that is needed
-                self._doubts.resolve(opened, before.rows)
+                opened.removed_segments.clear(before)  # the write may need this room
+                self._failed_writes.repair(opened, before.rows)
                 write = None
                 try:
                     with opened.database.transaction() as connection:
@@ -224,22 +287,22 @@ class Map:
                         after = write.finish()
                 except BaseException as error:
                     if write is not None:
-                        self._doubts.arise(error, write, opened, before.rows)
+                        self._failed_writes.note(error, write, opened, before.rows)
                     raise
             self._snapshot, self._record = after, write.record
             del before
-            opened.remains.clear(after)
+            opened.removed_segments.clear(after)
             if self.indexer is not None and ((write.filled and after.coded) or self.indexer.needs_work(after)):
                 self.indexer.wake()
 
     def edit(self, changes: Mapping[str, Any], expected_revision: int | None = None) -> MapRecord:
-        """Change settings (those of MapSettings) or ``calibration`` (None: back to the encoder's).
+        """Change settings (the fields of MapSettings) or ``calibration`` (None: use that of the encoder).
 
-        ``keep`` applies to frames enrolled from then on; pictures kept already stay as they are.
-        The revision grows by one, unless nothing changes.
+        ``keep`` applies to frames enrolled later; pictures that are kept already stay.  The revision grows by one if
+        anything changes.
 
         Raises:
-            InvalidField: an unknown or fixed field, or a value that it cannot have.
+            InvalidField: a field is unknown or fixed, or its value is not allowed.
             RevisionMismatch: the record is not at ``expected_revision``.
         """
         with self._writing() as write:
@@ -250,25 +313,36 @@ class Map:
                 write.edit(record)
         return write.record
 
-    def enrol(self, items: Sequence[Enrolment]) -> list[tuple[Place, Change]]:
-        """Remember frames, all of them or, if this raises, none; one sync and one COMMIT for all.
+    @overload
+    def enrol(self, items: Sequence[Enrolment]) -> Sequence[tuple[Place, Change]]: ...
 
-        An id that exists keeps its place and creation time: with the same digest only its fields are
-        applied (``unchanged``, ``updated``), with another its frame is ``replaced``.  An id that
-        occurs twice is taken in order.
+    @overload
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]: ...
+
+    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> Sequence[tuple[Place, Change] | None]:
+        """Store frames as places, all of them or, if this raises, none, with one sync and one COMMIT.
+
+        The items are stored in the order given, which is the order of the places in their sequences.  An id that
+        exists keeps its place and creation time: if the frame's digest is the same, only its fields are stored
+        (``unchanged``, ``updated``), otherwise its frame is ``replaced``.  An id may occur twice.
+
+        Returns:
+            The place of each item and what changed.  None for a SameFrame whose place is gone or shows another frame:
+            such an item changes nothing.
 
         Raises:
             InvalidIdentifier, InvalidField: an id or metadata that cannot be stored.
             NoRegions: a descriptor is all zero.
             ValueError: descriptors or a digest of the wrong kind.
         """
-        for item in items:
+        new = [item for item in items if isinstance(item, Enrolment)]
+        for item in new:
             check_enrolment(item, self._record.dimension, self._record.local_shape)
         if not items:
             return []
         with self._writing() as write:
-            write.expect(len(items))
-            return [write.enrol(item) for item in items]
+            write.expect(len(new))
+            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
         """Replace all fields of a place; its frame stays.
@@ -313,18 +387,18 @@ class Map:
     # Reading
 
     def snapshot(self) -> Snapshot:
-        """All places at this moment, to be searched; later writes do not change it."""
+        """All places at this moment, for searching; later writes do not change the snapshot."""
         while (snapshot := self._snapshot) is None:
             self._expect_open()
         return snapshot
 
     def count_places(self) -> int:
-        """How many places there are; the map is not read from disk for it."""
+        """How many places the map has; this does not read it from disk."""
         snapshot = self._snapshot
         return self._places if snapshot is None else len(snapshot)
 
     def digest(self, place_id: str) -> bytes | None:
-        """SHA-256 of the image of a place; None if there is no such place."""
+        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
         with self._reading() as connection:
             stored = ledger.find(connection, place_id)
         return None if stored is None else stored.digest
@@ -345,7 +419,7 @@ class Map:
             InvalidCursor.
         """
         with self._reading() as connection:
-            return pages.places(connection, self._folder.name, cursor, limit, sequence)
+            return page_of_places(connection, self._folder.name, cursor, limit, sequence)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
         """A page of sequences by name, and the cursor of the next page.
@@ -354,46 +428,66 @@ class Map:
             InvalidCursor.
         """
         with self._reading() as connection:
-            return pages.sequences(connection, self._folder.name, cursor, limit)
+            return page_of_sequences(connection, self._folder.name, cursor, limit)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
-        """The places of rows that a search returned; None for one deleted or given another frame since."""
+        """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         state, wanted = self._expect_open().database.state, [int(row) for row in rows]
-        found = self._memo.places(state, wanted)
+        found = self._recent_places.places(state, wanted)
         if missing := [row for row in wanted if row not in found]:
             with self._reading() as connection:
                 read = ledger.places_of_rows(connection, missing)
-            self._memo.keep(state, read)
+            self._recent_places.keep(state, read)
             found.update(read)
         return [found.get(row) for row in wanted]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
-        """The rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""
+        """The descriptor rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""
         with self._reading() as connection:
             found = ledger.rows_of_places(connection, list(place_ids))
         return [found.get(place_id) for place_id in place_ids]
+
+    def picture(self, place_id: str) -> bytes | None:
+        """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
+
+        Raises:
+            StorageFailure: the picture is damaged.
+        """
+        with self._reading() as connection:
+            stored = ledger.find(connection, place_id)
+            return None if stored is None else ledger.picture(connection, stored.number, place_id)
 
     def thumbnail(self, place_id: str) -> bytes:
         """A small JPEG of a place.
 
         Raises:
-            UnknownPlace, NoThumbnail.
+            UnknownPlace: there is no such place.
+            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            StorageFailure: the picture is damaged.
+            MemoryError: its pixels do not fit into memory.
         """
         with self._reading() as connection:
             stored = ledger.expect(connection, place_id)
-            kept = ledger.picture(connection, stored.number)
-        return small_picture(stored.place, kept)
+            kept = ledger.picture(connection, stored.number, place_id)
+        if kept is None:
+            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+        if stored.place.picture == "thumbnail":
+            return kept
+        try:
+            return encode_thumbnail(decode(kept, _ANY_SIZE))
+        except InvalidImage as error:
+            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
 
-    def verify(self, progress: Progress = untold) -> VerifyReport:
-        """Read all of the map again and check it; writes and searches go on meanwhile.
+    def verify(self, progress: Progress = no_progress) -> VerifyReport:
+        """Read all files of the map again and check them; writes and searches go on meanwhile.
 
-        The report is of the moment of the call.  Damage is reported, not quarantined: what is
-        served is in memory and passed its checks when it was read.
+        The report is about the moment of the call.  A damaged map is reported but not quarantined, because what is
+        searched is in memory and passed its checks when it was read.
         """
         with ExitStack() as stack:
             with self._lock:
                 snapshot = self.snapshot()
                 connection = stack.enter_context(self._reading())
                 connection.execute("BEGIN")
-                connection.execute("SELECT id FROM map").fetchall()  # this is when the transaction begins to see
+                connection.execute("SELECT id FROM map").fetchall()  # a transaction sees the moment of its first read
             return inspect(self._folder, connection, snapshot, progress)

@@ -1,6 +1,6 @@
-"""From a map's folder to a map in memory, and the folder of a new map.
+"""Opening a map: from its folder to a snapshot in memory; and making the folder of a new map.
 
-What SQLite names is checked against the segment files; nothing that fails a checksum is served.
+What SQLite says is checked against the segment files, and a map of which anything fails its checksum is not served.
 """
 
 from __future__ import annotations
@@ -17,62 +17,66 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
+from core.disk.sqlite_file import transaction
 from core.index import Codes, CodeTable
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Whereabouts
-from core.places import Pose, microseconds
-from core.storage.database import ledger
-from core.storage.database import row_checksums as seals
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
+from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
-from core.storage.database.schema import NO_SEQUENCE, check_schema, cut_sequences, migrate, misfiled, refile
-from core.storage.database.segment_table import NamedSegment, named_segments
+from core.storage.database.ledger import SegmentEntry, segment_entries
+from core.storage.database.schema import (
+    NO_SEQUENCE,
+    check_schema,
+    migrate,
+    rebuild_metadata_index,
+    stale_metadata_index,
+    wrong_sequence_ends,
+)
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.arrays import StaleArrays
-from core.storage.files.disk import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.storage.files.row_formats import HALF
-from core.storage.files.row_reader import Shelf
+from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
-from core.storage.patches import complaint
-from core.storage.reclaiming import Remains, clear_folder
-from core.storage.records import MapRecord
+from core.storage.records import MapRecord, validation_message
+from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.segment import Held, Segment, flat_index, vectors
+from core.storage.search.segment import Held, Location, Segment, flat_index, vectors
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.spots import Spot
 from core.storage.search.tiers import tier_for
 
 log = logging.getLogger(__name__)
 
 UNLISTED = ".unlisted-"
-"""Before the id, names the folder of a map that is being made; no map id begins with a dot."""
+"""Prefix of the folder of a map that is being built; no map id begins with a dot."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenMap:
-    """A map in use."""
+    """A map that was read from disk, and what is needed to read and write it."""
 
     record: MapRecord
     layout: Layout
     database: Database
-    shelf: Shelf
+    row_reader: RowReader
     files: IndexFiles
-    remains: Remains
+    removed_segments: RemovedSegments
 
 
-def spot_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Spot:
-    """A place as the snapshot knows it."""
+def location_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Location:
+    """The pose, sequence and time of a place as the snapshot holds them."""
     timestamp = NO_TIME if moment is None else microseconds(moment)
     if pose is None:
-        return Spot(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
+        return Location(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
     x, y, z = pose.position().tolist()
     kind = METRIC if pose.kind() == "metric" else GEOGRAPHIC
     heading = nan if pose.heading is None else pose.heading
-    return Spot(kind, (x, y, z), sequence, ordinal, heading, timestamp)
+    return Location(kind, (x, y, z), sequence, ordinal, heading, timestamp)
 
 
 def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> None:
-    """Make ``folder`` and in it an empty map, synced except for the folder's own name.
+    """Make ``folder`` with an empty map in it, durable except for the folder's own name.
 
     Raises:
         OSError, sqlite3.Error: the disk refuses.
@@ -81,48 +85,47 @@ def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> Non
     connection = connect(folder / FILE, create=True)
     try:
         migrate(connection, create=True)
-        connection.execute("BEGIN IMMEDIATE")
-        ledger.insert_record(connection, record, rows_per_segment)
-        connection.execute("COMMIT")
+        with transaction(connection):
+            ledger.insert_record(connection, record, rows_per_segment)
     finally:
-        connection.close()  # the log goes into the file and is removed
+        connection.close()  # SQLite moves its log into the file and deletes it
     sync_file(folder / FILE)
     sync_folder(folder)
 
 
 def read_layout(connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
-    """The map's record and what its segment files have in common.
+    """The map's record and the layout of its segment files.
 
     Raises:
-        Damage: the record makes no sense.
+        Damage: the record is invalid.
     """
     try:
         record, rows_per_segment = ledger.read_record(connection)
         return record, Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
     except ValueError as error:
-        raise Damage(f"map.sqlite: the map's own record cannot be read: {complaint(error)}") from error
+        raise Damage(f"map.sqlite: the map's own record cannot be read: {validation_message(error)}") from error
 
 
 def _adopt(folder: Path, connection: sqlite3.Connection) -> tuple[MapRecord, Layout]:
     record, layout = read_layout(connection)
     if record.id != folder.name.removeprefix(UNLISTED):
-        raise Damage(f"{FILE}: it is that of the map {record.id!r}")
+        raise Damage(f"{FILE}: it belongs to the map {record.id!r}")
     return record, layout
 
 
 def _check_files(folder: Path) -> None:
     if not (folder / FILE).is_file():
-        folder.stat()  # a folder that is out of reach is no damage: it may come back
+        folder.stat()  # a folder that cannot be reached is no damage: its disk may come back
         raise Damage(f"{FILE} is missing")
     check_log(folder / f"{FILE}-wal")
 
 
 def read_record(folder: Path) -> tuple[MapRecord, int]:
-    """The record of a map that is not opened yet, and how many places it has; an older file is migrated.
+    """The record of a map and how many places it has, without its places; an older database is migrated.
 
     Raises:
         DataDirectoryTooNew: a later version wrote it.
-        Damage: it is not a map, or not the one its folder names.
+        Damage: it is not a map, or another one than its folder says.
         sqlite3.Error: it cannot be read.
     """
     _check_files(folder)
@@ -133,31 +136,31 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
         (places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         return _adopt(folder, connection)[0], int(places)
     except sqlite3.OperationalError as error:
-        if primary_code(error) == sqlite3.SQLITE_ERROR:  # SQL that suits our tables does not suit these
+        if primary_code(error) == sqlite3.SQLITE_ERROR:  # our statements do not fit its tables
             raise Damage(f"{FILE}: {error}") from error
         raise
     finally:
         connection.close()
 
 
-def _load_segment(folder: Path, layout: Layout, named: NamedSegment, checksums: NDArray[np.uint32]) -> Held:
-    """The descriptors of a segment, every one of them checked; ``checksums`` are what SQLite names of its rows."""
-    index = flat_index(named.rows, layout.dimension, layout.precision == HALF)
-    local = np.zeros((named.rows, *layout.local_shape), dtype=np.int8)
+def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: NDArray[np.uint32]) -> Held:
+    """The descriptors of a segment, each of them checked; ``checksums`` are those that SQLite has of its rows."""
+    index = flat_index(entry.rows, layout.dimension, layout.precision == HALF)
+    local = np.zeros((entry.rows, *layout.local_shape), dtype=np.int8)
     target, filled = vectors(index), 0
-    for records in descriptors.read_checked(folder, layout, named.number, named.rows, named.checksum):
+    for records in descriptors.read_checked(folder, layout, entry.number, entry.rows, entry.checksum):
         part = slice(filled, filled + len(records))
         foreign = (checksums[part] != 0) & (checksums[part] != records["checksum"])
         for offset in np.flatnonzero(foreign)[:1].tolist():
             row = int(records["row"][offset])
-            raise Damage(f"{descriptors.segment_name(named.number)}: row {row} is of another frame")
+            raise Damage(f"{descriptors.segment_name(entry.number)}: row {row} is of another frame")
         target[part], local[part] = layout.descriptors_of(records), layout.locals_of(records)
         filled += len(records)
     return Held(index, local)
 
 
-def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable | None:
-    """The codes of the first groups that have good files; None without any, and where no code can be made sense of."""
+def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable | None:
+    """The codes of the first groups of segments that have good files; None if there is no coder."""
     try:
         coder = files.read_coder()
     except StaleArrays:
@@ -165,7 +168,7 @@ def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable |
     parts = []
     with suppress(StaleArrays):
         group = 0
-        while of_group := files.named_group(named, group):
+        while of_group := files.group_entries(entries, group):
             parts.append(files.read_codes(coder, of_group))
             group += 1
     if not parts:
@@ -181,34 +184,39 @@ def _load_codes(files: IndexFiles, named: Sequence[NamedSegment]) -> CodeTable |
 
 
 def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
-    """All rows of a small map and their indexes, but for the pictures, which are checked as they are read."""
+    """Check all rows of a small map and their indexes; pictures are checked when they are read."""
     for table in ("places", "place_values", "sequences"):
         ((line,),) = connection.execute(f"PRAGMA integrity_check({table})").fetchmany(1)
         if line != "ok":
             raise Damage(f"{FILE}: {line}")
-    if broken := seals.broken(connection, "places"):
+    if broken := row_checksums.mismatched(connection, "places"):
         raise Damage(f"{FILE}: place {broken[0]!r} does not match its checksum")
-    if found := cut_sequences(connection):
+    if found := wrong_sequence_ends(connection):
         raise Damage(f"{FILE}: {found[0]}")
-    if found := misfiled(connection):  # the places themselves are sound, and tell what this must be
-        log.warning("The metadata of map %s is filed anew: %s.", folder.name, found[0])
-        refile(connection)
+    if found := stale_metadata_index(connection):  # it can be made again from the places, which are sound
+        log.warning("The index of the metadata of map %s is rebuilt: %s.", folder.name, found[0])
+        rebuild_metadata_index(connection)
 
 
 def read_snapshot(
-    folder: Path, layout: Layout, connection: sqlite3.Connection, record: MapRecord, shelf: Shelf, files: IndexFiles
+    folder: Path,
+    layout: Layout,
+    connection: sqlite3.Connection,
+    record: MapRecord,
+    row_reader: RowReader,
+    files: IndexFiles,
 ) -> Snapshot:
-    """All that is searched, from disk.
+    """The snapshot of a map, read from disk.
 
-    The descriptors of a small map are read and checked.  Those of a larger one stay where they are and are checked
-    as they are read; here it is seen to it that their files are there, those of this map, and long enough.
+    The descriptors of a small map are read and checked.  Those of a larger map stay on disk and are checked when they
+    are read; here it is only checked that their files are there, belong to this map, and are long enough.
 
     Raises:
         Damage: SQLite and the segment files do not agree, or a checksum fails.
         OSError, sqlite3.Error: the disk refuses.
     """
-    named = named_segments(connection, layout)
-    total = sum(segment.rows for segment in named)
+    entries = segment_entries(connection, layout)
+    total = sum(segment.rows for segment in entries)
     columns = read_columns(connection, total)
     whereabouts = Whereabouts(
         np.full(total, NO_POSE, np.int8),
@@ -220,21 +228,21 @@ def read_snapshot(
         getattr(whereabouts, name)[columns.rows] = column
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
-    table = _load_codes(files, named)
+    table = _load_codes(files, entries)
     tier = tier_for(record.index, len(columns.rows), "exact" if table is None else "compact")
     holds = tier == "exact"
     segments = []
-    for segment in named:
+    for segment in entries:
         first = segment.number * layout.rows_per_segment
         part = slice(first, first + segment.rows)
         there = Whereabouts(**{name: column[part] for name, column in vars(whereabouts).items()})
         if segment.removed:
             if alive[part].any():
-                raise Damage(f"{FILE}: segment {segment.number + 1} is said to be removed, but has places")
+                raise Damage(f"{FILE}: segment {segment.number + 1} is recorded as removed, but has places")
             segments.append(Segment(None, first, there, alive[part], checksums[part], removed=True))
             continue
         if not holds:
-            shelf.check(segment.number, segment.rows)
+            row_reader.check(segment.number, segment.rows)
         held = _load_segment(folder, layout, segment, checksums[part]) if holds else None
         segments.append(Segment(held, first, there, alive[part], checksums[part]))
     if holds:
@@ -242,13 +250,13 @@ def read_snapshot(
     lists = None
     if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
         with suppress(StaleArrays):
-            lists, _ = files.read_lists(table.coder, len(table), named)
+            lists, _ = files.read_lists(table.coder, len(table), entries)
     return Snapshot(
         layout.dimension,
         layout.rows_per_segment,
         tuple(segments),
         layout.local_shape,
-        shelf,
+        row_reader,
         None if holds else table,
         lists,
         holds,
@@ -257,9 +265,9 @@ def read_snapshot(
 
 
 def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
-    """Open a map for use, and clear away what a crash left unfinished.
+    """Open a map for use, and delete what a crash left unfinished.
 
-    The snapshot is the caller's alone: its memory is free again when later ones hold less.
+    The snapshot is returned apart from the rest, so that its memory can be freed when a later one takes its place.
 
     Raises:
         DataDirectoryTooNew: a later version wrote it.
@@ -271,26 +279,26 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     try:
         with database.reading() as connection:
             record, layout = _adopt(folder, connection)
-            shelf, files = Shelf(folder, layout), IndexFiles(folder, layout)
-            snapshot = read_snapshot(folder, layout, connection, record, shelf, files)
-            clear_folder(folder, named_segments(connection, layout))
+            row_reader, files = RowReader(folder, layout), IndexFiles(folder, layout)
+            snapshot = read_snapshot(folder, layout, connection, record, row_reader, files)
+            clear_folder(folder, segment_entries(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
-        sync_folder(folder)  # SQLite has made the name of its log
-        # Earlier versions kept the descriptors of full segments a second time, for FAISS to read.
+        sync_folder(folder)  # the name of SQLite's log
+        # Earlier versions stored the descriptors of full segments twice, for FAISS.
         for superfluous in (*folder.glob(f"*{TEMPORARY}"), *folder.glob("index-*.faiss")):
             superfluous.unlink()
     except sqlite3.OperationalError as error:
         database.close()
-        if primary_code(error) == sqlite3.SQLITE_ERROR:  # SQL that suits our tables does not suit these
+        if primary_code(error) == sqlite3.SQLITE_ERROR:  # our statements do not fit its tables
             raise Damage(f"map.sqlite: {error}") from error
         raise
     except ValueError as error:
         database.close()
-        raise Damage(f"map.sqlite: {complaint(error)}") from error
-    except TypeError as error:  # a value is missing where the tables allow none
+        raise Damage(f"map.sqlite: {validation_message(error)}") from error
+    except TypeError as error:  # NULL where the tables allow none
         database.close()
-        raise Damage(f"{FILE}: a value makes no sense: {error}") from error
+        raise Damage(f"{FILE}: a value is invalid: {error}") from error
     except BaseException:
         database.close()
         raise
-    return OpenMap(record, layout, database, shelf, files, Remains(folder, layout)), snapshot
+    return OpenMap(record, layout, database, row_reader, files, RemovedSegments(folder, layout)), snapshot

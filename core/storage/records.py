@@ -1,15 +1,17 @@
-"""What goes into a map and what comes out of it, as plain typed values."""
+"""The values that go into a map and come out of it, and merge patches (RFC 7396) of places and of a map's record."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from core.errors import InvalidField
 from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Timestamp
 from core.storage.files.row_formats import Precision
@@ -67,7 +69,7 @@ class MapRecord(MapSettings):
         return self.local_cells, self.local_values
 
     def settings(self) -> MapSettings:
-        """The part that its owner chose."""
+        """The settings that its owner chose."""
         return MapSettings.model_validate(self.model_dump(include=set(MapSettings.model_fields)))
 
 
@@ -84,11 +86,12 @@ class SequenceSummary(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Enrolment:
-    """One frame to be remembered.
+    """One frame to be stored as a place.
 
-    descriptor, local: float32 [D] and int8 [C, L] of the map's encoder; [0, 0] where it has no second stage.
+    descriptor, local: float32 [D] and int8 [C, L], made by the map's encoder; local is [0, 0] without a second stage.
+    regions: how many regions of interest the frame has.
     digest: SHA-256 of the image's bytes, 32 bytes.
-    thumbnail, image: JPEG made from the frame, and the bytes as received; the map keeps what it is set to keep.
+    thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
     """
 
     id: str
@@ -103,7 +106,7 @@ class Enrolment:
 
 @dataclass(frozen=True)
 class SameFrame:
-    """Other fields for a place, if it still shows the frame of this digest; its descriptor need not be sent again."""
+    """New fields for a place that still shows the frame with this digest; the frame need not be encoded again."""
 
     id: str
     fields: PlaceFields
@@ -112,10 +115,10 @@ class SameFrame:
 
 @dataclass(frozen=True)
 class History:
-    """What a place brings along from another map besides its frame and fields.
+    """What is copied of a place from another map besides its frame and fields.
 
-    picture: what is kept of its frame there.
-    ordinal: its order in its sequence here; None puts it at the end.
+    picture: what is kept of its frame.
+    ordinal: its position in its sequence in the new map; None puts it at the end.
     """
 
     picture: Keep
@@ -133,3 +136,80 @@ class VerifyReport(BaseModel):
     checked_bytes: int = Field(ge=0, description="Bytes of descriptors, pictures and caches that were read again.")
     problems: list[str] = Field(description="Each names a file and what is damaged in it.")
     stale_caches: list[str] = Field(description="Index files that are missing or damaged; rebuilt at the next start.")
+
+
+MOST_FAULTS = 10
+"""Invalid values that an error message describes; further ones are only counted."""
+
+MOST_LISTED = 1000
+"""With more invalid values a message only counts them, because pydantic can only describe all of them at once."""
+
+
+def merge_patch(target: Any, patch: Any) -> Any:
+    """Apply a JSON merge patch (RFC 7396): objects are merged by member, null removes a member, all else replaces.
+
+    Neither argument is changed.
+    """
+    if not isinstance(patch, Mapping):
+        return patch
+    merged = dict(target) if isinstance(target, Mapping) else {}
+    for name, value in patch.items():
+        if value is None:
+            merged.pop(name, None)
+        else:
+            merged[name] = merge_patch(merged.get(name), value)
+    return merged
+
+
+def validation_message(error: ValueError) -> str:
+    """The first invalid values of many, on one line."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    if (count := error.error_count()) > MOST_LISTED:
+        return f"{count} values are invalid"
+    parts = []
+    for fault in error.errors(include_url=False, include_context=False, include_input=False)[:MOST_FAULTS]:
+        where = ".".join(str(step) for step in fault["loc"])
+        parts.append(f"{where}: {fault['msg']}" if where else fault["msg"])
+    if count > MOST_FAULTS:
+        parts.append(f"and {count - MOST_FAULTS} more")
+    return "; ".join(parts)
+
+
+def patched_fields(fields: PlaceFields, changes: Mapping[str, Any]) -> PlaceFields:
+    """``fields`` after a merge patch.
+
+    Raises:
+        InvalidField: the result is not valid for a place, or the patch is no object.
+    """
+    if not isinstance(changes, Mapping):
+        raise InvalidField("A patch is a JSON object.")
+    if "camera" in changes:
+        raise InvalidField("The camera of a place cannot be changed: send its frame again.")
+    document = fields.model_dump(include=set(PlaceFields.model_fields), exclude={"pose"})
+    if fields.pose is not None:
+        document["pose"] = fields.pose.model_dump(exclude_none=True)
+    try:
+        return PlaceFields.model_validate(merge_patch(document, changes))
+    except ValidationError as error:
+        raise InvalidField(f"The place cannot be changed like this: {validation_message(error)}.") from error
+    except RecursionError as error:
+        raise InvalidField("The patch is nested too deeply.") from error
+
+
+def patched_record(record: MapRecord, changes: Mapping[str, Any]) -> MapRecord:
+    """``record`` with other settings or another calibration (None: use that of its encoder).
+
+    Each value given replaces the present one; settings cannot be removed.
+
+    Raises:
+        InvalidField: a field is unknown or fixed, or its value is not allowed.
+    """
+    if not isinstance(changes, Mapping):
+        raise InvalidField("The changes of a map are a JSON object.")
+    if fixed := set(changes) - set(MapSettings.model_fields) - {"calibration"}:
+        raise InvalidField(f"These cannot be changed: {', '.join(sorted(map(str, fixed)))}.")
+    try:
+        return MapRecord.model_validate({**record.model_dump(), **changes})
+    except ValidationError as error:
+        raise InvalidField(f"The map cannot be changed like this: {validation_message(error)}.") from error

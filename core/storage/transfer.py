@@ -1,30 +1,29 @@
-"""Places from one map to another, with all that is kept of them, and the removal of many at once."""
+"""Copying places from one map to another with their history, and deleting many places at once."""
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from core.errors import StorageFailure
 from core.places import Place
 from core.storage.cameras import Access
 from core.storage.database import ledger
-from core.storage.records import Change, Enrolment, History, Keep, SameFrame
-from core.storage.writing import Write, check_enrolment
+from core.storage.records import Enrolment, History, Keep
+from core.storage.writing import Write
 
 
 @dataclass(frozen=True)
 class Outline:
-    """A place in brief: enough to see whether two maps hold the same.
+    """A place in brief: enough to see whether two maps hold the same place in the same state.
 
     number: grows in the order of enrolment.
     row: of its descriptor.
-    digest: SHA-256 of its image.
-    ordinal: its order in its sequence.
+    digest: SHA-256 of its image, 32 bytes.
+    picture: what is kept of its frame.
+    ordinal: its position in its sequence.
     """
 
     number: int
@@ -38,7 +37,7 @@ class Outline:
     updated_at: str
 
     def same_as(self, other: Outline) -> bool:
-        """Whether the two tell of the same place in the same state, in whatever maps."""
+        """Whether both are the same place in the same state; they may be of different maps."""
         return self.same_frame(other) and (self.sequence, self.ordinal, self.updated_at) == (
             other.sequence,
             other.ordinal,
@@ -57,12 +56,13 @@ _OUTLINE = (
 
 
 class Transfer:
-    """What a map gives to another and takes from it; from any thread.
+    """Reads, copies and deletes many places of one map at once.  Any thread may use it.
+
+    Every method may raise what ``reading`` and ``writing`` raise.
 
     Args:
-        reading, writing: give a connection to the map's database and a write to the map.  What both raise is
-            raised here.
-        lock: that of the one who writes.
+        reading, writing: open a connection to the map's database, and begin a write to the map.
+        lock: is held during every write to the map.
     """
 
     def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write], lock: threading.RLock) -> None:
@@ -74,60 +74,27 @@ class Transfer:
             return [Outline(*values) for values in connection.execute(_OUTLINE).fetchall()]
 
     def count_without_image(self) -> int:
-        """How many places keep no image."""
+        """How many places keep no original image."""
         with self._reading() as connection:
             (count,) = connection.execute("SELECT count(*) FROM places WHERE picture != 'image'").fetchone()
         return int(count)
 
     def sequence_ends(self) -> dict[str | None, int]:
-        """The ordinal that the next place of each sequence would get; None for the places without one."""
+        """The ordinal that the next place of each sequence will get; the key None is for places without a sequence."""
         with self._reading() as connection:
             return dict(connection.execute("SELECT name, next_ordinal FROM sequences").fetchall())
 
     def find(self, place_ids: Sequence[str]) -> dict[str, tuple[Place, int]]:
-        """Those of the places that there are, each with the row of its descriptor."""
+        """Places by id, each with its descriptor row; ids that do not exist are left out."""
         with self._reading() as connection:
             found = [ledger.find(connection, place_id) for place_id in place_ids]
         return {stored.place.id: (stored.place, stored.row) for stored in found if stored is not None}
 
-    def picture(self, place_id: str) -> bytes | None:
-        """What is kept of a place's frame, as its ``picture`` says; None if it is gone or keeps none.
-
-        Raises:
-            StorageFailure: it is damaged.
-        """
-        with self._reading() as connection:
-            stored = ledger.find(connection, place_id)
-            kept = None if stored is None else ledger.picture(connection, stored.number)
-        if kept is None:
-            return None
-        if hashlib.sha256(kept[0]).digest() != kept[1]:
-            raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
-        return kept[0]
-
-    def enrol(self, items: Sequence[Enrolment | SameFrame]) -> list[tuple[Place, Change] | None]:
-        """Like :meth:`core.storage.Map.enrol`, with places among them whose frame is known to be there already.
-
-        All in one COMMIT, in the order given, which is their order in their sequences.
-
-        Returns:
-            None for a place that shows another frame by now, or is gone: nothing is done about it.
-
-        Raises:
-            As :meth:`core.storage.Map.enrol`.
-        """
-        with self._writing() as write:
-            for item in items:
-                if isinstance(item, Enrolment):
-                    check_enrolment(item, write.record.dimension, write.record.local_shape)
-            write.expect(sum(isinstance(item, Enrolment) for item in items))
-            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
-
     def adopt(self, items: Sequence[tuple[Enrolment, History]]) -> None:
-        """Take places of another map, all of them or, if this raises, none.
+        """Store places of another map with their history, all of them or, if this raises, none.
 
         Raises:
-            ValueError: descriptors of the wrong kind.
+            ValueError: a descriptor is of the wrong kind.
             InvalidField, StorageFull, StorageFailure.
         """
         if items:
@@ -137,10 +104,10 @@ class Transfer:
                     write.adopt(item, history)
 
     def forget(self, frames: Mapping[str, bytes]) -> int:
-        """Delete places, all in one COMMIT; those that are gone or show another frame by now are left alone.
+        """Delete places in one COMMIT, except those that show another frame by now.
 
         Args:
-            frames: SHA-256 of its image by the id of each place.
+            frames: by the id of each place, the SHA-256 of its image.
 
         Returns:
             How many were deleted.
@@ -157,7 +124,7 @@ class Transfer:
         return count
 
     @contextmanager
-    def quiet(self) -> Iterator[None]:
-        """No other thread writes to the map within."""
+    def paused_writes(self) -> Iterator[None]:
+        """No other thread writes to the map during the block."""
         with self._lock:
             yield

@@ -1,4 +1,4 @@
-"""Reading all of a map again: does the disk still hold what was acknowledged?"""
+"""Reading all files of a map again to see whether the disk still holds what was written."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.database import row_checksums as seals
+from core.disk.files import Damage
+from core.storage.database import row_checksums
 from core.storage.database.columns import read_columns
-from core.storage.database.connections import FILE, connect, connect_aside
+from core.storage.database.connections import FILE, connect, connect_without_log
+from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.database.schema import check_schema, contradictions
-from core.storage.database.segment_table import NamedSegment, named_segments
 from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage
 from core.storage.files.segment_files import Layout
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
@@ -27,19 +27,19 @@ from core.storage.search.indexing import tier_of
 from core.storage.search.segment import Segment, vectors
 from core.storage.search.snapshot import Snapshot
 
-_NAMED = 10  # of the rows of one kind of damage, so many are told one by one
+_MOST_LISTED = 10  # damaged rows of one kind that are listed one by one; further ones are counted
 
 
 Progress = Callable[[int, int], None]
-"""Told of rows done and of all; what it raises ends the reading."""
+"""Is called with the rows done and all rows; what it raises ends the work."""
 
 
-def untold(done: int, total: int) -> None:
-    """Nobody is told."""
+def no_progress(done: int, total: int) -> None:
+    """Ignore the progress."""
 
 
 class _Findings:
-    def __init__(self, progress: Progress = untold) -> None:
+    def __init__(self, progress: Progress = no_progress) -> None:
         self.progress = progress
         self.problems: list[str] = []
         self.stale_caches: list[str] = []
@@ -49,7 +49,7 @@ class _Findings:
 
     @contextmanager
     def noting(self) -> Iterator[None]:
-        """A step that cannot be finished is a finding; the next one is taken all the same."""
+        """Note an error that ends the block as a problem, and go on after it."""
         try:
             yield
         except (Damage, OSError) as damage:
@@ -68,16 +68,16 @@ class _Findings:
         )
 
 
-def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
-    """Check a map that is out of service; a log that is damaged is reported, left aside and kept as it is."""
+def inspect_folder(folder: Path, progress: Progress = no_progress) -> VerifyReport:
+    """Check a map that is out of service; a damaged log is reported, ignored and left as it is."""
     findings = _Findings(progress)
     is_log_sound = False
     with findings.noting():
         check_log(folder / f"{FILE}-wal")
         is_log_sound = True
     with findings.noting():
-        # SQLite would put what it can read of a damaged log into the file, and remove the log with all the rest.
-        connection = connect(folder / FILE) if is_log_sound else connect_aside(folder / FILE)
+        # SQLite would move what it can read of a damaged log into the file, and delete the rest with the log.
+        connection = connect(folder / FILE) if is_log_sound else connect_without_log(folder / FILE)
         try:
             check_schema(connection)
             report = inspect(folder, connection, None, progress)
@@ -90,36 +90,36 @@ def inspect_folder(folder: Path, progress: Progress = untold) -> VerifyReport:
 
 
 def inspect(
-    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = untold
+    folder: Path, connection: sqlite3.Connection, snapshot: Snapshot | None, progress: Progress = no_progress
 ) -> VerifyReport:
-    """Check a map's files against each other, and against ``snapshot`` if it is in service.
+    """Check a map's files against each other and, if the map is in service, against its snapshot.
 
-    Checked are: SQLite's integrity, every descriptor's checksum, the rows that places name, the
-    pictures' digests, the caches; and that what is searched is what is stored.
+    This checks SQLite's integrity, the checksums of rows and descriptors, the rows that places refer to, the digests of
+    pictures and the index files, and that the snapshot is what is stored.
 
     Args:
-        connection: in a transaction that sees the moment of the snapshot, which is ended before descriptors are
-            read: that takes long, and meanwhile SQLite's log could not be emptied.
-        snapshot: sees to it that none of its descriptors goes meanwhile.
-        progress: told while descriptors are read.
+        connection: in a transaction of the moment of the snapshot.  The transaction is ended before descriptors are
+            read, which takes long, because SQLite cannot empty its log while it lasts.
+        snapshot: also keeps the files of its descriptors from being deleted; None for a map that is out of service.
+        progress: is called while descriptors are read.
     """
     findings = _Findings(progress)
     with findings.noting():
         _check_tables(connection, findings)
     with findings.noting():
-        _check_seals(connection, findings)
+        _check_row_checksums(connection, findings)
     with findings.noting():
         findings.problems += [f"{FILE}: {found}" for found in contradictions(connection)]
     with findings.noting():
         _, layout = read_layout(connection)
-        segments = named_segments(connection, layout)
+        segments = segment_entries(connection, layout)
         findings.rows = sum(segment.rows for segment in segments)
         (findings.places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         with findings.noting():
             _check_pictures(connection, findings)
         if snapshot is not None:
             with findings.noting():
-                _check_spots(connection, snapshot, findings)
+                _check_locations(connection, snapshot, findings)
         query = "SELECT row, id, checksum FROM places"
         places = {row: (place, checksum) for row, place, checksum in connection.execute(query).fetchall()}
         if connection.in_transaction:
@@ -141,13 +141,13 @@ def _check_tables(connection: sqlite3.Connection, findings: _Findings) -> None:
         findings.problems.append(f"{FILE}: row {row} of {table} belongs to nothing in {parent}")
 
 
-def _check_seals(connection: sqlite3.Connection, findings: _Findings) -> None:
+def _check_row_checksums(connection: sqlite3.Connection, findings: _Findings) -> None:
     for table, kind in (("map", "map"), ("places", "place"), ("cameras", "camera")):
-        names = seals.broken(connection, table)
-        for name in names[:_NAMED]:
+        names = row_checksums.mismatched(connection, table)
+        for name in names[:_MOST_LISTED]:
             findings.problems.append(f"{FILE}: {kind} {name!r} does not match its checksum")
-        if len(names) > _NAMED:
-            findings.problems.append(f"{FILE}: so with {len(names) - _NAMED} more of {table}")
+        if len(names) > _MOST_LISTED:
+            findings.problems.append(f"{FILE}: the same is true of {len(names) - _MOST_LISTED} more rows of {table}")
 
 
 def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None:
@@ -157,13 +157,13 @@ def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None
     )
     for place, number, kind, source_digest, digest, size, camera in connection.execute(query).fetchall():
         if (kind == "none") != (size is None):
-            findings.problems.append(f"{FILE}: place {place!r} is said to keep {kind}, which is not so")
+            findings.problems.append(f"{FILE}: place {place!r} is recorded to keep {kind}, which is not true")
         if size is None:
             continue
         ((content,),) = connection.execute("SELECT bytes FROM pictures WHERE place = ?", (number,)).fetchall()
         findings.checked_bytes += size
         found = hashlib.sha256(content).digest()
-        # The digest of a place that a camera took is that of its image and of what was masked in it.
+        # The digest of a place with a camera covers its image and the camera's mask.
         if found != digest or (kind == "image" and camera is None and found != source_digest):
             findings.problems.append(f"{FILE}: the {kind} of place {place!r} does not match its digest")
 
@@ -172,43 +172,43 @@ def _check_descriptors(
     folder: Path,
     layout: Layout,
     places: dict[int, tuple[str, int]],
-    segments: list[NamedSegment],
+    segments: list[SegmentEntry],
     snapshot: Snapshot | None,
     findings: _Findings,
 ) -> None:
     for row, (place, _) in places.items():
         if row >= findings.rows:
             findings.problems.append(f"{FILE}: place {place!r} has row {row}, but there are {findings.rows}")
-    for named in segments:
-        findings.progress(named.number * layout.rows_per_segment, findings.rows)
+    for entry in segments:
+        findings.progress(entry.number * layout.rows_per_segment, findings.rows)
         with findings.noting():
-            _check_segment(folder, layout, named, places, snapshot, findings)
+            _check_segment(folder, layout, entry, places, snapshot, findings)
 
 
 def _check_segment(
     folder: Path,
     layout: Layout,
-    named: NamedSegment,
+    entry: SegmentEntry,
     places: dict[int, tuple[str, int]],
     snapshot: Snapshot | None,
     findings: _Findings,
 ) -> None:
-    row = named.number * layout.rows_per_segment
-    if named.removed:
-        for place in [places[one][0] for one in range(row, row + named.rows) if one in places][:_NAMED]:
-            findings.problems.append(f"{FILE}: the segment of place {place!r} is said to be removed")
+    row = entry.number * layout.rows_per_segment
+    if entry.removed:
+        for place in [places[one][0] for one in range(row, row + entry.rows) if one in places][:_MOST_LISTED]:
+            findings.problems.append(f"{FILE}: the segment of place {place!r} is recorded as removed")
         return
     damaged: list[int] = []
     foreign: list[int] = []
     differing: list[int] = []
     running = 0
-    searched = None if snapshot is None else snapshot.segments[named.number]
-    for records in descriptors.read_records(folder, layout, named.number, named.rows):
+    searched = None if snapshot is None else snapshot.segments[entry.number]
+    for records in descriptors.read_records(folder, layout, entry.number, entry.rows):
         damaged += descriptors.damaged_rows(layout, records, row)
-        running = descriptors.chain(records["checksum"], running)
-        named_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
-        for offset, (named_sum, record) in enumerate(zip(named_sums, records, strict=True), start=row):
-            if named_sum not in (None, record["checksum"]):
+        running = descriptors.segment_checksum(records["checksum"], running)
+        expected_sums = [places[offset][1] if offset in places else None for offset in range(row, row + len(records))]
+        for offset, (expected_sum, record) in enumerate(zip(expected_sums, records, strict=True), start=row):
+            if expected_sum not in (None, record["checksum"]):
                 foreign.append(offset)
         if searched is not None:
             differing += [row + offset for offset in _differing(searched, row - searched.first_row, layout, records)]
@@ -217,29 +217,29 @@ def _check_segment(
         findings.progress(row, findings.rows)
     for rows, what in (
         (damaged, "does not match its checksum"),
-        (foreign, f"is not the one that {FILE} names"),
+        (foreign, f"is not the one that {FILE} records"),
         (differing, "is not what is searched"),
     ):
-        name = descriptors.segment_name(named.number)
-        for found in rows[:_NAMED]:
-            whose = f"place {places[found][0]!r}" if found in places else "no place any more"
+        name = descriptors.segment_name(entry.number)
+        for found in rows[:_MOST_LISTED]:
+            whose = f"place {places[found][0]!r}" if found in places else "of no place"
             findings.problems.append(f"{name}: row {found} ({whose}) {what}")
-        if len(rows) > _NAMED:
-            findings.problems.append(f"{name}: so with {len(rows) - _NAMED} more rows")
-    if not damaged and running != named.checksum:
-        findings.problems.append(f"{descriptors.segment_name(named.number)}: its rows are not those that {FILE} names")
+        if len(rows) > _MOST_LISTED:
+            findings.problems.append(f"{name}: the same is true of {len(rows) - _MOST_LISTED} more rows")
+    if not damaged and running != entry.checksum:
+        findings.problems.append(f"{descriptors.segment_name(entry.number)}: its rows are not those in {FILE}")
 
 
 def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np.void]) -> list[int]:
-    """Which of the rows from ``start`` on are searched otherwise than they are stored.
+    """Which of the rows from ``start`` on differ between memory and disk.
 
-    Byte for byte, for a bit may be flipped that changes no comparison.  Of a segment on the shelf it is
-    its checksums in memory that count: whatever is read of it must have them.
+    Rows are compared byte for byte, because a flipped bit need not change a comparison of numbers.  Of a segment whose
+    descriptors stay on disk the checksums in memory are compared: whatever is read of it must match them.
     """
     rows = slice(start, start + len(records))
     if segment.held is None:
-        named = segment.checksums[rows]
-        return [int(offset) for offset in np.flatnonzero((named != 0) & (named != records["checksum"]))]
+        expected = segment.checksums[rows]
+        return [int(offset) for offset in np.flatnonzero((expected != 0) & (expected != records["checksum"]))]
     stored = zip(layout.descriptors_of(records), layout.locals_of(records), strict=True)
     held = zip(vectors(segment.index)[rows].astype(np.float32, copy=False), segment.local[rows], strict=True)
     return [
@@ -249,19 +249,19 @@ def _differing(segment: Segment, start: int, layout: Layout, records: NDArray[np
     ]
 
 
-def _check_spots(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
-    """Is what is searched what is stored: the same places, alive, at the same spots?"""
+def _check_locations(connection: sqlite3.Connection, snapshot: Snapshot, findings: _Findings) -> None:
+    """Check that the snapshot has the places that are stored, at the same locations."""
     columns = read_columns(connection, snapshot.rows)
     searched, stored = snapshot.whereabouts.take(columns.rows), columns.whereabouts
     same = snapshot.alive[columns.rows]
     for name, column in vars(stored).items():
         found = getattr(searched, name)
-        if name == "position":  # a point on the sphere may differ in its last bits
+        if name == "position":  # the computation of a point on the sphere may differ in its last bits
             same &= np.isclose(found, column, rtol=0, atol=1e-6).all(axis=1)
         else:
             same &= (found == column) | ((found != found) & (column != column))
     for row in columns.rows[~same].tolist():
-        findings.problems.append(f"row {row} is searched otherwise than {FILE} has it")
+        findings.problems.append(f"row {row} differs between what is searched and {FILE}")
     if snapshot.rows != findings.rows or len(snapshot) != len(columns.rows):
         told = f"{len(snapshot)} places in {snapshot.rows} rows are searched"
         findings.problems.append(f"{told}, {len(columns.rows)} in {findings.rows} are stored")

@@ -1,1 +1,1 @@
-"""Looking after a map: what its own descriptors and the answers it gave say about it.  No storage, no HTTP."""
+"""The upkeep of a map: what its own descriptors and its answers say about its weak points.  No storage, no HTTP."""

@@ -1,4 +1,4 @@
-"""Gaps along a sequence: steps from one frame to the next that are out of the ordinary for that sequence."""
+"""Gaps along a sequence: steps from one frame to the next that are unusually large for that sequence."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import NO_POSE, NO_TIME, Whereabouts
+from core.places import NO_POSE, NO_TIME, Whereabouts
 
 Measure = Literal["distance", "time", "similarity"]
 
 LONG = 3.0
-"""A step is a gap if it is so many times as long as the sequence's median step …"""
+"""A gap is more than this many times as long as the sequence's median step."""
 
 DEVIATIONS = 4.0
-"""… and so many standard deviations, as estimated from the median deviation, away from it."""
+"""A gap is also more than this many standard deviations longer than the median step."""
 
 TO_DEVIATION = 1.4826
-"""Of a normal distribution the standard deviation is so many times the median absolute deviation."""
+"""The standard deviation of a normal distribution is this many times its median absolute deviation."""
 
 FEWEST_STEPS = 5
-"""In a shorter sequence nothing is out of the ordinary."""
+"""A sequence with fewer known steps has no gaps."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """A step between two frames that follow each other.
+    """An unusual step between two consecutive frames.
 
-    before: position of the first of the two in its sequence.
-    measure: what is out of the ordinary: metres, seconds, or how alike the two look.
+    before: the position of the first of the two in its sequence.
+    measure: what is unusual: the distance in metres, the time in seconds, or the similarity of the two (their score).
     value, median: of this step, and of all steps of the sequence.
     """
 
@@ -41,51 +41,56 @@ class Gap:
 
     @property
     def severity(self) -> float:
-        """How many times the ordinary it is; at least 1."""
+        """How many times the median the step is (for similarity, the median divided by it); at least 1."""
         high, low = (self.median, self.value) if self.measure == "similarity" else (self.value, self.median)
         return max(1.0, high / max(low, 1e-9)) if high > 0 else 1.0
 
 
 def distances(where: Whereabouts) -> NDArray[np.float64]:
-    """Metres from each of n places to the next, float64 [n - 1]; NaN where one has no pose or poses differ in kind."""
+    """Metres from each of n places to the next, float64 [n - 1]; NaN without two poses of one kind."""
     steps = np.sqrt(np.square(np.diff(where.position, axis=0)).sum(axis=1))
     known = (where.kind[1:] == where.kind[:-1]) & (where.kind[1:] != NO_POSE)
     return np.where(known, steps, np.nan)
 
 
 def durations(where: Whereabouts) -> NDArray[np.float64]:
-    """Seconds from each of n places to the next, float64 [n - 1]; NaN where one has no time."""
+    """Seconds from each of n places to the next, float64 [n - 1]; NaN without two timestamps."""
     known = (where.timestamp[1:] != NO_TIME) & (where.timestamp[:-1] != NO_TIME)
     moments = np.where(where.timestamp == NO_TIME, 0, where.timestamp)
     return np.where(known, np.diff(moments) / 1e6, np.nan)
 
 
 def long_steps(steps: NDArray[np.float64], measure: Measure) -> list[Gap]:
-    """Steps that are much longer than the sequence's others.
+    """Find steps that are much longer than the others of the sequence.
 
     Args:
-        steps: float64 [n], not negative where known, NaN where not.
+        steps: float64 [n], not negative; NaN where not known.
+        measure: what the steps are.
     """
     known = steps[~np.isnan(steps)]
     if len(known) < FEWEST_STEPS:
         return []
     median, deviation = _spread(known)
-    if median <= 0:  # most frames stand still: only a jump from there would show, and every move is one
+    if median <= 0:  # the robot mostly stood still, so that every move would count as a gap
         return []
     least = max(LONG * median, median + DEVIATIONS * deviation)
     return [Gap(int(i), measure, float(steps[i]), median) for i in np.flatnonzero(steps > least)]
 
 
 def backward_steps(durations: NDArray[np.float64]) -> int:
-    """How many frames were taken before the one they follow: the order of enrolment is not that of time."""
+    """How many frames were taken earlier than the frame enrolled before them.
+
+    Args:
+        durations: float64 [n], seconds from each frame to the next.
+    """
     return int((durations < 0).sum())
 
 
 def unlike_steps(similarities: NDArray[np.float64]) -> list[Gap]:
-    """Steps between frames that look far less alike than is ordinary for the sequence.
+    """Find steps between frames that look far less alike than is usual for the sequence.
 
     Args:
-        similarities: float64 [n], scores; NaN where not known.
+        similarities: float64 [n], scores of consecutive frames; NaN where not known.
     """
     known = similarities[~np.isnan(similarities)]
     if len(known) < FEWEST_STEPS:
@@ -96,6 +101,6 @@ def unlike_steps(similarities: NDArray[np.float64]) -> list[Gap]:
 
 
 def _spread(values: NDArray[np.float64]) -> tuple[float, float]:
-    """The median, and a standard deviation that a few outliers do not change."""
+    """The median, and a standard deviation estimated from the median absolute deviation, robust to outliers."""
     median = float(np.median(values))
     return median, TO_DEVIATION * float(np.median(np.abs(values - median)))

@@ -1,4 +1,4 @@
-"""Answers week by week, and whether they drift: seasons, new shelves, a camera that was moved."""
+"""A map's answers week by week, and whether they drift: with the seasons, new furniture, a camera that was moved."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ import numpy as np
 from core.judgement.verdict import Verdict
 
 SCORE_BINS = 20
-"""Of equal width over the scores from 0 to 1; what lies outside counts in the first or last."""
+"""Bins of equal width for scores from 0 to 1; scores outside count in the first or last bin."""
 
 FEWEST_QUERIES = 20
-"""A week with fewer does not count in a trend."""
+"""A week with fewer queries does not count in a trend."""
 
 FEWEST_WEEKS = 4
-"""With fewer there is no trend."""
+"""With fewer weeks there is no trend."""
 
 SIGNIFICANT = 3.0
-"""A trend is told as drift when its slope is so many standard errors from zero."""
+"""A trend is reported as drift if its slope is this many standard errors from zero."""
 
 
 @dataclass(frozen=True)
 class Week:
-    """The answers of one week, from its Monday, by their verdicts, and sums over those in which anything was compared.
+    """Counts of the answers of one week, from its Monday, and sums over those with a score.
 
-    blank: of the unknown, those in which nothing could be compared.
-    bins: counts of the scores, from 0 to 1.
+    blank: how many of the unknown ones have no score: the frame had no region, or the map no place.
+    score, score_squares, decision, decision_squares: sums of scores, decision values and their squares.
+    bins: counts of the scores, by SCORE_BINS bins from 0 to 1.
     """
 
     monday: date
@@ -46,7 +47,7 @@ class Week:
 
     @classmethod
     def of(cls, monday: date, verdict: Verdict, score: float | None, decision: float | None) -> Week:
-        """A week with one answer; without a score nothing could be compared."""
+        """A week with one answer."""
         recognized, ambiguous, unknown = (int(verdict == each) for each in get_args(Verdict))
         if score is None:
             return cls(monday, recognized, ambiguous, unknown, blank=1)
@@ -58,24 +59,24 @@ class Week:
 
     @property
     def queries(self) -> int:
-        """How many answers there were."""
+        """How many answers there are."""
         return self.recognized + self.ambiguous + self.unknown
 
     @property
     def compared(self) -> int:
-        """In how many anything was compared."""
+        """How many answers have a score."""
         return self.queries - self.blank
 
     def mean_score(self) -> float | None:
-        """Mean of the best scores; None if there were none."""
+        """The mean of the best scores; None if there are none."""
         return self.score / self.compared if self.compared else None
 
     def mean_decision(self) -> float | None:
-        """Mean of the decision values; None if there were none."""
+        """The mean of the decision values; None if there are none."""
         return self.decision / self.compared if self.compared else None
 
     def unknown_rate(self) -> float | None:
-        """Share of the answers that were unknown; None if there were none."""
+        """The share of unknown answers; None if there are no answers."""
         return self.unknown / self.queries if self.queries else None
 
     def __add__(self, other: Week) -> Week:
@@ -115,14 +116,14 @@ class Trend:
 
 
 def trend(moments: Sequence[float], means: Sequence[float], variances: Sequence[float]) -> Trend | None:
-    """The weighted least-squares line through means; None with fewer than four.
+    """Fit a line to the weeks' means by weighted least squares; None with fewer than FEWEST_WEEKS weeks.
 
-    The standard error takes what the means scatter about the line, where that is more than their own variances say:
-    weeks differ by more than by chance.
+    If the means scatter about the line by more than their variances explain, the standard error grows accordingly, as
+    weeks differ by more than chance.
 
     Args:
-        moments: of the n weeks, counted in weeks.
-        means, variances: of each week, and of that mean; a variance is positive.
+        moments: of the n weeks, in weeks.
+        means, variances: the mean of each week, and the variance of that mean, over 0.
     """
     if len(moments) < FEWEST_WEEKS:
         return None
@@ -140,7 +141,7 @@ def trend(moments: Sequence[float], means: Sequence[float], variances: Sequence[
 
 
 def score_trend(weeks: Sequence[Week]) -> Trend | None:
-    """How the mean of the best scores changes from week to week."""
+    """The trend of the mean of the best scores, per week."""
     used = [week for week in weeks if week.compared >= FEWEST_QUERIES]
     means = [week.score / week.compared for week in used]
     variances = [
@@ -151,9 +152,9 @@ def score_trend(weeks: Sequence[Week]) -> Trend | None:
 
 
 def unknown_trend(weeks: Sequence[Week]) -> Trend | None:
-    """How the share of unknown answers changes from week to week."""
+    """The trend of the share of unknown answers, per week."""
     used = [week for week in weeks if week.queries >= FEWEST_QUERIES]
-    # One of each is added (Agresti and Coull's way), or a week without any unknown would count for everything.
+    # One answer of each kind is added (after Agresti and Coull): a week without unknown ones would have no variance.
     rates = [(week.unknown + 1) / (week.queries + 2) for week in used]
     variances = [rate * (1 - rate) / week.queries for rate, week in zip(rates, used, strict=True)]
     return trend(_moments(used), rates, variances)

@@ -1,4 +1,4 @@
-"""Places that their neighbours stand in for, and what leaving them out costs in recall."""
+"""Redundant places, which look like a neighbour, and what removing them costs in recall."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from core.judgement.verdict import NO_POSE, Neighborhood, Whereabouts
+from core.places import NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 
 MOST_NEIGHBOURS = 32
-"""A place is held against so many of its nearest at most: where a robot stood still, pairs would be without number."""
+"""A place is compared with at most this many of its nearest: where a robot stood still, there are too many pairs."""
 
 
 def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
-    """Pairs of places that are the same place (``Whereabouts.near``), each once, the lesser first: int64 [m, 2]."""
+    """Pairs of frames of the same place (``Whereabouts.near``), each once, the lower first: int64 [m, 2]."""
     pairs: list[NDArray[np.int64]] = [np.empty((0, 2), np.int64)]
     for kind in np.unique(where.kind[where.kind != NO_POSE]):
         members = np.flatnonzero(where.kind == kind)
         count = min(len(members), MOST_NEIGHBOURS + 1)
         tree = cKDTree(where.position[members])
-        # The tree's own bound is exclusive, and rounded; places at exactly the radius are near.
+        # The tree's bound is exclusive and rounded, but places at exactly the radius are near.
         bound = 1.001 * neighborhood.radius + 1e-6
         apart, found = tree.query(where.position[members], k=[*range(1, count + 1)], distance_upper_bound=bound)
         first = np.repeat(np.arange(len(members)), count)
@@ -36,7 +36,7 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
 
 
 def _along_sequences(where: Whereabouts, frames: int) -> list[NDArray[np.int64]]:
-    """Pairs of one sequence, so many frames apart at most, that have no poses of one kind to go by."""
+    """Pairs of one sequence, at most ``frames`` apart, that do not both have poses of one kind."""
     pairs = []
     reach = min(frames, MOST_NEIGHBOURS // 2)
     order = np.lexsort((where.ordinal, where.sequence))
@@ -58,19 +58,21 @@ def thinned(
     least: float,
     free: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """The places to keep, so that each that goes has a kept one that is the same place and looks alike.
+    """Choose the places to keep, such that every removed one has a kept neighbour of the same place that looks alike.
 
-    Greedy: places go one after the other, those with the most alike neighbour first, each only if it has a kept
-    neighbour that stands in for it, and if all that it stands in for have another one.
+    The choice is greedy: places are considered by the similarity of their most similar neighbour, highest first.  A
+    place is removed if it has a kept neighbour that replaces it, and if every removed place that it replaces has
+    another.
 
     Args:
-        pairs: int64 [m, 2], of places that are the same place, each pair once.
-        similarity: float32 [m], score of each pair.
-        least: the score from which on one stands in for the other.
-        free: bool [places], those that may go; None: all.
+        places: number of places.
+        pairs: int64 [m, 2], frames of the same place, each pair once.
+        similarity: float32 [m], the score of each pair.
+        least: the score from which one of a pair replaces the other.
+        free: bool [places], which may be removed; None: all.
 
     Returns:
-        bool [places].
+        bool [places], which are kept.
     """
     may_go = np.ones(places, np.bool_) if free is None else free
     kept = np.ones(places, np.bool_)
@@ -81,7 +83,7 @@ def thinned(
             near[a].append(b)
             near[b].append(a)
             best[a], best[b] = max(best[a], score), max(best[b], score)
-    stand_ins = [len(others) for others in near]  # of each place, those that are kept
+    stand_ins = [len(others) for others in near]  # of each place, how many kept neighbours replace it
     for place in np.argsort(-best, kind="stable").tolist():
         if not (may_go[place] and stand_ins[place]):
             continue
@@ -94,13 +96,13 @@ def thinned(
 
 @dataclass(frozen=True)
 class Trial:
-    """Queries whose truth is known, held against a map once; what remains of it can then be judged without searching.
+    """The matches of queries with known truth against a whole map, from which the matches in a part of it follow.
 
-    positions: int64 [q, c], the best places for each query by the first stage, best first; NONE behind the last.
+    positions: int64 [q, c], the best places for each query by the first stage, best first, filled up with NONE.
     scores: float32 [q, c], of the first stage.
     gains: float32 [q, c], of the second stage, at least 0.
     right: bool [q, c], which of the places are the query's own.
-    candidates: that the second stage examines of each query; 0: there is none.
+    candidates: how many the second stage examines for each query; 0: there is none.
     """
 
     positions: NDArray[np.int64]
@@ -110,7 +112,7 @@ class Trial:
     candidates: int
 
     def found(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """For which queries the best match among the places that are kept is right; bool [q].
+        """For which queries the best match among the kept places is right; bool [q].
 
         Args:
             kept: bool [places].
@@ -118,7 +120,7 @@ class Trial:
         there = (self.positions != NONE) & kept[np.maximum(self.positions, 0)]
         examined = there & (there.cumsum(axis=1) <= self.candidates)
         values = np.where(there, self.scores + np.where(examined, self.gains, 0), -np.inf)
-        if self.candidates:  # what was not examined comes behind what was, as its order says
+        if self.candidates:  # places that were not examined rank after those that were
             values = np.where(there & ~examined, -np.inf, values)
         best = np.argmax(values, axis=1)[:, np.newaxis]
         return np.take_along_axis(self.right & there, best, axis=1)[:, 0]
@@ -126,11 +128,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class Thinning:
-    """One way to thin a map.
+    """A map with some of its places removed, and what that changes.
 
-    least: how alike two places must look for one to stand in for the other.
+    least: the score from which one place replaces another.
     kept: bool [places].
-    before, after: queries that are answered right by the whole map, and by what is kept; bool [q].
+    before, after: bool [q], which queries the whole map and the kept places answer rightly.
     """
 
     least: float
@@ -140,12 +142,12 @@ class Thinning:
 
     @property
     def loss(self) -> float:
-        """What it costs: recall before minus recall after."""
+        """The recall before minus the recall after."""
         return float(self.before.mean() - self.after.mean())
 
 
 def steps(similarity: NDArray[np.float32], count: int) -> list[float]:
-    """Scores to try, highest first: quantiles of those of the pairs there are."""
+    """Values of ``least`` to try, highest first: at most ``count`` quantiles of the pairs' scores, float32 [m]."""
     if not len(similarity):
         return []
     shares = np.linspace(1.0, 0.0, count + 1)[1:]
@@ -153,11 +155,11 @@ def steps(similarity: NDArray[np.float32], count: int) -> list[float]:
 
 
 def best_thinning(tried: Sequence[Thinning], most_loss: float) -> Thinning | None:
-    """The one that removes most, of those up to the first that costs too much; None if already that one does.
+    """The last thinning before the first that costs too much recall; None if the first one does.
 
     Args:
-        tried: from the gentlest on.
-        most_loss: of recall.
+        tried: those that remove fewer places first.
+        most_loss: the recall that may be lost.
     """
     chosen = None
     for thinning in tried:

@@ -1,4 +1,4 @@
-"""Where somebody should go again: stretches of a sequence of which several signs say that the map is weak there."""
+"""Where to take frames again: stretches of a sequence where several signs say that the map is weak."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Literal
 Reason = Literal["never-matched", "distance-gap", "time-gap", "similarity-gap", "aliased", "hub"]
 
 BRIDGED = 2
-"""Stretches with so few frames between them are one."""
+"""Stretches with at most this many frames between them are joined."""
 
 FEWEST_SILENT = 3
-"""So many frames in a row that never matched are a sign; single ones are not."""
+"""At least this many frames in a row that never matched are a sign."""
 
 WEIGHTS: dict[Reason, float] = {
     "distance-gap": 3.0,
@@ -23,12 +23,12 @@ WEIGHTS: dict[Reason, float] = {
     "hub": 1.0,
     "never-matched": 0.5,
 }
-"""What a sign at one frame counts; a gap in distance is ground that was never shown."""
+"""The weight of a sign; that of ``never-matched`` counts for each frame."""
 
 
 @dataclass(frozen=True)
 class Sign:
-    """Something that speaks against frames first … last of a sequence (positions in it)."""
+    """A reason to take the frames from ``first`` to ``last`` of a sequence again (positions in it)."""
 
     first: int
     last: int
@@ -37,9 +37,10 @@ class Sign:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Frames first … last of a sequence that should be taken again, and why.
+    """Frames from ``first`` to ``last`` of a sequence that should be taken again.
 
-    weight: how much speaks for it.
+    reasons: of the signs, each once.
+    weight: the sum of the signs' weights.
     """
 
     first: int
@@ -49,7 +50,7 @@ class Stretch:
 
 
 def silent_runs(matched: Iterable[bool]) -> list[Sign]:
-    """Runs of frames that never matched, in a sequence of which other frames did."""
+    """Find runs of frames that never matched, in a sequence of which other frames did."""
     flags = list(matched)
     signs, position = [], 0
     for was_matched, run in groupby(flags):
@@ -61,7 +62,7 @@ def silent_runs(matched: Iterable[bool]) -> list[Sign]:
 
 
 def stretches(signs: Iterable[Sign]) -> list[Stretch]:
-    """The signs of one sequence as stretches, those that touch or nearly touch as one; the weightiest first."""
+    """Join the signs of one sequence that touch or nearly touch into stretches, those of highest weight first."""
     found: list[Stretch] = []
     for sign in sorted(signs, key=lambda sign: (sign.first, sign.last)):
         weight = WEIGHTS[sign.reason] * (sign.last - sign.first + 1 if sign.reason == "never-matched" else 1)

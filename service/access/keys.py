@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from core.disk.files import Damage, sync_folder
+from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, TooNew, connect, transaction
 from core.places import check_map_id
 from service.access.roles import LEVELS, Role
 from service.errors.faults import InvalidRequest, KeysUnreadable
 
 FILE = "keys.sqlite"
-APPLICATION = 0x706C6B79  # "plky"
-VERSION = 1
 MODE = 0o600
 BUSY_SECONDS = 5.0
 
@@ -49,6 +49,7 @@ _TABLE = """CREATE TABLE keys (
     seal BLOB NOT NULL,
     last_used_at TEXT
 ) STRICT"""
+_SCHEMA = Schema(application_id=0x706C6B79, version=1, create=[_TABLE])  # "plky"
 _COLUMNS = "id, name, role, maps, digest, created_at, expires_at, revoked_at, seal, last_used_at"
 
 
@@ -188,19 +189,17 @@ class KeyStore:
             status = self.path.stat()
             if not stat.S_ISREG(status.st_mode) or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
                 raise KeysUnreadable(f"Others may write to {self.path}: chmod 600 it, then look whose keys it holds.")
-            connection = sqlite3.connect(
-                f"{self.path.absolute().as_uri()}?mode=rw",
-                uri=True,
-                timeout=BUSY_SECONDS,
-                isolation_level=None,
-                check_same_thread=False,
-            )
             try:
-                _check(connection, self.path)
-            except BaseException:
-                connection.close()
-                raise
-        return connection
+                return SqliteFile(self.path, _SCHEMA, {}, timeout=BUSY_SECONDS).open(create=False)
+            except TooNew as error:
+                written = f"{self.path} was written by a later version of placerec (schema {error.version})."
+                raise KeysUnreadable(written) from error
+            except NotOurs as error:
+                raise KeysUnreadable(
+                    f"{self.path} is not a file of keys, or it is damaged; nobody is let in. Restore it."
+                ) from error
+            except Damage as error:
+                raise KeysUnreadable(f"{self.path} is damaged: {error}.") from error
 
     @contextmanager
     def changing(self) -> Iterator[sqlite3.Connection]:
@@ -209,31 +208,18 @@ class KeyStore:
             # A rollback journal: the file is all there is of the keys.  EXTRA syncs the folder too, or a power
             # cut could bring the journal back, and with it a key that was revoked.
             connection.execute("PRAGMA synchronous = EXTRA")
-            connection.execute("BEGIN IMMEDIATE")
-            try:
+            with transaction(connection):
                 yield connection
-                connection.execute("COMMIT")
-            except BaseException:
-                with suppress(sqlite3.Error):
-                    connection.execute("ROLLBACK")
-                raise
 
     def _make(self) -> None:
-        """The file, whole or not at all: one without its tables would be taken for damage."""
-        from core.storage.files.disk import sync_folder  # with it come the index and its compiler, which take a second
-
+        """Make the file whole or not at all: one without its tables would count as damaged."""
         temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
         with _refusals(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             try:
                 os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, MODE))
-                with closing(sqlite3.connect(temporary, isolation_level=None)) as connection:
-                    connection.execute("PRAGMA synchronous = EXTRA")
-                    connection.execute("BEGIN IMMEDIATE")
-                    connection.execute(_TABLE)
-                    connection.execute(f"PRAGMA application_id = {APPLICATION}")
-                    connection.execute(f"PRAGMA user_version = {VERSION}")
-                    connection.execute("COMMIT")
+                with closing(connect(temporary, "rw", {"synchronous": "EXTRA"})) as connection:
+                    _SCHEMA.migrate(connection, create=True)
                 with suppress(FileExistsError):  # another process was quicker
                     os.link(temporary, self.path)
                 sync_folder(self.path.parent)
@@ -298,18 +284,6 @@ def _key(row: tuple[object, ...]) -> Key:
         revoked_at=None if revoked is None else datetime.fromisoformat(str(revoked)),
         last_used_at=None if used is None else datetime.fromisoformat(str(used)),
     )
-
-
-def _check(connection: sqlite3.Connection, path: Path) -> None:
-    (application,) = connection.execute("PRAGMA application_id").fetchone()
-    (version,) = connection.execute("PRAGMA user_version").fetchone()
-    if application != APPLICATION:
-        raise KeysUnreadable(f"{path} is not a file of keys, or it is damaged; nobody is let in. Restore it.")
-    if version != VERSION:
-        raise KeysUnreadable(f"{path} was written by a later version of placerec (schema {version}).")
-    for (line,) in connection.execute("PRAGMA quick_check").fetchall():
-        if line != "ok":
-            raise KeysUnreadable(f"{path} is damaged: {line}.")
 
 
 @contextmanager

@@ -20,17 +20,27 @@ from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
+from service.app import routes as root
 from service.app.gauges import gauges
-from service.app.routers import ROUTERS
-from service.engine.engine import Engine
+from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
+from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
-from service.maps.calibration_schemas import CalibrationOrder
+from service.jobs import routes as jobs
+from service.maps import calibration_routes, camera_routes, transfer_routes
+from service.maps import routes as maps
+from service.maps.schemas import CalibrationOrder
+from service.places import routes as places
 from service.places.parameters import BatchItem
+from service.queries import loop_closure, several_routes
+from service.queries import routes as queries
+from service.sessions import routes as sessions
+from service.sessions import stream_routes
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
+from service.upkeep import routes as upkeep
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -61,6 +71,26 @@ TAGS = [
     {"name": "encoders", "description": "Models and vocabularies installed."},
     {"name": "service", "description": "Health, counters, version."},
 ]
+
+ROUTERS = (
+    queries.router,  # routes are tried in turn, so the one that robots ask most comes first
+    root.router,
+    maps.router,
+    places.router,
+    places.traverses,
+    camera_routes.router,
+    calibration_routes.router,
+    loop_closure.router,
+    several_routes.router,
+    sessions.router,
+    stream_routes.router,
+    queries.explanations,
+    frames.router,
+    upkeep.router,
+    transfer_routes.router,
+    jobs.router,
+    root.encoders,
+)
 
 
 def _operation_id(route: APIRoute) -> str:
@@ -140,14 +170,14 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
         with audit_file(chosen.audit_file), keyring or nullcontext():
             warn_if_exposed(gate, chosen)
-            engine = await to_thread.run_sync(Engine, chosen, metrics)
-            app.state.engine = engine
-            engine.start()
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics)
+            runtime.publish(app.state)
+            runtime.start()
             try:
-                with gauges(engine, app.state.upload_memory, to_thread.current_default_thread_limiter()):
+                with gauges(runtime, app.state.upload_memory, to_thread.current_default_thread_limiter()):
                     yield
             finally:
-                await engine.close()
+                await runtime.close()
 
     app = Application(
         title="placerec",

@@ -1,4 +1,4 @@
-"""``placerec bench``: how fast this machine recognizes places, by itself or as a running service."""
+"""``placerec bench``: how fast this machine recognizes places, in this process or through a running service."""
 
 from __future__ import annotations
 
@@ -13,36 +13,41 @@ import typer
 from service.commands.connection.client import Target, ask, path_of, read_bytes
 from service.commands.connection.credentials import given_key
 from service.commands.console import Failure, number, progress, show, table, write_file
-from service.commands.models import ModelsDir, default_encoder, open_catalogue
+from service.commands.model import ModelsDir, default_encoder, open_catalogue
 
 if TYPE_CHECKING:
     from core.method.encoder import Encoder
 
-PICTURES = 16
-"""Frames that the robots send in turn, if none is given."""
+FRAMES = 16
+"""Frames that are encoded together, and that the robots send in turn."""
 
 
 def bench(
-    image: Annotated[Path | None, typer.Option(help="Frame to encode; default: 640x480 JPEGs made here.")] = None,
+    image: Annotated[Path | None, typer.Option(help="Frame to encode. Default: 640x480 JPEGs drawn for this.")] = None,
     encoder: Annotated[str | None, typer.Option(help="Encoder by name or identity.", show_default=False)] = None,
     places: Annotated[int, typer.Option(min=1, help="Places to search among.")] = 1622,
-    rounds: Annotated[int, typer.Option(min=3, help="Runs of each; the median counts.")] = 30,
-    threads: Annotated[int, typer.Option(min=0, help="Threads of a forward pass; 0 uses every core.")] = 0,
+    rounds: Annotated[int, typer.Option(min=3, help="Runs of each stage; the median is shown.")] = 30,
+    threads: Annotated[int, typer.Option(min=0, help="Threads of a forward pass; 0: every core.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures.")] = None,
     models_dir: ModelsDir = None,
     url: Annotated[str | None, typer.Option(help="Measure the service at this address instead.")] = None,
     map_id: Annotated[
-        str | None, typer.Option("--map", "-m", help="With --url: the map to ask; else frames are only encoded.")
+        str | None, typer.Option("--map", "-m", help="With --url: the map to query. Default: frames are only encoded.")
     ] = None,
     robots: Annotated[
-        list[int] | None, typer.Option(min=1, max=1000, help="With --url: so many at a time; several times.")
+        list[int] | None,
+        typer.Option(
+            min=1, max=1000, help="With --url: number of robots at a time; may be repeated. Default: 1, 4 and 16."
+        ),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0.2, max=600, help="With --url: for each number of robots.")] = 5.0,
+    seconds: Annotated[
+        float, typer.Option(min=0.2, max=600, help="With --url: seconds for each number of robots.")
+    ] = 5.0,
 ) -> None:
-    """Measure encoding stage by stage, in batches, and a search of both stages, in this process.
+    """Measure encoding, stage by stage and in batches, and the search of a map, in this process.
 
-    With --url: what 1, 4 and 16 robots see of a running service, each of which sends its next frame when it has the
-    answer to the last. It asks and changes nothing.
+    With --url: measure how a running service answers 1, 4 and 16 robots, each of which sends its next frame when it
+    has the answer to the last. Nothing in the service is changed.
     """
     if url is None:
         figures = _measure_here(image, encoder, places, rounds, threads, models_dir)
@@ -58,29 +63,23 @@ def _measure_here(
     # Imported here because they take a second.
     import torch
 
-    from core.evaluation.timing import (
-        better_forward,
-        encode_batch,
-        encoding_runs,
-        jpeg,
-        medians,
-        sample_picture,
-        search_run,
-    )
+    from core.evaluation.samples import jpeg, sample_frame
+    from core.evaluation.timing import better_forward, encode_batch, encoding_runs, medians, search_run
     from core.threads import share_cores
 
     share_cores(threads or torch.get_num_threads())
     chosen: Encoder = open_catalogue(models_dir).get(encoder or default_encoder())
-    data = jpeg(sample_picture()) if image is None else read_bytes(image)
+    data = jpeg(sample_frame()) if image is None else read_bytes(image)
     with progress() as bar:
         bar.add_task("Measuring", total=None)
-        batch = {"batch": lambda: encode_batch(chosen, [data] * PICTURES)}
-        times = medians({**encoding_runs(chosen, data), **batch, "search": search_run(chosen, places)}, rounds)
-        times["batch"] /= PICTURES
+        batch = {"batch": lambda: encode_batch(chosen, [data] * FRAMES)}
+        with search_run(chosen, places) as search:
+            times = medians({**encoding_runs(chosen, data), **batch, "search": search}, rounds)
+        times["batch"] /= FRAMES
     forward = better_forward(times)
     shown = table("what", "#ms", "#of a forward pass", title=f"{chosen.name}, {torch.get_num_threads()} threads")
     for name, milliseconds in [("bare forward pass", forward), *times.items()]:
-        called = {"search": f"search of {places}", "batch": f"encode, {PICTURES} together, each"}.get(name, name)
+        called = {"search": f"search of {places}", "batch": f"encode, {FRAMES} together, each"}.get(name, name)
         shown.add_row(called, number(milliseconds, 2), number(milliseconds / forward, 2))
     show(shown)
     return {
@@ -98,18 +97,18 @@ def _measure_service(
 ) -> dict[str, Any]:
     import subprocess
 
-    from core.evaluation.timing import jpeg, sample_picture
+    from core.evaluation.samples import jpeg, sample_frame
     from service.commands.load import measure
 
     path = "/v1/encode" if map_id is None else path_of("maps", map_id, "query")
     version = ask(Target(url, None), "GET", "/version").json()
-    frames = [read_bytes(image)] if image else [jpeg(sample_picture(index)) for index in range(PICTURES)]
+    frames = [read_bytes(image)] if image else [jpeg(sample_frame(index)) for index in range(FRAMES)]
     seen: dict[str, Any] = {}
     shown = table("robots", "#answers/s", "#p50 ms", "#p95 ms", "#p99 ms", "#refused", title=f"{url}{path}")
     with tempfile.TemporaryDirectory() as text, progress() as bar:
         folder = Path(text)
         for index, data in enumerate(frames):
-            # One that the service cannot take is refused before it is measured.
+            # A frame that the service refuses ends the command before the measurement.
             ask(Target(url, None), "POST", path, content=data, headers={"Content-Type": "image/jpeg"})
             (folder / f"{index}.jpg").write_bytes(data)
         task = bar.add_task("Driving", total=len(robots))
@@ -127,7 +126,7 @@ def _measure_service(
 
 
 def summary(found: Mapping[str, Any]) -> dict[str, Any]:
-    """Percentiles in milliseconds, answers a second, and how many were none, of what the load measured."""
+    """Percentiles in milliseconds, answers per second and refusals of a load's measurement."""
     import numpy as np
 
     times = np.array(found["milliseconds"])

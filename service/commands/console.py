@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
+from core.disk.files import write_file as write_durably
 from core.errors import PlacerecError
 from service.commands.connection.credentials import add_key
 from service.errors.faults import Fault
@@ -118,10 +118,8 @@ def write_file(path: Path, text: str) -> None:
     Raises:
         Failure: the file cannot be written.
     """
-    partial = path.with_name(path.name + ".tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, "utf-8")
-        os.replace(partial, path)
+        write_durably(path, text.encode())
     except OSError as error:
         raise Failure(f"{path} cannot be written: {error.strerror}.") from error

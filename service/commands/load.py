@@ -28,7 +28,7 @@ KEY = "PLACEREC_KEY"
 
 
 def request(host: str, path: str, data: bytes, key: str | None = None) -> bytes:
-    """One frame as it goes over the wire."""
+    """The bytes of a request that sends one frame."""
     head = f"POST {path} HTTP/1.1\r\nHost: {host}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n"
     if key:
         head += f"Authorization: Bearer {key}\r\n"
@@ -48,7 +48,7 @@ async def robot(
 ) -> None:
     """Send frames until the time is up, and note how long each answer took, in seconds.
 
-    One that is refused because the service is full is sent again, and its time goes on: it was not lost.
+    A frame that is refused because the service is full is sent again, and its time goes on.
     """
     reader, writer = await asyncio.open_connection(host, port)
     index = first
@@ -67,7 +67,7 @@ async def robot(
 
 
 def measure(url: str, path: str, frames: Path, robots: int, seconds: float, key: str | None = None) -> dict[str, Any]:
-    """What so many robots see, driven by a process of their own; as :func:`drive` gives it.
+    """The measurement of :func:`drive` with so many robots, run in a process of its own.
 
     Args:
         key: of the service; without one, that of the environment.
@@ -75,16 +75,27 @@ def measure(url: str, path: str, frames: Path, robots: int, seconds: float, key:
     Raises:
         subprocess.CalledProcessError: the service cannot be reached, or hung up.
     """
-    words = ["--url", url, "--path", path, "--frames", str(frames), "--robots", str(robots), "--seconds", str(seconds)]
-    command = [sys.executable, "-m", "service.commands.load", *words]
-    environment = {**os.environ, **({} if key is None else {KEY: key})}  # not among the words, which others can see
+    arguments = [
+        "--url",
+        url,
+        "--path",
+        path,
+        "--frames",
+        str(frames),
+        "--robots",
+        str(robots),
+        "--seconds",
+        str(seconds),
+    ]
+    command = [sys.executable, "-m", "service.commands.load", *arguments]
+    environment = {**os.environ, **({} if key is None else {KEY: key})}  # not an argument, which others can see
     done = subprocess.run(command, capture_output=True, check=True, env=environment)
     found: dict[str, Any] = json.loads(done.stdout)
     return found
 
 
 async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: float) -> dict[str, object]:
-    """Let so many robots drive; what they saw, with times in milliseconds."""
+    """Let so many robots drive; the numbers of statuses, and each answer's time in milliseconds."""
     parts = urlsplit(url)
     host, port = str(parts.hostname), parts.port or 80
     key = os.environ.get(KEY)
@@ -112,14 +123,14 @@ def _processor_seconds() -> float:
 
 
 def main() -> None:
-    """Read the words of the command and print what came of it."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--url", required=True)
-    words.add_argument("--path", required=True, help="where frames are posted to, such as /v1/maps/lab/query")
-    words.add_argument("--frames", type=Path, required=True, help="folder of JPEG files; .jpg")
-    words.add_argument("--robots", type=int, default=1)
-    words.add_argument("--seconds", type=float, default=5.0)
-    given = words.parse_args()
+    """Parse the arguments, drive, and print the measurement as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--url", required=True)
+    parser.add_argument("--path", required=True, help="where frames are posted to, such as /v1/maps/lab/query")
+    parser.add_argument("--frames", type=Path, required=True, help="folder of JPEG files; .jpg")
+    parser.add_argument("--robots", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=5.0)
+    given = parser.parse_args()
     frames = [path.read_bytes() for path in sorted(given.frames.glob("*.jpg"))]
     found = asyncio.run(drive(given.url, given.path, frames, given.robots, given.seconds))
     sys.stdout.write(json.dumps(found) + "\n")

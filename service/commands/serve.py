@@ -55,10 +55,10 @@ def _serve_logged(settings: Settings) -> None:
     connections = Connections(settings, application.state.upload_memory, application.state.metrics)
 
     def drain() -> None:
-        application.state.engine.stopping = connections.draining = True
+        application.state.runtime.stopping = connections.draining = True
 
     def stop() -> None:
-        application.state.engine.jobs.stop_soon()
+        application.state.jobs.stop_soon()
 
     try:
         serve_application(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from core.frames.exif import read_whereabouts
+from core.frames.exif import read_pose_and_time
 from core.frames.traverses import find_images
 from core.places import PlaceFields, Pose, Sequence, Timestamp, check_place_id
 from service.commands.console import Failure
@@ -42,8 +42,8 @@ class Frame:
     camera: str | None = None
 
     def parameters(self, data: bytes) -> dict[str, str]:
-        """The parameters of the request that enrols the frame with the bytes ``data``."""
-        pose, timestamp = (self.pose, self.timestamp) if self.listed else read_whereabouts(data)
+        """What goes into the query string beside the frame's bytes ``data``."""
+        pose, timestamp = (self.pose, self.timestamp) if self.listed else read_pose_and_time(data)
         given = {} if pose is None else {name: repr(value) for name, value in pose if value is not None}
         if timestamp is not None:
             given["timestamp"] = timestamp.isoformat()

@@ -1,4 +1,4 @@
-"""``placerec vocabulary``: encoders of one's own."""
+"""``placerec vocabulary``: training encoders on images of one's own."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
 
+from core.disk.files import replacing
 from core.errors import InvalidImage
 from core.frames.traverses import SUPPORTED_SUFFIXES, natural_key
 from service.commands.connection.client import read_bytes
 from service.commands.console import Commands, Failure, messages, output, progress, remark
-from service.commands.models import ModelsDir, check_free_name, models_directory
+from service.commands.model import ModelsDir, check_free_name, models_directory
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 vocabulary = typer.Typer(cls=Commands, help="Train vocabularies for encoders of your own.", no_args_is_help=True)
 
 HELD_OUT = 5
-"""One image in so many calibrates the verdict and trains nothing."""
+"""One image in so many is held out of training and calibrates the verdict."""
 
 FEWEST_IMAGES = 30
 NEIGHBOURS = 3
@@ -42,7 +43,7 @@ CAFFE_STEP = 1.0
 
 
 @dataclass(frozen=True)
-class Pictures:
+class Split:
     """Images to learn from and images to measure with, in natural order."""
 
     train: list[Path]
@@ -51,7 +52,7 @@ class Pictures:
 
 @vocabulary.callback()
 def _group() -> None:
-    """Keeps ``train`` a command of its own while it is the only one."""
+    """Keep ``train`` a subcommand while it is the only one."""
 
 
 @vocabulary.command()
@@ -79,10 +80,13 @@ def train(
     ] = True,
     gamma: Annotated[float, typer.Option(min=0.01, max=1.0, help="Exponent of the power normalisation.")] = 0.5,
     normalization: Annotated[Literal["intra", "global"], typer.Option(help="Of the VLAD.")] = "intra",
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Same seed, same images: same vocabulary.")] = 0,
-    limit: Annotated[int, typer.Option(min=FEWEST_IMAGES, help="Of more images, this many are drawn.")] = 3000,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="The same seed and images give the same vocabulary.")
+    ] = 0,
+    limit: Annotated[int, typer.Option(min=FEWEST_IMAGES, help="Draw this many if there are more images.")] = 3000,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an installed encoder of this name; its maps need it no more.")
+        bool,
+        typer.Option("--overwrite", help="Replace an installed encoder of this name, if no map needs it any more."),
     ] = False,
     models_dir: ModelsDir = None,
 ) -> None:
@@ -99,7 +103,7 @@ def train(
     from core.method.vocabulary import pool_features, train_vocabulary
     from core.networks.network import load_network
 
-    pictures = _choose(_find(images), limit, seed)
+    chosen = _split(_find(images), limit, seed)
     folder = models_directory(models_dir)
     check_free_name(folder, name, "encoder", overwrite)
     network_name, network_file = _find_network(network, folder)
@@ -118,17 +122,17 @@ def train(
         raise Failure(f"The encoder cannot be made: {error.errors()[0]['msg']}.") from error
     extractor = FeatureExtractor(load_network(network_file, layer_names), definition)
     with progress() as bar:
-        reading = bar.add_task("Regions", total=len(pictures.train))
-        frames = (_features(extractor, pixels) for _, pixels in _read(pictures.train, bar, reading))
+        reading = bar.add_task("Regions", total=len(chosen.train))
+        frames = (_features(extractor, pixels) for _, pixels in _read(chosen.train, bar, reading))
         features = pool_features(frames, seed)
         clustering = bar.add_task(f"k-means, {words} words", total=None)
         made = train_vocabulary(features, words, seed, extractor.origin)
         bar.update(clustering, total=1, completed=1)
-        calibration = _calibrate(name, extractor, definition, made, pictures.held_out, bar)
+        calibration = _calibrate(name, extractor, definition, made, chosen.held_out, bar)
     encoder = Encoder(name, extractor, definition, made, calibration)
     training = {
-        "images": len(pictures.train),
-        "held_out": len(pictures.held_out),
+        "images": len(chosen.train),
+        "held_out": len(chosen.held_out),
         "features": len(features),
         "seed": seed,
     }
@@ -154,14 +158,14 @@ def _find(given: Sequence[Path]) -> list[Path]:
     return sorted(found, key=lambda path: natural_key(str(path)))
 
 
-def _choose(paths: list[Path], limit: int, seed: int) -> Pictures:
+def _split(paths: list[Path], limit: int, seed: int) -> Split:
     if len(paths) > limit:
         remark(f"{limit} of {len(paths)} images are drawn (--limit).")
-        chosen = np.random.default_rng(seed).choice(len(paths), limit, replace=False)
-        paths = [paths[index] for index in sorted(chosen)]
+        drawn = np.random.default_rng(seed).choice(len(paths), limit, replace=False)
+        paths = [paths[index] for index in sorted(drawn)]
     held_out = paths[HELD_OUT - 1 :: HELD_OUT][:MOST_HELD_OUT]
     kept = set(held_out)
-    return Pictures([path for path in paths if path not in kept], held_out)
+    return Split([path for path in paths if path not in kept], held_out)
 
 
 def _find_network(given: str, folder: Path) -> tuple[str, Path]:
@@ -174,7 +178,7 @@ def _find_network(given: str, folder: Path) -> tuple[str, Path]:
 
 
 def _install_network(name: str, file: Path, folder: Path) -> None:
-    """Put a network that was named by its file where the encoder will look for it."""
+    """Install a network that was given as a file, so that the encoder finds it."""
     from core.method.catalogue import NETWORK_SUFFIX, PACKAGED
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -183,9 +187,8 @@ def _install_network(name: str, file: Path, folder: Path) -> None:
         return
     if target.exists() and target.read_bytes() != file.read_bytes():
         raise Failure(f"{target} is another network of the same name.")
-    partial = target.with_name(target.name + ".tmp")
-    shutil.copyfile(file, partial)
-    os.replace(partial, target)
+    with replacing(target) as temporary:
+        shutil.copyfile(file, temporary)
 
 
 def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[float, ...]:
@@ -202,7 +205,7 @@ def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[flo
 
 
 def _read(paths: Sequence[Path], bar: Progress, task: TaskID) -> Iterator[tuple[Path, Pixels]]:
-    """The images that can be decoded; of the others it is said that they cannot."""
+    """The images that can be decoded; the others are named in a message."""
     from core.frames.images import decode
 
     for path in paths:
@@ -225,7 +228,7 @@ def _calibrate(
     paths: Sequence[Path],
     bar: Progress,
 ) -> Calibration:
-    from core.judgement.encoder_calibration import calibrate, second_look
+    from core.judgement.calibration import fit_encoder_calibration, second_look
     from core.judgement.verdict import Calibration
     from core.method.encoder import Encoder
 
@@ -240,4 +243,4 @@ def _calibrate(
         raise Failure(f"Only {len(looks)} of the images kept out can be decoded; give more images.")
     first, second = (np.stack(side) for side in zip(*looks, strict=True))  # n x D
     score = encoder.scores_from_inner_products
-    return calibrate(score(first @ first.T), score(second @ first.T), NEIGHBOURS, "encoder-default")
+    return fit_encoder_calibration(score(first @ first.T), score(second @ first.T), NEIGHBOURS, "encoder-default")

@@ -1,4 +1,4 @@
-"""Frames on their way through the encoder: a place in the bounded queue, a turn, patience that may end before it."""
+"""The bounded queue in front of the encoders: a request takes a place, and its frames are encoded within a deadline."""
 
 from __future__ import annotations
 
@@ -16,43 +16,49 @@ from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.threads import cores, share_cores
-from service.engine.microbatches import MOST_FRAMES, Encoded, MicroBatches, Then, Turn, late
+from service.engine.microbatches import (
+    MOST_FRAMES,
+    AfterEncoding,
+    Encoded,
+    MicroBatches,
+    QueuedFrame,
+    deadline_exceeded,
+)
 from service.errors.faults import ClientGone, QueueFull
 from service.telemetry.metrics import Metrics
 
-__all__ = ["Encoded", "Inference", "Outcomes", "Patience", "Then"]
+__all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadline"]
 
 Outcomes = list[tuple[int, Encoded | Exception]]
-"""What became of some frames of many, each with its index."""
+"""Some frames of a request, each with its index: encoded, or the error that kept it from being encoded."""
 
 AHEAD = 2 * MOST_FRAMES * max(2, cores())
-"""Frames of one bulk request that wait at a time: enough that the encoder never waits for it."""
-
+"""Frames of one bulk request that wait at a time: enough that the encoder never runs out of them."""
 
 UNWATCHED = 0.25
-"""Seconds for which nobody looks whether the caller of one frame is still there: most have their answer by then."""
+"""Seconds after which a connection is watched for a client that hangs up; most frames are encoded by then."""
 
 
 @dataclass(frozen=True)
-class Patience:
-    """How long a caller waits: until ``deadline`` (``time.monotonic``) or until ``hung_up`` returns."""
+class RequestDeadline:
+    """When a request stops waiting: at the time ``at`` (``time.monotonic``), or as soon as ``hung_up`` returns."""
 
-    deadline: float
+    at: float
     hung_up: Callable[[], Awaitable[None]]
 
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds until the deadline; negative after it."""
-        return self.deadline - time.monotonic()
+        return self.at - time.monotonic()
 
 
-class Inference:
-    """Loads encoders and encodes frames.
+class EncoderQueue:
+    """Loads encoders and encodes frames.  It is used from the event loop.
 
     Args:
         catalogue: the installed encoders.
-        limits: of a frame.
-        queue_length: requests that may be in here at one time.
-        threads: of a forward pass; 0 leaves it to torch.
+        limits: the largest frame that is decoded.
+        queue_length: the most requests that may have a place at one time.
+        threads: the number of threads of a forward pass; 0 leaves it to torch.
     """
 
     def __init__(
@@ -65,34 +71,36 @@ class Inference:
         self._batches = MicroBatches(self._load, limits, metrics.encoded_together.observe)
 
     def close(self) -> None:
-        """Drop what waits and end the thread."""
+        """Cancel the waiting frames and end the encoder's threads; blocks."""
         self._batches.close()
 
     def check_room(self) -> None:
-        """Raise QueueFull if there is no place in the queue now; cheap, for before a body is read."""
+        """Raise QueueFull if there is no free place; a route calls it before it reads a body."""
         if self._waiting >= self._queue_length:
-            raise QueueFull("Too many requests wait for the encoder; send this one again in a moment.")
+            raise QueueFull("Too many requests are waiting for the encoder; send this one again in a moment.")
 
     @property
     def waiting(self) -> int:
-        """Requests that have a place in the queue now."""
+        """The number of requests that have a place in the queue now."""
         return self._waiting
 
     @contextmanager
-    def place_in_queue(self, frames: int = 1) -> Iterator[None]:
-        """A place in the queue for one request, whose frames are encoded within.
+    def place(self, frames: int = 1) -> Iterator[None]:
+        """Hold a place in the queue for one request, whose frames are encoded within the context.
 
         Args:
-            frames: of the request. Those of many frames, which keep their places for long, may have half of the queue,
-                so that there is always room for those of one.
+            frames: the number of frames of the request.  Requests of several frames take longer, so they may have only
+                half of the places, and there is always room for requests of a single frame.
 
         Raises:
-            QueueFull: none is free.
+            QueueFull: no place is free.
         """
         self.check_room()
         bulk = int(frames > 1)
         if bulk and self._bulk >= max(1, self._queue_length // 2):
-            raise QueueFull("Too many requests of many frames wait for the encoder; send this one again in a moment.")
+            raise QueueFull(
+                "Too many requests of several frames are waiting for the encoder; send this one again in a moment."
+            )
         self._waiting, self._bulk = self._waiting + 1, self._bulk + bulk
         self._metrics.queue.set(self._waiting)
         try:
@@ -102,11 +110,11 @@ class Inference:
             self._metrics.queue.set(self._waiting)
 
     async def load(self, identity: str) -> Encoder:
-        """The encoder of an identity, loaded and seen to reproduce its golden values.
+        """The encoder of an identity; it is loaded, and checked against its golden values, when it is first used.
 
         Raises:
-            UnknownEncoder: none is installed.
-            InvalidModel: it is damaged, or gives other values on this machine.
+            UnknownEncoder: no encoder of this identity is installed.
+            InvalidModel: its files are damaged, or it does not reproduce its golden values on this machine.
         """
         if identity in self._loaded:
             return self._loaded[identity]
@@ -123,36 +131,38 @@ class Inference:
         self,
         identity: str,
         data: bytes,
-        patience: Patience,
+        deadline: RequestDeadline,
         mask: Mask | None = None,
-        then: Then | None = None,
+        after_encoding: AfterEncoding | None = None,
     ) -> Encoded:
-        """Decode and encode one frame when its turn comes; call it within ``place_in_queue``.
+        """Wait in the queue, then decode and encode one frame; call it within ``place``.
 
         Args:
-            then: as :attr:`Turn.then`.
+            data: the bytes of a JPEG, PNG or WebP file.
+            mask: the part of the frame that is ignored.
+            after_encoding: see :class:`QueuedFrame`.
 
         Raises:
-            DeadlineExceeded, ClientGone: before its turn came; it was not encoded.
-            InvalidImage: it cannot be decoded.
-            UnknownEncoder, InvalidModel: as for ``load``.
+            DeadlineExceeded, ClientGone: the request ended before the encoding began; the frame was not encoded.
+            InvalidImage: the frame cannot be decoded.
+            UnknownEncoder, InvalidModel: see ``load``.
         """
-        if patience.left() <= 0:
-            raise late()
-        turn = Turn(identity, data, mask, patience.deadline, then=then)
-        self._batches.put([turn])
-        result = asyncio.wrap_future(turn.result)
+        if deadline.seconds_left() <= 0:
+            raise deadline_exceeded()
+        frame = QueuedFrame(identity, data, mask, deadline.at, after_encoding=after_encoding)
+        self._batches.put([frame])
+        result = asyncio.wrap_future(frame.result)
         gone: asyncio.Future[Any] | None = None
         try:
-            await asyncio.wait({result}, timeout=min(UNWATCHED, patience.left()))
+            await asyncio.wait({result}, timeout=min(UNWATCHED, deadline.seconds_left()))
             if not result.done():
-                gone = asyncio.ensure_future(patience.hung_up())
+                gone = asyncio.ensure_future(deadline.hung_up())
                 waited: set[asyncio.Future[Any]] = {result, gone}
-                left = max(0.0, patience.left())
+                left = max(0.0, deadline.seconds_left())
                 await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
-            # A frame that the encoder has begun is finished: dropping it would save nothing.
-            if not result.done() and turn.result.cancel():
-                raise _gone() if gone is not None and gone.done() else late()
+            # A frame whose encoding has begun cannot be cancelled: the other frames of its batch need the pass.
+            if not result.done() and frame.result.cancel():
+                raise _gone() if gone is not None and gone.done() else deadline_exceeded()
             encoded = await result
         finally:
             if gone is not None:
@@ -165,35 +175,45 @@ class Inference:
         self,
         identity: str,
         frames: Sequence[bytes],
-        patience: Patience,
+        deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
     ) -> AsyncGenerator[Outcomes]:
-        """Encode the frames of a bulk request, some ahead at a time; call it within ``place_in_queue``.
+        """Encode the frames of a bulk request; call it within ``place``.
 
-        They share forward passes with one another and with what others ask for, and a robot's frame goes first.
-        What is given up, for whatever reason, is taken out of the queue.
+        At most ``AHEAD`` of them wait at a time.  They share forward passes with each other and with the frames of
+        other requests, and robots' frames go first.  When the generator is closed, waiting frames leave the queue.
+
+        Args:
+            frames: the bytes of the files.
+            masks: for each frame the part that is ignored; None: all frames are used whole.
 
         Yields:
-            What became of frames, with their indices, as they get done: in order but for those that fail. An
-            error is that of ``encode`` and one frame's own, or everyone's (a deadline, an encoder that is damaged).
+            Frames that are done, with their indices: in order, except that those that fail come early.  An error is
+            one of ``encode``; it concerns one frame, or all (a deadline, a damaged encoder).
         """
         hidden = [None] * len(frames) if masks is None else masks
-        open_: dict[asyncio.Future[Encoded], tuple[int, Turn]] = {}
+        open_: dict[asyncio.Future[Encoded], tuple[int, QueuedFrame]] = {}
         begun, bulk = 0, len(frames) > 1
-        gone = asyncio.ensure_future(patience.hung_up())
+        gone = asyncio.ensure_future(deadline.hung_up())
         try:
             while begun < len(frames) or open_:
                 following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
-                turns = [Turn(identity, frames[i], hidden[i], patience.deadline, bulk, asks=False) for i in following]
-                self._batches.put(turns)
-                open_ |= {asyncio.wrap_future(turn.result): (i, turn) for i, turn in zip(following, turns, strict=True)}
+                queued = [
+                    QueuedFrame(identity, frames[i], hidden[i], deadline.at, bulk, from_robot=False) for i in following
+                ]
+                self._batches.put(queued)
+                open_ |= {
+                    asyncio.wrap_future(frame.result): (i, frame) for i, frame in zip(following, queued, strict=True)
+                }
                 begun = following.stop
                 waited: set[asyncio.Future[Any]] = {*open_, gone}
-                await asyncio.wait(waited, timeout=max(0.0, patience.left()), return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait(
+                    waited, timeout=max(0.0, deadline.seconds_left()), return_when=asyncio.FIRST_COMPLETED
+                )
                 done = [(future, *open_.pop(future)) for future in [*open_] if future.done()]
-                if not done and (begun < len(frames) or any(turn.result.cancel() for _, turn in open_.values())):
-                    raise _gone() if gone.done() else late()
-                if not done:  # all that is left was begun before the time was up
+                if not done and (begun < len(frames) or any(frame.result.cancel() for _, frame in open_.values())):
+                    raise _gone() if gone.done() else deadline_exceeded()
+                if not done:  # the encoding of all remaining frames was begun before the deadline
                     await asyncio.wait(open_)
                     continue
                 for future, _, _ in done:
@@ -202,8 +222,8 @@ class Inference:
                 yield [(i, _outcome(future)) for future, i, _ in done]
         finally:
             gone.cancel()
-            for future, (_, turn) in open_.items():
-                turn.result.cancel()
+            for future, (_, frame) in open_.items():
+                frame.result.cancel()
                 future.cancel()
 
 
@@ -217,4 +237,4 @@ def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:
 
 
 def _gone() -> ClientGone:
-    return ClientGone("The caller hung up before its frame was encoded.")
+    return ClientGone("The client hung up before its frame was encoded.")

@@ -1,4 +1,11 @@
-"""Searches that come together read a map together: each place is fetched from memory once for all of them."""
+"""In which thread, and together with which other queries, a query is searched for.
+
+The search itself is :func:`core.recognition.recognition.locate`.  For speed it runs in one of three places:
+
+* in a small map, in the thread that encoded the frame (:class:`SearchAhead`);
+* else in a worker's thread, where queries of one map that arrive together share one pass over the places;
+* with filters or priors, alone in a worker's thread.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +18,56 @@ from dataclasses import dataclass
 from anyio import to_thread
 
 from core.method.encoder import Encoder, Encoding
-from core.recognition.localization import Located, locate
+from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
 from core.threads import cores
+from service.engine.microbatches import Encoded
 
 MOST_TOGETHER = 8
-"""Queries of one search: from four on the map is read no faster for each, and whoever comes next waits for all."""
+"""The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""
 
 CORES_A_SEARCH = 4
-"""So many cores of the machine allow one more search of the same map at a time; each takes several for a large map."""
+"""One search of a map runs at a time for each so many cores: the search of a large map uses several cores itself."""
+
+MOST_AHEAD = 4000
+"""The most places of a map that is searched in the encoder's thread; such a search takes a few milliseconds."""
 
 
 @dataclass(frozen=True)
-class _Purpose:
-    """What searches must have in common to be one; maps and encoders are themselves, not what they are called."""
+class Recognized:
+    """An encoded frame and the answer of the map, which is None for a frame without regions."""
+
+    encoded: Encoded
+    answer: Answer | None
+
+
+@dataclass(frozen=True)
+class SearchAhead:
+    """A search of a map that is done in the encoder's thread; frames of a batch with equal values share one search."""
+
+    map_: Map
+    k: int
+
+    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Answer] | None]:
+        """The answer for each frame; None for a frame that is left to :meth:`Searches.recognize`."""
+        seen = [one for one in encoded if len(one.encoding.regions)]
+        if not seen or not self.map_.snapshot().holds:  # its descriptors would have to be read from disk
+            return [None] * len(encoded)
+        found = iter(locate(self.map_, seen[0].encoder, [one.encoding for one in seen], self.k))
+        return [[next(found)] if len(one.encoding.regions) else None for one in encoded]
+
+
+def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
+    """The search to do in the encoder's thread, or None if other frames would wait too long for it."""
+    if selection is not None or map_.count_places() > MOST_AHEAD:
+        return None
+    return SearchAhead(map_, k)
+
+
+@dataclass(frozen=True)
+class _SearchKey:
+    """Queries with equal keys can share a search; maps and encoders are compared by identity, not by name."""
 
     map_: Map
     encoder: Encoder
@@ -35,25 +77,49 @@ class _Purpose:
 @dataclass
 class _Waiting:
     encodings: Sequence[Encoding]
-    answer: asyncio.Future[list[Located]]
+    answer: asyncio.Future[list[Answer]]
 
 
 class Searches:
-    """Takes what has come whenever a thread is free for a map, so that one query alone never waits for company.
+    """Searches maps for encoded queries; it is used only from the event loop.
 
-    Used from the event loop alone.
+    Whenever a thread is free for a map it takes the queries that wait, so a single query never waits for others.
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[_Purpose, deque[_Waiting]] = {}
-        self._running: defaultdict[_Purpose, int] = defaultdict(int)
+        self._waiting: dict[_SearchKey, deque[_Waiting]] = {}
+        self._running: defaultdict[_SearchKey, int] = defaultdict(int)
         self._tasks: set[asyncio.Task[None]] = set()
         self._at_once = max(1, cores() // CORES_A_SEARCH)
 
+    async def recognize(
+        self, map_: Map, frames: Sequence[Encoded], k: int, selection: Selection | None = None
+    ) -> list[Recognized]:
+        """Search a map for frames that its encoder has encoded; a result of ``SearchAhead`` is taken as it is.
+
+        Args:
+            k: how many matches to list.
+            selection: what is known of the place; None: nothing.
+
+        Raises:
+            StorageFailure: the map's files cannot be read.
+        """
+        seen = [frame for frame in frames if len(frame.encoding.regions)]
+        if len(seen) == 1 and seen[0].search_result is not None:
+            answers: list[Answer] = seen[0].search_result
+        else:
+            encodings = [frame.encoding for frame in seen]
+            answers = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+        remaining = iter(answers)
+        return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]
+
     async def locate(
         self, map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
-    ) -> list[Located]:
-        """What :func:`core.recognition.localization.locate` gives, in a thread and together with what others ask for.
+    ) -> list[Answer]:
+        """Call :func:`core.recognition.recognition.locate` in a thread, for these and other waiting queries at once.
+
+        Args:
+            encodings: queries that have regions.
 
         Raises:
             StorageFailure: the map's files cannot be read.
@@ -61,62 +127,62 @@ class Searches:
         if selection is not None:
             return await to_thread.run_sync(locate, map_, encoder, encodings, k, selection)
         loop = asyncio.get_running_loop()
-        purpose = _Purpose(map_, encoder, k)
+        key = _SearchKey(map_, encoder, k)
         parts = [
             _Waiting(encodings[start : start + MOST_TOGETHER], loop.create_future())
             for start in range(0, len(encodings), MOST_TOGETHER)
         ]
-        self._waiting.setdefault(purpose, deque()).extend(parts)
-        if self._running[purpose] < self._at_once:
-            self._running[purpose] += 1
-            # Not before the others whose frames left the encoder in the same moment have come as well.
-            # It is nobody's search alone, so it says in the log of none that it was for it.
-            loop.call_soon(self._start, purpose, context=Context())
+        self._waiting.setdefault(key, deque()).extend(parts)
+        if self._running[key] < self._at_once:
+            self._running[key] += 1
+            # Starting a little later lets the other frames of the same batch join the search.
+            # The search serves several requests, so it must not log under the id of this one.
+            loop.call_soon(self._start, key, context=Context())
         if len(parts) == 1:
             return await parts[0].answer
         answers = await asyncio.gather(*(part.answer for part in parts))
-        return [located for answer in answers for located in answer]
+        return [answer for part in answers for answer in part]
 
-    def _start(self, purpose: _Purpose) -> None:
-        task = asyncio.create_task(self._run(purpose))
+    def _start(self, key: _SearchKey) -> None:
+        task = asyncio.create_task(self._run(key))
         self._tasks.add(task)  # the loop itself keeps no task alive
         task.add_done_callback(self._tasks.discard)
 
-    async def _run(self, purpose: _Purpose) -> None:
+    async def _run(self, key: _SearchKey) -> None:
         try:
-            while together := self._take(purpose):
-                await self._answer(purpose, together)
+            while together := self._take(key):
+                await self._answer(key, together)
         finally:
-            self._running[purpose] -= 1
-            if not self._running[purpose]:
-                del self._running[purpose]
-                self._waiting.pop(purpose, None)
+            self._running[key] -= 1
+            if not self._running[key]:
+                del self._running[key]
+                self._waiting.pop(key, None)
 
-    def _take(self, purpose: _Purpose) -> list[_Waiting]:
-        """What to search for next: an equal share for each of the threads that a map may have."""
-        waiting = self._waiting.get(purpose, deque())
+    def _take(self, key: _SearchKey) -> list[_Waiting]:
+        """The queries of the next search: an equal share for each thread that the map may use."""
+        waiting = self._waiting.get(key, deque())
         most = min(MOST_TOGETHER, -(-sum(len(one.encodings) for one in waiting) // self._at_once))
         taken: list[_Waiting] = []
         count = 0
         while waiting and (not taken or count + len(waiting[0].encodings) <= most):
             one = waiting.popleft()
-            if not one.answer.done():  # its request was given up
+            if not one.answer.done():  # else its request was cancelled
                 taken.append(one)
                 count += len(one.encodings)
         return taken
 
-    async def _answer(self, purpose: _Purpose, together: Sequence[_Waiting]) -> None:
+    async def _answer(self, key: _SearchKey, together: Sequence[_Waiting]) -> None:
         encodings = [encoding for one in together for encoding in one.encodings]
         try:
-            located = await to_thread.run_sync(locate, purpose.map_, purpose.encoder, encodings, purpose.k)
+            answers = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k)
         except Exception as error:
-            if len(together) > 1:  # only those fail whose fault it is
+            if len(together) > 1:  # search for each alone, so that only the faulty ones fail
                 for one in together:
-                    await self._answer(purpose, [one])
+                    await self._answer(key, [one])
             elif not together[0].answer.done():
                 together[0].answer.set_exception(error)
             return
-        remaining = iter(located)
+        remaining = iter(answers)
         for one in together:
             answer = [next(remaining) for _ in one.encodings]
             if not one.answer.done():

@@ -18,7 +18,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from core import errors
-from core.storage.files.disk import refusals
+from core.disk.files import disk_errors
 from service.errors import faults
 
 MEDIA_TYPE = "application/problem+json"
@@ -228,7 +228,7 @@ def declared(error: Exception) -> Exception:
         return faults.MemoryFull("There is not enough memory for this request now. Try again later.")
     if isinstance(error, OSError) and error.errno in SHORTAGES:
         try:
-            with refusals("do what was asked for"):
+            with disk_errors("do what was asked for"):
                 raise error
         except errors.PlacerecError as refusal:
             return refusal

@@ -1,1 +1,1 @@
-"""Frames without a map: descriptors, regions, the score of two."""
+"""Frames without a map: descriptors, regions, and the score of two frames."""

@@ -1,4 +1,4 @@
-"""Frames without a map: their descriptor, their regions, the score of two."""
+"""Routes of frames without a map: the descriptor or the regions of a frame, and the score of two frames."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.method.region_drawing import boxes, draw, layer_grids, strongest
-from service.engine.engine import in_thread
-from service.engine.queue import Encoded
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     QueueFull,
     UnsupportedMediaType,
@@ -29,11 +28,19 @@ from service.frames.schemas import (
     RegionsParameters,
     RegionsView,
 )
-from service.http.dependencies import EngineDep, PatienceDep, milliseconds_since, rounded, single_values, started
+from service.http.dependencies import (
+    DeadlineDep,
+    EngineDep,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
 from service.http.headers import preferred
 from service.http.openapi import BINARY, form_body, frame_body
 from service.http.uploads import read_frame, read_pair
-from service.queries.explanations import as_drawn, drawing, explained
+from service.queries.explanations import draw_explanation, explain_pair, scaled_for_drawing
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",
@@ -56,18 +63,18 @@ JSON, OCTETS, PNG = "application/json", "application/octet-stream", "image/png"
     },
 )
 async def encode(
-    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[EncoderParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The descriptor of a frame, float32: base64 in JSON, or the bytes alone (`Accept: application/octet-stream`).
 
     The bytes are little-endian; their encoder and the number of regions stand in the headers
     `X-Encoder` and `X-Regions`.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     identity = await in_thread(engine.resolve, options.joined(frame.fields).encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, deadline)
     regions = len(encoded.encoding.regions)
     if regions == 0:
         raise errors.NoRegions("The frame has no region of interest: it is blank, or nearly so.")
@@ -91,15 +98,15 @@ async def encode(
     responses={200: {"description": "The regions.", "content": {PNG: {"schema": BINARY}}}},
 )
 async def regions(
-    options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[RegionsParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The regions of interest of a frame: as JSON, or drawn (`?format=png`, or `Accept: image/png`)."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
     options = options.joined(frame.fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        encoded = await engine.inference.encode(identity, frame.data, patience)
+    with engine.queue.place():
+        encoded = await engine.queue.encode(identity, frame.data, deadline)
     found = encoded.encoding.regions
     layers = await in_thread(layer_grids, encoded.encoder)
     chosen = strongest(found, options.limit)
@@ -148,22 +155,22 @@ async def regions(
     responses={200: {"description": "The score.", "content": {PNG: {"schema": BINARY}}}},
 )
 async def match(
-    options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, patience: PatienceDep
+    options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
     """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
     itself reach where parts of it are plain."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     first, second, fields = await read_pair(request, engine.settings)
     options = options.joined(fields)
     identity = await in_thread(engine.resolve, options.encoder)
-    with engine.inference.place_in_queue():
-        a = await in_thread(as_drawn, await engine.inference.encode(identity, first, patience))
-        b = await engine.inference.encode(identity, second, patience)
+    with engine.queue.place():
+        a = await in_thread(scaled_for_drawing, await engine.queue.encode(identity, first, deadline))
+        b = await engine.queue.encode(identity, second, deadline)
     both = {stage: a.milliseconds[stage] + b.milliseconds[stage] for stage in a.milliseconds}
     wanted = options.format or ("png" if preferred(request.headers.get("accept"), JSON, PNG) == PNG else "json")
-    explanation = await in_thread(explained, a, b) if options.explain or wanted == "png" else None
+    explanation = await in_thread(explain_pair, a, b) if options.explain or wanted == "png" else None
     if explanation is not None and wanted == "png":
-        drawn = await in_thread(drawing, explanation, a.pixels, b.pixels)
+        drawn = await in_thread(draw_explanation, explanation, a.pixels, b.pixels)
         return Response(drawn, headers={"X-Encoder": identity, "X-Score": str(explanation.score)}, media_type=PNG)
     score = MatchScore(
         score=a.encoder.score(a.encoding, b.encoding),

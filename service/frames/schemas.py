@@ -1,4 +1,4 @@
-"""What a frame gives without a map: descriptor, regions, a score against another."""
+"""Descriptors, regions and scores of frames as JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from service.http.schemas import Milliseconds, Parameters
-from service.queries.explanation_schemas import ExplanationView
+from service.queries.schemas import ExplanationView
 
 
 class Descriptor(BaseModel):

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any, Protocol, Self, TypeVar
 
 from fastapi import Depends, Header, Path, Query, Request
 from pydantic import AfterValidator
 
 from core.places import check_map_id, check_place_id
+from core.storage import Map
 from service.access.roles import Principal
 from service.engine.engine import Engine
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of
 from service.http.schemas import PageParameters
-from service.http.uploads import instead_of, media_type
+from service.http.uploads import instead_of, media_type, read_frame
 
 JSON_TYPES = ("application/json", "application/merge-patch+json")
 
 
-async def _engine(request: Request) -> Engine:
-    engine: Engine = request.app.state.engine
-    return engine
+class FromState:
+    """A dependency that gives what the application keeps under a name (see :mod:`service.app.runtime`)."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    async def __call__(self, request: Request) -> Any:
+        return getattr(request.app.state, self.name)
 
 
 async def _principal(request: Request) -> Principal:
@@ -31,7 +37,7 @@ async def _principal(request: Request) -> Principal:
     return principal
 
 
-async def _patience(
+async def _request_deadline(
     request: Request,
     x_request_timeout: Annotated[
         float | None,
@@ -43,11 +49,11 @@ async def _patience(
             "service's own limit.",
         ),
     ] = None,
-) -> Patience:
+) -> RequestDeadline:
     intake = intake_of(request)
     if x_request_timeout is not None:
         intake.deadline = min(intake.deadline, request.state.started + x_request_timeout)
-    return Patience(intake.deadline, intake.hung_up)
+    return RequestDeadline(intake.deadline, intake.hung_up)
 
 
 async def single_values(request: Request) -> None:
@@ -74,6 +80,36 @@ async def json_body(request: Request) -> None:
         raise UnsupportedMediaType(f"Send the body as {' or '.join(JSON_TYPES)}{instead_of(kind)}.")
 
 
+class FrameOptions(Protocol):
+    """Parameters that stand beside one frame."""
+
+    @property
+    def encoder(self) -> str | None: ...
+    def joined(self, fields: Mapping[str, str]) -> Self: ...
+
+
+Options = TypeVar("Options", bound=FrameOptions)
+
+
+async def frame_for_map(request: Request, engine: Engine, map_id: str, options: Options) -> tuple[Map, bytes, Options]:
+    """What every route that takes one frame for a map begins with.
+
+    Returns:
+        The map, the bytes of the frame's file, and the parameters, those of a form's fields included.
+
+    Raises:
+        QueueFull: the encoder's queue is full, so the body is not read at all.
+        UnknownMap, MapQuarantined, WrongEncoder.
+        Others: as for ``read_frame``.
+    """
+    engine.queue.check_room()
+    map_ = await engine.map(map_id)
+    frame = await read_frame(request, engine.settings)
+    options = options.joined(frame.fields)
+    engine.assert_encoder(map_, options.encoder)
+    return map_, frame.data, options
+
+
 def started(request: Request) -> float:
     """When the request arrived (``time.monotonic``)."""
     moment: float = request.state.started
@@ -90,9 +126,9 @@ def rounded(milliseconds: Mapping[str, float]) -> dict[str, float]:
     return {stage: round(duration, 3) for stage, duration in milliseconds.items()}
 
 
-EngineDep = Annotated[Engine, Depends(_engine)]
+EngineDep = Annotated[Engine, Depends(FromState("engine"))]
 PrincipalDep = Annotated[Principal, Depends(_principal)]
-PatienceDep = Annotated[Patience, Depends(_patience)]
+DeadlineDep = Annotated[RequestDeadline, Depends(_request_deadline)]
 MapId = Annotated[str, Path(alias="map", description="Id of the map.", examples=["lab"]), AfterValidator(check_map_id)]
 PlaceId = Annotated[
     str, Path(alias="place", description="Id of the place.", examples=["p7"]), AfterValidator(check_place_id)

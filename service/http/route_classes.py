@@ -9,9 +9,10 @@ X-Request-Timeout) goes the framework's way, which also says what is wrong with 
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 from urllib.parse import parse_qsl
 
+from fastapi import params
 from fastapi.routing import APIRoute
 from pydantic import BaseModel, ValidationError
 from starlette.requests import Request
@@ -19,10 +20,13 @@ from starlette.responses import Response
 
 from core.errors import InvalidIdentifier
 from core.places import check_map_id
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.http.bodies import intake_of, json_size, parse_json
+from service.http.dependencies import FromState
 
-EXPECTED = {"map_id", "options", "request", "engine", "patience"}
+READ_HERE = {"map_id", "options", "request", "deadline"}
+"""Parameters of a route that are read without the framework; all others must come from the application's state."""
+
 DEADLINE = "x-request-timeout"
 KEPT = 512
 """Query strings whose parameters are remembered; the robots of one fleet send the same ones."""
@@ -32,18 +36,19 @@ LONGEST_KEPT = 256
 
 
 class QuickRoute(APIRoute):
-    """A fast route for functions with the parameters of ``EXPECTED``, where ``options`` is a frozen model.
+    """A route of the parameters ``map_id``, ``options`` (a frozen model), ``request``, ``deadline`` and ``FromState``.
 
     The function returns a model.  Functions with other parameters get the framework's own route.
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         careful = super().get_route_handler()
-        hints = get_type_hints(self.endpoint)
-        if hints.keys() - {"return"} != EXPECTED:
+        hints = get_type_hints(self.endpoint, include_extras=True)
+        kept = {name: state for name, hint in hints.items() if (state := _state_name(hint)) is not None}
+        if hints.keys() - {"return"} - kept.keys() != READ_HERE:
             return careful
         endpoint: Callable[..., Coroutine[Any, Any, BaseModel]] = self.endpoint
-        read = _Reader(hints["options"])
+        read = _Reader(get_type_hints(self.endpoint)["options"])
         exclude_unset = self.response_model_exclude_unset
 
         async def quick(request: Request) -> Response:
@@ -52,12 +57,19 @@ class QuickRoute(APIRoute):
             if options is None or DEADLINE in request.headers or not _is_map_id(name):
                 return await careful(request)
             intake = intake_of(request)
-            patience = Patience(intake.deadline, intake.hung_up)
-            engine = request.app.state.engine
-            answer = await endpoint(map_id=name, options=options, request=request, engine=engine, patience=patience)
+            deadline = RequestDeadline(intake.deadline, intake.hung_up)
+            given = {parameter: getattr(request.app.state, state) for parameter, state in kept.items()}
+            answer = await endpoint(map_id=name, options=options, request=request, deadline=deadline, **given)
             return Response(answer.model_dump_json(exclude_unset=exclude_unset), media_type="application/json")
 
         return quick
+
+
+def _state_name(hint: Any) -> str | None:
+    """Under which name the application keeps the value of a parameter; None for other parameters."""
+    marks = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    sources = (mark.dependency for mark in marks if isinstance(mark, params.Depends))
+    return next((source.name for source in sources if isinstance(source, FromState)), None)
 
 
 def _is_map_id(name: str) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 from starlette.requests import Request
 
 from core.errors import EmptyImage, ImageTooLarge
-from core.frames.images import read_header
+from core.frames.containers import read_header
 from service.errors.faults import InvalidRequest, UnsupportedMediaType
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part, read_form

@@ -1,1 +1,1 @@
-"""Long work in the background."""
+"""Jobs: long work in the background."""

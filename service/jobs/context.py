@@ -1,48 +1,65 @@
-"""A job from within: how it says how far it is, what it remembers, and how it learns that it is to stop."""
+"""What a running job uses: its context (progress, notes, cancellation), and encoding that lets requests go first."""
 
 from __future__ import annotations
 
+import asyncio
 import time
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
+from core.frames.masks import Mask
 from core.storage import Atlas, Map
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
+from service.engine.queue import RequestDeadline
+from service.errors.faults import ClientGone
 from service.jobs.records import Job
 
-if TYPE_CHECKING:
-    from service.jobs.jobs import Jobs
-
 Work = Callable[["JobContext"], Mapping[str, Any]]
-"""What a job does; its result is an object of JSON."""
+"""The function of a job; it returns the job's result as a JSON object."""
 
 NOTICE_SECONDS = 0.1
-"""Those who watch a job are told of its progress at most so often."""
+"""Watchers of a job are notified of its progress at most once in this time."""
 
 WRITING_SECONDS = 2.0
-"""Its progress is written down at most so often; how it ends always is."""
+"""The progress of a job is written to disk at most once in this time; its end is always written."""
+
+SLICE_SECONDS = 5.0
+"""A resumable job works for so long before it gives way to waiting jobs of other maps."""
 
 
 class JobCancelled(Exception):
-    """Raised within a job that somebody asked to stop; it undoes what must not stay, and lets it pass."""
+    """Raised in a job that was asked to stop.  The job undoes what must not stay half done, and lets it propagate."""
 
 
 class JobInterrupted(Exception):
-    """Raised within a job because the service stops; it lets it pass, and goes on at the next start if it can."""
+    """Raised in a job because the service stops.  The job lets it propagate; a resumable job goes on later."""
 
 
 class JobGivesWay(Exception):
-    """Raised within a job because others wait and it has had its share of time: it lets it pass, and goes on later."""
+    """Raised in a job whose time slice is over while others wait.  The job lets it propagate, and goes on later."""
 
 
-SLICE_SECONDS = 5.0
-"""So long a job that can be taken up again works before it gives way to those that wait."""
+class Supervisor(Protocol):
+    """The part of :class:`service.jobs.jobs.Jobs` that a job context uses."""
+
+    stopping: bool
+
+    def get(self, job_id: str) -> Job: ...
+    def others_wait(self, job_id: str) -> bool: ...
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None: ...
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None: ...
 
 
 class JobContext:
-    """What a job knows of itself while it runs, in the thread that runs it."""
+    """The interface between a running job and the service; it is used in the job's thread.
 
-    def __init__(self, jobs: Jobs, job: Job) -> None:
+    id, map_id, arguments, attempt, maps: as in :class:`service.jobs.records.Job`.
+    notes: what :meth:`remember` stored, also in an earlier attempt.
+    """
+
+    def __init__(self, jobs: Supervisor, job: Job) -> None:
         self._jobs, self._written, self._noticed = jobs, time.monotonic(), 0.0
         self._began = time.monotonic()
         self.id, self.map_id, self.arguments = job.id, job.map_id, job.arguments
@@ -51,48 +68,60 @@ class JobContext:
         self.maps = job.maps
 
     def map(self, atlas: Atlas, map_id: str | None = None) -> Map:
-        """One of the maps that the job was asked for, its own one unless another is named.
+        """One of the job's maps: the one with id ``map_id``, or by default the map that the job works on.
 
         Raises:
-            UnknownMap: it was deleted, though another one may have been created under its id.
-            MapQuarantined, StorageFailure.
+            UnknownMap: the map was deleted since the job was submitted, even if another one has its id now.
+            MapQuarantined: the map is damaged.
+            StorageFailure: the map cannot be read.
         """
         name = str(self.map_id) if map_id is None else map_id
         found = atlas.get(name)
-        if name in self.maps and self.maps[name] != born(found):
+        if name in self.maps and self.maps[name] != creation_time(found):
             raise UnknownMap(
-                f"The map {name!r} was deleted since the job was asked for; the one of that id now is another."
+                f"The map {name!r} was deleted after the job was submitted; the map of that id is now another one."
             )
         return found
 
     def progress(self, done: int, total: int | None = None, message: str = "") -> None:
-        """Say how far the job is; cheap enough to be called at every step."""
+        """Report how far the job is.  This is cheap: call it at every step.
+
+        Args:
+            done: steps that are done.
+            total: all steps; None while their number is not known.
+            message: what the job is doing; at most 500 characters are kept.
+        """
         now = time.monotonic()
         writing, noticing = now - self._written >= WRITING_SECONDS, now - self._noticed >= NOTICE_SECONDS
         self._written = now if writing else self._written
         self._noticed = now if noticing else self._noticed
-        self._jobs._progress(self.id, writing, noticing, done=done, total=total, message=message[:500])
+        self._jobs.report(self.id, writing, noticing, done=done, total=total, message=message[:500])
 
     def remember(self, **notes: Any) -> None:
-        """Write down, on disk when this returns, what the next attempt needs besides the arguments; JSON.
+        """Add notes (JSON values) for the next attempt of the job; they are on disk when this returns.
 
         Raises:
-            StorageFull, StorageFailure.
+            StorageFull, StorageFailure: the disk is full or refuses.
         """
         self.notes = {**self.notes, **notes}
-        self._jobs._note(self.id, self.notes)
+        self._jobs.note(self.id, self.notes)
 
     @property
     def cancelled(self) -> bool:
-        """Somebody has asked the job to stop."""
+        """Whether the job was asked to stop."""
         return self._jobs.get(self.id).cancelling
 
+    @property
+    def is_to_stop(self) -> bool:
+        """Whether the job was asked to stop, or the service is stopping."""
+        return self._jobs.stopping or self.cancelled
+
     def check_cancelled(self) -> None:
-        """Return unless the job is to stop.
+        """Raise if the job has to stop.
 
         Raises:
-            JobCancelled: it was asked to.
-            JobInterrupted: the service stops.
+            JobCancelled: the job was asked to stop.
+            JobInterrupted: the service is stopping.
         """
         if self._jobs.stopping:
             raise JobInterrupted
@@ -100,17 +129,18 @@ class JobContext:
             raise JobCancelled
 
     def give_way(self) -> None:
-        """Let jobs of other maps have their turn, if any wait and this one has worked for a while; for jobs that can be
-        taken up again, called where nothing is half done.
+        """Let waiting jobs of other maps run, if this one has had its time slice.
+
+        Only resumable jobs call this, at points where nothing is half done.
 
         Raises:
-            JobGivesWay: they go first.
+            JobGivesWay: other jobs run first.
         """
         if time.monotonic() - self._began >= SLICE_SECONDS and self._jobs.others_wait(self.id):
             raise JobGivesWay
 
     def pause(self, seconds: float) -> None:
-        """Do nothing for a while; raises like :meth:`check_cancelled`, without waiting for the end."""
+        """Sleep for some seconds; raises like :meth:`check_cancelled`, as soon as the job has to stop."""
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0:
             self.check_cancelled()
@@ -118,6 +148,82 @@ class JobContext:
         self.check_cancelled()
 
 
-def born(map_: Map) -> str:
-    """What tells a map from later ones of the same id: when it was created."""
+def creation_time(map_: Map) -> str:
+    """When a map was created, as ISO 8601; it distinguishes the map from later ones of the same id."""
     return map_.record.created_at.isoformat()
+
+
+Result = TypeVar("Result")
+
+POLL_SECONDS = 0.2
+"""A job that has to stop withdraws its waiting frames within this time."""
+
+YIELD_SECONDS = 1.0
+"""A job holds its frames back while requests wait for the encoder, but no longer than this, so that it ends."""
+
+LONGEST_SECONDS = 3600.0
+"""The longest time that the frames of a job wait for the encoder."""
+
+
+def yield_to_requests(engine: Engine, context: JobContext) -> None:
+    """Wait while requests wait for the encoder, for at most ``YIELD_SECONDS``.
+
+    Raises:
+        JobCancelled, JobInterrupted: the job has to stop.
+    """
+    until = time.monotonic() + YIELD_SECONDS
+    context.check_cancelled()
+    while engine.queue.waiting and time.monotonic() < until:
+        context.pause(0.01)
+
+
+def run_after_requests(
+    engine: Engine, context: JobContext, work: Callable[[RequestDeadline], Coroutine[Any, Any, Result]]
+) -> Result:
+    """Let waiting requests go first, then run a coroutine on the event loop; blocks the job's thread.
+
+    Args:
+        work: is called with a deadline that ends when the job has to stop.
+
+    Raises:
+        JobCancelled, JobInterrupted: the job has to stop.
+        Others: what the coroutine raises.
+    """
+
+    async def stopped() -> None:
+        while not context.is_to_stop:
+            await asyncio.sleep(POLL_SECONDS)
+
+    yield_to_requests(engine, context)
+    deadline = RequestDeadline(time.monotonic() + LONGEST_SECONDS, stopped)
+    try:
+        return asyncio.run_coroutine_threadsafe(work(deadline), engine.loop).result()
+    except ClientGone:
+        context.check_cancelled()
+        raise
+
+
+def encode_after_requests(
+    engine: Engine, context: JobContext, identity: str, frames: Sequence[bytes], masks: Sequence[Mask | None]
+) -> list[Encoded | Exception]:
+    """Encode the frames of a job after the requests that wait; blocks the job's thread.
+
+    The frames need no place in the queue, which is for requests, and share forward passes like bulk frames.
+
+    Args:
+        identity: the identity of the encoder.
+        frames: the bytes of the files.
+        masks: for each frame the part that is ignored.
+
+    Returns:
+        For each frame its encoding, without the pixels, or the error that kept it from being encoded.
+
+    Raises:
+        JobCancelled, JobInterrupted: the job has to stop.
+        EncoderNotInstalled: the encoder is not installed.
+    """
+
+    async def encode(deadline: RequestDeadline) -> list[Encoded | Exception]:
+        return await engine.encode_all(identity, frames, deadline, masks)
+
+    return run_after_requests(engine, context, encode)

@@ -1,8 +1,8 @@
-"""Long work: done in the background, told as it goes on, remembered over a restart.
+"""Jobs: long work in the background, which can be followed and cancelled, and survives a restart.
 
-A job is a function that runs in a worker's thread.  Of a kind that is registered (:meth:`Jobs.register`) it is made
-again from its arguments after a restart; of any other it is then said to have failed, and why.  Whether a job stops
-when it is asked to lies with it: it calls :meth:`JobContext.check_cancelled` where it can stop.
+A job is a function that runs in a worker's thread.  A job of a registered kind (:meth:`Jobs.register`) is resumed from
+its arguments and notes after a restart; any other is then marked as failed.  A job stops when it is asked to only at
+the points where it calls :meth:`JobContext.check_cancelled`.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ from service.jobs.records import DAMAGED, Job, JobRecords
 __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jobs", "Work"]
 
 MOST_RESULT_BYTES = 4 << 20
-"""Of a result as JSON."""
+"""The longest result, as JSON, that a job may have."""
 
 Discard = Callable[[Job], None]
-"""Clears away what a job had for itself, once it has ended in whatever way."""
+"""Removes the files of a job once the job has ended."""
 
 log = logging.getLogger("placerec.jobs")
 
 
 class Jobs:
-    """All jobs of a data directory.  From any thread; reading never waits for a disk.
+    """All jobs of a data directory.  Thread-safe; reading never waits for a disk.
 
     Args:
-        directory: that of the data, held by this process.
-        workers: jobs that run at one time; of one map at most one runs.
-        longest_queue: jobs that may wait.
-        history: jobs that have ended and are still told.
-        most_watchers: that may follow jobs at one time.
+        directory: the data directory, which this process holds.
+        workers: how many jobs run at one time; of one map at most one job runs.
+        longest_queue: how many jobs may wait.
+        history: how many ended jobs are remembered.
+        most_watchers: how many clients may follow jobs at one time.
 
     Raises:
-        DataDirectoryTooNew, StorageFull, StorageFailure.
+        DataDirectoryTooNew: a later version of placerec wrote the jobs' file.
+        StorageFull, StorageFailure: the jobs' file cannot be opened.
     """
 
     def __init__(
@@ -64,12 +65,12 @@ class Jobs:
         self._workers, self._longest_queue, self._history = workers, longest_queue, history
         self._most_watchers = most_watchers
         self.stopping = False
-        self._changed = threading.Condition()  # held by whoever changes a job
+        self._changed = threading.Condition()  # held while a job is changed
         self._records = JobRecords(directory)
         self._kinds: dict[str, Work] = {}
         self._discards: dict[str, Discard] = {}
         self._numbers = itertools.count(1)
-        self._gaveway: dict[str, tuple[int, int]] = {}  # behind whom a job waits that has given way
+        self._gave_way: dict[str, tuple[int, int]] = {}  # the position in the queue of jobs that gave way
         self._works: dict[str, Work] = {}
         self._jobs = {job.id: job for job in self._records.read()}
         self._last_number = self._records.last_number()
@@ -79,27 +80,32 @@ class Jobs:
     # Kinds, start and end
 
     def register(self, kind: str, work: Work, discard: Discard | None = None) -> None:
-        """Name a kind of job that can be begun anew: ``work`` does what ``context.arguments`` say, from any state
-        that an earlier attempt left; ``discard`` clears away what the job had for itself."""
+        """Register a kind of resumable jobs.
+
+        Args:
+            work: does what ``context.arguments`` say, and goes on from any state that an earlier attempt left.
+            discard: removes the files of a job that has ended.
+        """
         self._kinds[kind] = work
         if discard is not None:
             self._discards[kind] = discard
 
     def start(self) -> None:
-        """Take up what an earlier process left, and work; call it when all kinds are registered."""
+        """Resume the jobs of the last run of the service and start the workers; all kinds must be registered before."""
         for job in [job for job in self.all() if not job.ended]:
             if job.resumable and job.kind in self._kinds:
                 self._works[job.id] = self._kinds[job.kind]
                 if job.state == "running":
-                    self._change(job.id, state="queued", message="waits to go on after a restart of the service")
+                    self._change(job.id, state="queued", message="waits to be resumed after a restart of the service")
                 continue
-            was = "ran" if job.state == "running" else "waited"
-            why = "this kind of job cannot be taken up again"
+            state = "running" if job.state == "running" else "waiting"
+            why = "this kind of job cannot be resumed"
             if job.message == DAMAGED:
                 why = DAMAGED
             elif job.resumable:
                 why = f"this version of placerec knows no jobs of the kind {job.kind}"
-            self._end(job.id, "failed", problem=_problem(JobLost(f"The service ended while the job {was}, and {why}.")))
+            lost = JobLost(f"The service ended while the job was {state}, and {why}.")
+            self._end(job.id, "failed", problem=_problem(lost))
             self._discard(job)
         for number in range(self._workers):
             thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
@@ -107,23 +113,23 @@ class Jobs:
             self._threads.append(thread)
 
     def stop_soon(self) -> None:
-        """Ask what runs to stop where it can, and let those who watch go; returns at once."""
+        """Ask the running jobs to stop, and end the streams of watchers; returns at once."""
         with self._changed:
             self.stopping = True
             self._changed.notify_all()
         self._notify(None)
 
-    def close(self, patience: float = 10.0) -> None:
-        """Stop, and wait so many seconds for what runs: what has not stopped by then is found as it was killed."""
+    def close(self, timeout: float = 10.0) -> None:
+        """Stop, and wait at most ``timeout`` seconds for running jobs; those that go on count as killed."""
         self.stop_soon()
-        until = time.monotonic() + patience
+        until = time.monotonic() + timeout
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
             if thread.is_alive():
-                log.warning("a job does not stop; it is left behind")
+                log.warning("a job does not stop; the service stops without waiting for it")
         self._records.close()
 
-    # For those who ask
+    # Submitting, reading and cancelling
 
     def submit(
         self,
@@ -133,17 +139,17 @@ class Jobs:
         arguments: Mapping[str, Any] | None = None,
         maps: Mapping[str, str] | None = None,
     ) -> Job:
-        """Let a job wait for its turn; it is on disk when this returns.
+        """Add a job to the queue; it is on disk when this returns.
 
         Args:
-            work: what it does; without it the kind is a registered one, which survives a restart.
-            arguments: for the work, as JSON.
-            maps: those that it is asked for, by id, and when each was created (``job_context.born``): the job fails
-                rather than to work on a later one of the same id.
+            work: the function of the job; None: that of the registered kind, which survives a restart.
+            arguments: the arguments of the work; JSON values.
+            maps: the ids of the maps that the job uses, with their ``creation_time``: the job fails if one of them
+                was replaced by another map of the same id.
 
         Raises:
-            JobQueueFull: too many wait.
-            StorageFull, StorageFailure: it was not taken.
+            JobQueueFull: too many jobs are waiting.
+            StorageFull, StorageFailure: the job was not accepted.
         """
         resumable = work is None
         chosen = self._kinds[kind] if work is None else work
@@ -168,20 +174,20 @@ class Jobs:
         return job
 
     def check_room(self) -> None:
-        """Raise JobQueueFull if no further job may wait; for before a long body is read."""
+        """Raise JobQueueFull if no further job may wait; a route calls it before it reads a long body."""
         if sum(job.state == "queued" for job in self._jobs.copy().values()) >= self._longest_queue:
-            raise JobQueueFull(f"{self._longest_queue} jobs wait already; send this one again later.")
+            raise JobQueueFull(f"{self._longest_queue} jobs are waiting already; send this one again later.")
 
     @property
     def watchers(self) -> int:
-        """Clients that follow jobs now."""
+        """The number of clients that follow jobs now."""
         return len(self._watchers)
 
     def get(self, job_id: str) -> Job:
-        """A job as it is now.
+        """The present state of a job.
 
         Raises:
-            UnknownJob: there is none, or it ended so long ago that it is forgotten.
+            UnknownJob: there is no such job, or it ended so long ago that it is forgotten.
         """
         found = self._jobs.get(job_id)
         if found is None:
@@ -191,22 +197,22 @@ class Jobs:
         return found
 
     def all(self) -> list[Job]:
-        """Those that are remembered, the oldest first."""
+        """All jobs that are remembered, the oldest first."""
         return sorted(self._jobs.copy().values(), key=lambda job: job.number)
 
     def cancel(self, job_id: str) -> Job:
-        """Ask a job to stop.  One that waits is cancelled at once, one that runs when it gets to where it can stop.
+        """Ask a job to stop.  A waiting job is cancelled at once, a running one at the next point where it can stop.
 
         Raises:
-            UnknownJob: there is none.
-            JobEnded: it has succeeded or failed.
-            StorageFull, StorageFailure: it was not asked.
+            UnknownJob: there is no such job.
+            JobEnded: the job has succeeded or failed.
+            StorageFull, StorageFailure: the request could not be stored; the job goes on.
         """
         with self._changed:
             job = self.get(job_id)
             if job.state in ("succeeded", "failed"):
                 raise JobEnded(f"The job {job_id} has {job.state} already.")
-            if ended := job.state == "queued" and (not job.attempt or job_id in self._gaveway):
+            if ended := job.state == "queued" and (not job.attempt or job_id in self._gave_way):
                 job = self._end(job_id, "cancelled")
             elif job.state != "cancelled" and not job.cancelling:
                 changed = replace(job, cancelling=True, change=job.change + 1)
@@ -220,13 +226,13 @@ class Jobs:
 
     @contextmanager
     def watching(self, job_id: str) -> Iterator[asyncio.Event]:
-        """An event of the running loop that is set whenever the job has changed, or the service stops.
+        """An event of the running loop that is set whenever the job changes, or when the service stops.
 
         Raises:
-            TooManyWatchers.
+            TooManyWatchers: too many clients follow jobs already.
         """
         if len(self._watchers) >= self._most_watchers:
-            raise TooManyWatchers("Too many follow jobs already; read the job instead, or come again later.")
+            raise TooManyWatchers("Too many clients follow jobs already; read the job instead, or try again later.")
         watcher = (job_id, asyncio.get_running_loop(), asyncio.Event())
         self._watchers.append(watcher)
         try:
@@ -238,11 +244,11 @@ class Jobs:
 
     def _work(self) -> None:
         while (job := self._take()) is not None:
-            if job.id not in self._gaveway:  # else that it began was told
+            if job.id not in self._gave_way:  # a job that gave way was noted when it began
                 _note(job, "running")
             try:
                 self._do(job)
-            except Exception:  # a defect of ours: the job is told as failed, and the worker goes on
+            except Exception:  # this code has a defect: the job has failed, and the worker goes on
                 log.exception("job %s failed", job.id)
                 self._end(job.id, "failed", problem=_problem(RuntimeError()))
 
@@ -258,8 +264,8 @@ class Jobs:
         except JobInterrupted:
             ended = self._put_off(job)
         except JobGivesWay:
-            self._gaveway[job.id] = (self._last_number, next(self._numbers))
-            ended = self._change(job.id, state="queued", message="waits for others to have their turn")
+            self._gave_way[job.id] = (self._last_number, next(self._numbers))
+            ended = self._change(job.id, state="queued", message="waits for the jobs of other maps")
             with self._changed:
                 self._changed.notify_all()
         except Exception as error:
@@ -275,7 +281,7 @@ class Jobs:
         log.info("job %s", ended.state, extra={"job": job.id, "kind": job.kind, "map": job.map_id, "seconds": seconds})
 
     def _take(self) -> Job | None:
-        """The next job, which runs from now on; waits for one; None when the service stops."""
+        """Wait for the next job and mark it as running; None when the service stops."""
         with self._changed:
             while not self.stopping:
                 for job in self._ready():
@@ -285,7 +291,7 @@ class Jobs:
         return None
 
     def _ready(self, but_for: str | None = None) -> list[Job]:
-        """Jobs that may run now, in their order; those of one map run one after another, as they were asked for."""
+        """The jobs that may run now, in order; jobs of one map run one after another, in the order of submission."""
         first: dict[str | None, int] = {}
         for job in (open_ := [job for job in self.all() if not job.ended and job.id != but_for]):
             first.setdefault(job.map_id, job.number)
@@ -296,7 +302,7 @@ class Jobs:
             and job.id in self._works
             and (job.map_id is None or first[job.map_id] == job.number)
         ]
-        return sorted(ready, key=lambda job: self._gaveway.get(job.id, (job.number, 0)))
+        return sorted(ready, key=lambda job: self._gave_way.get(job.id, (job.number, 0)))
 
     def others_wait(self, job_id: str) -> bool:
         """Whether jobs of other maps wait that could run if this one gave way."""
@@ -306,20 +312,21 @@ class Jobs:
 
     def _put_off(self, job: Job) -> Job:
         if job.resumable:
-            return self._change(job.id, state="queued", message="goes on when the service starts again")
-        why = "The service was stopped while the job ran, and this kind of job cannot be taken up again."
+            return self._change(job.id, state="queued", message="is resumed when the service starts again")
+        why = "The service was stopped while the job was running, and this kind of job cannot be resumed."
         return self._end(job.id, "failed", problem=_problem(JobLost(why)))
 
     def _discard(self, job: Job) -> None:
         if (discard := self._discards.get(job.kind)) is not None:
             try:
                 discard(job)
-            except Exception as error:  # what is left is cleared away at the next start
-                log.warning("what the job %s had cannot be cleared away: %s", job.id, error)
+            except Exception as error:  # the files are removed at the next start
+                log.warning("the files of the job %s cannot be removed: %s", job.id, error)
 
     # Changes
 
-    def _progress(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
+    def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None:
+        """Note the progress of a job: on disk if ``writing``, and for its watchers if ``noticing``."""
         if writing:
             self._change(job_id, **progress)
             return
@@ -330,14 +337,19 @@ class Jobs:
         if noticing:
             self._notify(job_id)
 
-    def _note(self, job_id: str, notes: Mapping[str, Any]) -> None:
+    def note(self, job_id: str, notes: Mapping[str, Any]) -> None:
+        """Store the notes of a job for its next attempt.
+
+        Raises:
+            StorageFull, StorageFailure: the disk is full or refuses.
+        """
         with self._changed:
             job = replace(self._jobs[job_id], notes=dict(notes))
             self._records.put(job)
             self._jobs[job_id] = job
 
     def _end(self, job_id: str, state: str, **outcome: Any) -> Job:
-        """The end of a job, before which the oldest that have ended are forgotten."""
+        """End a job, and forget the oldest ended jobs beyond ``history``."""
         with self._changed:
             past = [job for job in self.all() if job.ended]
             past = past[: max(0, len(past) + 1 - self._history)]
@@ -346,15 +358,15 @@ class Jobs:
             ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
             _note(ended, state)
             self._works.pop(job_id, None)
-            self._gaveway.pop(job_id, None)
+            self._gave_way.pop(job_id, None)
             self._changed.notify_all()  # another one of the same map may run
             if past:
-                with suppress(PlacerecError):  # they are forgotten at another time
+                with suppress(PlacerecError):  # they are removed from disk another time
                     self._records.forget([job.number for job in past])
         return ended
 
     def _change(self, job_id: str, **changes: Any) -> Job:
-        """Another state; a disk that refuses to keep it does not end the work."""
+        """Change a job in memory and on disk; if the disk refuses, the job goes on all the same."""
         with self._changed:
             before = self._jobs[job_id]
             change = 0 if "attempt" in changes else before.change + 1
@@ -367,7 +379,7 @@ class Jobs:
         return job
 
     def _notify(self, job_id: str | None) -> None:
-        """Wake those who watch a job; all for None."""
+        """Wake the watchers of a job; all watchers for None."""
         for watched, loop, event in self._watchers.copy():
             if job_id in (None, watched):
                 with suppress(RuntimeError):  # its loop has ended

@@ -1,4 +1,4 @@
-"""Long work as it is told and remembered: one record a job, in a small SQLite file beside the maps."""
+"""The records of jobs, in a small SQLite file in the data directory."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+from core.disk.files import Damage, disk_errors
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, TooNew
 from core.errors import DataDirectoryTooNew
-from core.storage.files.disk import Damage, refusals
 
 FILE = "jobs.sqlite"
-VERSION = 3
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 ENDED: frozenset[JobState] = frozenset({"succeeded", "failed", "cancelled"})
@@ -50,29 +50,33 @@ _TABLE = """CREATE TABLE jobs (
     asker TEXT NOT NULL DEFAULT '{}'
 ) STRICT"""
 
-_MIGRATIONS = {
-    1: "ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'",
-    2: "ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'",
-}
-"""From a version to the next one."""
+_SCHEMA = Schema(
+    application_id=0,
+    version=3,
+    create=[_TABLE],
+    migrations={
+        1: ["ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'"],
+        2: ["ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'"],
+    },
+)
 
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of long work, as of one moment.
+    """The state of a job at one moment.
 
-    number: grows from job to job.
-    arguments: what it was asked for, as JSON.
-    resumable: after a restart it is done again from ``arguments`` and ``notes``.
-    cancelling: it was asked to stop.
-    attempt: how often it was begun.
-    change: counts what became of it within the attempt.
-    done, total: of whatever it works through; the total may not be known yet.
-    notes: what it wrote down for its next attempt.
-    result: what it found, once it has succeeded.
-    problem: why it failed, as a problem object.
-    maps: the maps that it was asked for, by id, and when each was created: one of the same id that was created at
-        another time is another map.
+    number: counts the jobs; a later job has a larger number.
+    arguments: the arguments of the job, as JSON values.
+    resumable: whether the job is resumed from ``arguments`` and ``notes`` after a restart.
+    cancelling: whether the job was asked to stop.
+    attempt: how often the job was started.
+    change: counts the changes of the job within the attempt.
+    done, total: steps that are done, and all steps; the total is None while it is not known.
+    notes: what the job has stored for its next attempt.
+    result: the result of a job that has succeeded.
+    problem: why the job failed, as a problem object (RFC 9457).
+    maps: the ids of the maps that the job uses, with the time at which each was created: a map of the same id that was
+        created at another time is another map.
     asker: who asked for it, as ``service.access.audit.Asker`` has it; for the audit trail.
     """
 
@@ -100,59 +104,59 @@ class Job:
 
     @property
     def ended(self) -> bool:
-        """Nothing will become of it any more."""
+        """Whether the job has succeeded, failed or been cancelled."""
         return self.state in ENDED
 
     @property
     def version(self) -> str:
-        """Names this moment of the job; of two, the later one differs."""
+        """Identifies this state of the job; every change gives another version."""
         return f"{self.attempt}.{self.change}"
 
 
 class JobRecords:
-    """The file; from any thread.  What a method wrote is synced when it returns.
+    """The file of the jobs.  Thread-safe; what a method writes is synced when it returns.
 
-    Every method may raise StorageFull and StorageFailure: the disk refuses.
+    Every method may raise StorageFull and StorageFailure.
     """
 
     def __init__(self, directory: Path) -> None:
-        """Open the file of a data directory that this process holds.
+        """Open the file in a data directory that this process has locked.
 
-        One that is damaged is put aside: jobs are work to be done again, not what the maps hold.  What can still be
-        read of it is kept, as jobs that cannot go on.
+        A damaged file is renamed and replaced by a new one; the jobs that can still be read from it are kept as jobs
+        that cannot be resumed.
 
         Raises:
-            DataDirectoryTooNew: a later version of placerec wrote it.
-            StorageFull, StorageFailure.
+            DataDirectoryTooNew: a later version of placerec wrote the file.
+            StorageFull, StorageFailure: the file cannot be opened.
         """
         self._lock = threading.Lock()
         self.put_aside: str | None = None
-        """Under which name the file was put aside because it was damaged, if it was."""
-        path = directory / FILE
-        with refusals(f"open {path}"):
+        """The new name of a damaged file; None if the file was not damaged."""
+        readable = f"SELECT {', '.join(_NAMES)} FROM jobs"
+        file = SqliteFile(directory / FILE, _SCHEMA, {**DURABLE, "journal_size_limit": 1 << 20}, [readable])
+        with disk_errors(f"open {file.path}", FILE):
             try:
-                self._connection = _open(path)
+                self._connection = file.open()
+            except TooNew as error:
+                raise DataDirectoryTooNew(
+                    f"{file.path} was written by a later version of placerec (schema {error.version})."
+                ) from error
             except Damage as damage:
-                aside = path.with_name(f"{FILE}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
-                log.error("%s cannot be read and is put aside as %s: %s", path, aside.name, damage)
-                salvaged = _salvaged(path)
-                path.rename(aside)
-                for suffix in ("-wal", "-shm"):
-                    with suppress(FileNotFoundError):
-                        path.with_name(FILE + suffix).unlink()
-                self._connection, self.put_aside = _open(path), aside.name
+                salvaged = _salvaged(file.path)
+                self.put_aside = file.put_aside(damage).name
+                self._connection = file.open()
                 for job in salvaged:
                     with suppress(sqlite3.IntegrityError, sqlite3.ProgrammingError, ValueError, TypeError):
-                        self.put(job)  # unless nothing that a job can be is left of it
+                        self.put(job)  # a record that is no valid job is dropped
 
     def close(self) -> None:
-        """Nothing can be written from here on."""
+        """Close the file."""
         with self._lock:
             self._connection.close()
 
     def read(self) -> list[Job]:
         """All jobs, the oldest first."""
-        with self._lock, refusals("read the jobs"), closing(self._connection.cursor()) as cursor:
+        with self._lock, disk_errors("read the jobs"), closing(self._connection.cursor()) as cursor:
             cursor.execute("SELECT * FROM jobs ORDER BY number")
             names = [column[0] for column in cursor.description]
             return [_readable(dict(zip(names, values, strict=True))) for values in cursor.fetchall()]
@@ -161,75 +165,28 @@ class JobRecords:
         """Write a job, new or changed."""
         columns = _columns(job)
         names, marks = ", ".join(columns), ", ".join("?" * len(columns))
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"INSERT OR REPLACE INTO jobs ({names}) VALUES ({marks})", tuple(columns.values()))
 
     def update(self, job: Job) -> None:
-        """Write what changes of a job as it goes on: all but its arguments and notes, which may be long."""
+        """Write a changed job, except its arguments and notes, which do not change here and may be long."""
         columns = {name: value for name, value in _columns(job).items() if name not in ("arguments", "notes")}
         assignments = ", ".join(f"{name} = ?" for name in columns)
-        with self._lock, refusals("write down a job"):
+        with self._lock, disk_errors("write down a job"):
             self._connection.execute(f"UPDATE jobs SET {assignments} WHERE number = ?", (*columns.values(), job.number))
 
     def forget(self, numbers: list[int]) -> None:
         """Delete jobs."""
-        with self._lock, refusals("forget a job"):
+        with self._lock, disk_errors("forget a job"):
             self._connection.execute(
                 "DELETE FROM jobs WHERE number IN (SELECT value FROM json_each(?))", (json.dumps(numbers),)
             )
 
     def last_number(self) -> int:
-        """The largest number that a job ever had; 0 if there was none."""
-        with self._lock, refusals("read the jobs"):
+        """The largest number that a job ever had; 0 if there never was a job."""
+        with self._lock, disk_errors("read the jobs"):
             found = self._connection.execute("SELECT seq FROM sqlite_sequence WHERE name = 'jobs'").fetchone()
         return 0 if found is None else int(found[0])
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    """A connection to the file, which is made if it is not there.
-
-    Raises:
-        Damage: it is no database, or not one of ours.
-    """
-    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA journal_size_limit = 1048576")
-        (version,) = connection.execute("PRAGMA user_version").fetchone()
-        if version > VERSION:
-            raise DataDirectoryTooNew(f"{path} was written by a later version of placerec (schema {version}).")
-        if version == 0:
-            if connection.execute("SELECT 1 FROM sqlite_schema").fetchone():
-                raise Damage("it holds tables that are not ours")
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_TABLE)
-            connection.execute(f"PRAGMA user_version = {VERSION}")
-            connection.execute("COMMIT")
-        for old in range(version or VERSION, VERSION):
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_MIGRATIONS[old])
-            connection.execute(f"PRAGMA user_version = {old + 1}")
-            connection.execute("COMMIT")
-        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
-            if line != "ok":
-                raise Damage(line)
-        connection.execute(f"SELECT {', '.join(_NAMES)} FROM jobs").fetchall()  # can all of it be read?
-        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
-        connection.execute("UPDATE jobs SET id = id WHERE false")
-    except sqlite3.DatabaseError as error:
-        connection.close()
-        told = str(error)
-        if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
-            raise  # the disk refuses
-        raise Damage(str(error)) from error
-    except UnicodeDecodeError as error:
-        connection.close()
-        raise Damage("its text is damaged") from error
-    except BaseException:
-        connection.close()
-        raise
-    return connection
 
 
 def _columns(job: Job) -> dict[str, Any]:
@@ -274,7 +231,7 @@ def _job(columns: dict[str, Any]) -> Job:
 
 
 def _readable(columns: dict[str, Any]) -> Job:
-    """A job; of one whose record makes no sense, what can be told of it: it cannot go on."""
+    """The job of a row; a damaged row gives a job without arguments, which cannot be resumed."""
     try:
         return _job(dict(columns))
     except (ValueError, TypeError, KeyError) as error:
@@ -286,7 +243,7 @@ def _readable(columns: dict[str, Any]) -> Job:
 
 
 def _salvaged(path: Path) -> list[Job]:
-    """The jobs of a damaged file, as far as it can be read; none of them can go on."""
+    """The jobs that can be read from a damaged file, none of which can be resumed."""
     found: dict[int, Job] = {}
     with (
         suppress(sqlite3.Error, UnicodeDecodeError, TypeError),

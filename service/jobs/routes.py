@@ -1,4 +1,4 @@
-"""Jobs: long work that goes on in the background, to be listed, followed and cancelled."""
+"""Routes of jobs: list, read, follow and cancel."""
 
 from __future__ import annotations
 
@@ -10,31 +10,45 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Path, Query, Request
 from pydantic import Field
-from starlette.responses import Response, StreamingResponse
+from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
-from core.storage.database.cursors import Listing, decode_number, encode_cursor
+from core.storage.pagination import Listing, decode_number, encode_cursor
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
-from service.engine.engine import Engine
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, PrincipalDep, single_values
+from service.http.dependencies import FromState, PrincipalDep, single_values
 from service.http.schemas import PageParameters
-from service.jobs.jobs import NOTICE_SECONDS, Jobs
+from service.jobs.context import NOTICE_SECONDS
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView
+from service.settings import Settings
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
 
 EVENT_STREAM = "text/event-stream"
 HEARTBEAT_SECONDS = 10.0
-"""A stream says at least so often that it is alive."""
+"""A stream of events sends a comment at least so often, so that connections stay open."""
 
 LONGEST_WAIT = 60.0
+"""The longest time, in seconds, that a read of a job waits for its end."""
+
+JobsDep = Annotated[Jobs, Depends(FromState("jobs"))]
+
+
+def location_of(job: Job, settings: Settings) -> str:
+    """The path at which a job can be read, for the header ``Location``."""
+    return f"{settings.root_path}{router.prefix}/{job.id}"
+
+
+def accepted(job: Job, settings: Settings) -> Response:
+    """The answer 202 with a job that was submitted, and its path in ``Location``."""
+    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location_of(job, settings)})
 
 
 class JobPageParameters(PageParameters):
-    """Which jobs."""
+    """The parameters of a list of jobs."""
 
     map: str | None = Field(default=None, max_length=64, description="Only the jobs of this map.")
     kind: str | None = Field(default=None, max_length=64, description="Only the jobs of this kind.")
@@ -56,13 +70,13 @@ Wait = Annotated[
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-async def list_jobs(page: JobPageQuery, engine: EngineDep, principal: PrincipalDep) -> JobPage:
+async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> JobPage:
     """List jobs, the newest first; of those that have ended only the latest are kept."""
     listing: Listing = ["jobs", page.map, page.kind, page.state]
     after = decode_number(listing, page.cursor)
     found = [
         job
-        for job in reversed(engine.jobs.all())
+        for job in reversed(jobs.all())
         if (after < 0 or job.number < after)
         and page.map in (None, job.map_id)
         and page.kind in (None, job.kind)
@@ -75,16 +89,16 @@ async def list_jobs(page: JobPageQuery, engine: EngineDep, principal: PrincipalD
 
 
 @router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
-async def read_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
+async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
     """Read how a job stands. With `wait` the answer comes when it has ended, or when that time is up."""
-    job = _job_for(engine, principal, job_id)
+    job = _job_for(jobs, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
-        with engine.jobs.watching(job_id) as changed:
-            while not (job := engine.jobs.get(job_id)).ended and not engine.jobs.stopping:
+        with jobs.watching(job_id) as changed:
+            while not (job := jobs.get(job_id)).ended and not jobs.stopping:
                 if not await _wait(changed, until - time.monotonic()):
                     break
-    return JobView.of(engine.jobs.get(job_id))
+    return JobView.of(jobs.get(job_id))
 
 
 @router.get(
@@ -101,18 +115,18 @@ async def read_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep, wa
     },
 )
 async def follow_job(
-    job_id: JobId, request: Request, engine: EngineDep, principal: PrincipalDep, last_event_id: LastEventId = None
+    job_id: JobId, request: Request, jobs: JobsDep, principal: PrincipalDep, last_event_id: LastEventId = None
 ) -> Response:
     """Follow a job by server-sent events.
 
     Each event tells all there is to know of the job, so that one who comes late, or again with
     `Last-Event-ID`, misses nothing that still holds.
     """
-    job = _job_for(engine, principal, job_id)
+    job = _job_for(jobs, principal, job_id)
     if job.ended and last_event_id == job.version:
-        return Response(status_code=204)  # which tells a browser not to come again
-    stream = _events(engine.jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
-    first = await anext(stream)  # a refusal comes as a problem, not within the stream
+        return Response(status_code=204)  # this status stops a browser from reconnecting
+    stream = _events(jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
+    first = await anext(stream)  # TooManyWatchers is answered as a problem, not within the stream
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
     return StreamingResponse(_after(first, stream), media_type=EVENT_STREAM, headers=headers)
 
@@ -120,39 +134,39 @@ async def follow_job(
 @router.post(
     "/{job}/cancel", responses=problem_documentation(UnknownJob, JobEnded, errors.StorageFull, errors.StorageFailure)
 )
-def cancel_job(job_id: JobId, engine: EngineDep, principal: PrincipalDep) -> JobView:
+def cancel_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep) -> JobView:
     """Ask a job to stop.
 
     One that waits is cancelled at once; one that runs stops where it can and undoes what must not
     stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
     """
-    job = _job_for(engine, principal, job_id)
+    job = _job_for(jobs, principal, job_id)
     needed = OPERATIONS.get(str(job.asker.get("operation")), UNLISTED).role
     if not covers(principal.role, needed):
         raise RoleTooLow(f"The key {principal.name!r} has the role {principal.role}; this job needs {needed}.")
-    return JobView.of(engine.jobs.cancel(job_id))
+    return JobView.of(jobs.cancel(job_id))
 
 
 def maps_of(job: Job) -> set[str | None]:
-    """The maps that a job has to do with; None for one that has to do with none in particular."""
+    """The ids of the maps that a job uses; None is among them if the job works on no map in particular."""
     named = {job.arguments.get(name) for name in ("from", "to")}
     return {job.map_id, *job.maps, *(name for name in named if isinstance(name, str))}
 
 
-def _job_for(engine: Engine, principal: Principal, job_id: str) -> Job:
-    """A job, if all its maps are the caller's; for any other it is not there.
+def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
+    """A job, if the caller may use all its maps.
 
     Raises:
-        UnknownJob.
+        UnknownJob: there is no such job, or the caller may not use one of its maps.
     """
-    job = engine.jobs.get(job_id)
+    job = jobs.get(job_id)
     if not principal.may_use(*maps_of(job)):
         raise UnknownJob(f"There is no job {job_id[:80]!r}.")
     return job
 
 
 async def _wait(changed: asyncio.Event, seconds: float) -> bool:
-    """Whether something changed within so many seconds."""
+    """Whether the event was set within some seconds; clears it."""
     try:
         async with asyncio.timeout(max(0.0, seconds)):
             await changed.wait()
@@ -163,14 +177,14 @@ async def _wait(changed: asyncio.Event, seconds: float) -> bool:
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
-    """The stream, from behind the event ``last`` to the end of the job, of the service, or of the caller's key."""
+    """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
     with jobs.watching(job_id) as changed:
         yield ": placerec\n\n"
         while True:
             try:
                 job = jobs.get(job_id)
             except UnknownJob:
-                return  # it ended and was forgotten, so long did the caller not read
+                return  # the job ended and was forgotten before the caller read on
             if job.version != last:
                 last = job.version
                 yield _event(job)

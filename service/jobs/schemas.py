@@ -1,4 +1,4 @@
-"""Jobs: long work as it is shown."""
+"""Jobs as JSON."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class JobView(BaseModel):
 
     @classmethod
     def of(cls, job: Job) -> JobView:
-        """A job as callers see it."""
+        """The JSON view of a job."""
         return cls(
             id=job.id,
             kind=job.kind,

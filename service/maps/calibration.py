@@ -3,36 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import (
     TOGETHER,
-    Advance,
-    Questions,
-    calibrated,
-    labelled,
-    map_itself,
-    second_traverse,
-    warnings_on,
+    LabelledQueries,
+    ProgressCallback,
+    calibrate_map,
+    calibration_warnings,
+    queries_from_labels,
+    queries_from_map,
+    queries_from_traverse,
 )
-from core.recognition.localization import calibration_of
+from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
-from service.jobs.background import stand_back
-from service.jobs.jobs import JobContext
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
-from service.places.own_frames import load_encoder
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.engine.engine import Engine
+from service.jobs.context import JobContext, yield_to_requests
+from service.maps.schemas import CalibrationOrder, CalibrationReport
 
 KIND = "calibrate"
 
 
 def measured(
-    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: Advance
+    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
 ) -> CalibrationReport:
     """Ask a map, and report what follows; nothing is stored.
 
@@ -44,9 +40,9 @@ def measured(
         Others: what ``advance`` raises.
     """
     snapshot = map_.snapshot()
-    questions = _questions(map_, snapshot, order, encodings)
+    queries = _queries(map_, snapshot, order, encodings)
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = calibrated(map_, encoder, snapshot, questions, order.target, source, advance)
+    found = calibrate_map(map_, encoder, snapshot, queries, order.target, source, advance)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -56,7 +52,7 @@ def measured(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=warnings_on(found, order.method),
+        warnings=calibration_warnings(found, order.method),
     )
 
 
@@ -113,9 +109,9 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         context.progress(done, total)
         context.check_cancelled()
         if done % TOGETHER == 0:
-            stand_back(engine, context)
+            yield_to_requests(engine, context)
 
-    report = measured(map_, load_encoder(engine, map_), order, [], advance)
+    report = measured(map_, engine.load_encoder(map_), order, [], advance)
     told = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=told)
@@ -123,11 +119,11 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     return told
 
 
-def _questions(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> Questions:
+def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
     if order.method == "frames":
         assert order.labels is not None
-        return labelled(map_, snapshot, encodings, [label.place for label in order.labels])
+        return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
     if order.method == "sequence":
         assert order.sequence is not None
-        return second_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
-    return map_itself(map_, snapshot, order.most)
+        return queries_from_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
+    return queries_from_map(map_, snapshot, order.most)

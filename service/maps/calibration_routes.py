@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Depends, Request, Response
-from starlette.responses import JSONResponse
 
 from core import errors
 from core.method.encoder import Encoding
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     DeadlineExceeded,
     EncoderNotInstalled,
@@ -22,15 +21,16 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import json_size, parse_json
-from service.http.dependencies import EngineDep, IfMatch, MapId, PatienceDep, single_values
+from service.http.dependencies import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.headers import expected_revision
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
-from service.jobs.context import born
-from service.jobs.routes import router as jobs
+from service.jobs.context import creation_time
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.calibration import KIND, arguments_of, measured, store
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
+from service.maps.schemas import CalibrationOrder, CalibrationReport
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -77,7 +77,7 @@ BODY: dict[str, Any] = {
     responses={202: {"model": JobView, "description": "The job that does it, if `background` is asked for."}},
 )
 async def calibrate_map(
-    map_id: MapId, request: Request, engine: EngineDep, patience: PatienceDep, if_match: IfMatch = None
+    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, deadline: DeadlineDep, if_match: IfMatch = None
 ) -> CalibrationReport | Response:
     """Measure when a map's answers are to be believed, and make that its calibration.
 
@@ -89,7 +89,7 @@ async def calibrate_map(
     map_ = await engine.map(map_id)
     expected = expected_revision(if_match, map_.record.revision)
     if media_type(request) == FORM:
-        order, encodings = await _labelled_frames(engine, map_, request, patience)
+        order, encodings = await _labelled_frames(engine, map_, request, deadline)
     else:
         order, encodings = await _order(request), []
     try:
@@ -98,13 +98,12 @@ async def calibrate_map(
         raise EncoderNotInstalled(str(error)) from error
     request.state.noted = {"map": map_id, "method": order.method}
     if order.background:
-        arguments, maps = arguments_of(map_, order, expected), {map_id: born(map_)}
-        job = await in_thread(engine.jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
-        location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-        return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+        arguments, maps = arguments_of(map_, order, expected), {map_id: creation_time(map_)}
+        job = await in_thread(jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
+        return accepted(job, engine.settings)
 
     def advance(_done: int, _total: int) -> None:
-        if patience.left() <= 0:
+        if deadline.seconds_left() <= 0:
             raise DeadlineExceeded(
                 "The time was up before all was measured: ask in the background. Nothing was stored."
             )
@@ -134,7 +133,7 @@ async def _order(request: Request) -> CalibrationOrder:
 
 
 async def _labelled_frames(
-    engine: Engine, map_: Map, request: Request, patience: Patience
+    engine: Engine, map_: Map, request: Request, deadline: RequestDeadline
 ) -> tuple[CalibrationOrder, list[Encoding]]:
     """The order and the encoded frames of a form, in the order of its labels.
 
@@ -143,7 +142,7 @@ async def _labelled_frames(
         UnknownCamera: the map has none of a label's name.
         InvalidImage, NoRegions: one cannot be used; nothing is calibrated then.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     value, others = json_part(await read_many(request, engine.settings), "calibration")
     json_size(value, "The part 'calibration'")
     order = validated(CalibrationOrder, value)
@@ -156,8 +155,8 @@ async def _labelled_frames(
     for label in wanted:
         check_part(files[label], engine.settings)
     masks = [await camera_mask(map_, label.camera) for label in order.labels]
-    with engine.inference.place_in_queue(len(wanted)):
-        outcomes = await engine.encode_all_for(map_, [files[name].data for name in wanted], patience, masks)
+    with engine.queue.place(len(wanted)):
+        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in wanted], deadline, masks)
     encodings = []
     for name, outcome in zip(wanted, outcomes, strict=True):
         if isinstance(outcome, Exception):

@@ -13,7 +13,7 @@ from service.errors.faults import UnsupportedMediaType
 from service.errors.problems import problem_documentation
 from service.http.dependencies import EngineDep, MapId, json_body, single_values
 from service.http.route_classes import StrictRoute
-from service.maps.camera_schemas import CameraDefinition, CameraList, CameraView
+from service.maps.schemas import CameraDefinition, CameraList, CameraView
 
 router = APIRouter(
     prefix="/v1/maps/{map}/cameras",

@@ -1,60 +1,67 @@
-"""Maps that are brought as files: written to disk as they arrive, checked to the last bit, listed when they are whole.
+"""Imports: map files that clients send are stored, checked, and made into maps, at once or by a job.
 
-imports/<name>       a file that a job is to read, or a request that is under way
-imports/.<name>      one that is still arriving; nothing waits for it after a crash
+imports/<name>       a complete file, of which a request or a job makes a map
+imports/.<name>      a file that is still arriving; the next start removes what a crash left of it
 """
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import logging
 import os
-import re
-import secrets
 import shutil
 import threading
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from anyio import CapacityLimiter
 
+from core.disk.files import Damage, disk_errors, write_at
 from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
-from core.frames.images import Limits, read_header
+from core.frames.containers import read_header
+from core.frames.images import Limits
+from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
 from core.storage.archives.building import build, check_sizes
 from core.storage.archives.manifest import Manifest
 from core.storage.archives.reading import Archive, opening_of
 from core.storage.archives.tar_layout import BLOCK
-from core.storage.files.disk import Damage, refusals
-from service.errors.faults import ClientGone, DigestMismatch, InvalidRequest, TooManyImports, TooManyPlaces
+from service.engine.engine import Engine
+from service.errors.faults import ClientGone, DigestMismatch, TooManyImports, TooManyPlaces
+from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
-from service.http.incoming_file import IncomingFile
 from service.jobs.context import JobContext
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job
+from service.maps.limits import check_new_map
 from service.worker_threads import to_its_end
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "import"
 FOLDER = "imports"
-THUMBNAIL_BYTES, THUMBNAIL_PIXELS = 4 << 20, 2048 * 2048
-"""Of what a service keeps as a thumbnail, at most, however small the frames are that another one takes."""
 
-_DIGEST = re.compile(r"\s*([a-z0-9*_.-]+)\s*=\s*:([A-Za-z0-9+/=]*):\s*")
+THUMBNAIL_BYTES, THUMBNAIL_PIXELS = 4 << 20, 2048 * 2048
+"""Pictures up to this size are imported even if the service's own limit on frames is lower: they may be thumbnails
+that a service with a higher limit made."""
 
 log = logging.getLogger("placerec.imports")
 
+Accept = Callable[[Manifest], str]
+"""Looks at the manifest of a file that is still arriving, and returns the id of the map that is to be made of it.
+Raises the problem that the client is answered with if none can be made."""
+
 
 @dataclass(frozen=True)
-class Arrived:
-    """A file that is there whole.  map_id: which map is to be made of it."""
+class ReceivedFile:
+    """A map file that is complete.
+
+    name: in the folder of imports.
+    map_id: of the map that is to be made of it.
+    tag: SHA-256 of the manifest, in hexadecimal.
+    size: in bytes.
+    """
 
     name: str
     map_id: str
@@ -63,200 +70,141 @@ class Arrived:
     size: int
 
 
-Accept = Callable[[Manifest], str]
-"""Looks at a manifest before the rest has come: which map it is to be.  Raises what the caller is to be told."""
-
-
-def wanted_digests(headers: Mapping[str, str]) -> list[bytes]:
-    """The SHA-256 that Content-Digest and Repr-Digest (RFC 9530) say the body has; other algorithms are passed over.
-
-    Raises:
-        InvalidRequest: one cannot be read.
-    """
-    found = []
-    for header in ("content-digest", "repr-digest"):
-        for member in filter(None, headers.get(header, "").split(",")):
-            named = _DIGEST.fullmatch(member)
-            if named is None:
-                raise InvalidRequest(f"{header}: it is not written like sha-256=:…:.")
-            if named[1] == "sha-256":
-                try:
-                    found.append(base64.b64decode(named[2], validate=True))
-                except binascii.Error:
-                    raise InvalidRequest(f"{header}: it is not base64.") from None
-    return found
-
-
 class Imports:
-    """What arrives, and what waits for jobs."""
+    """Receives map files and makes maps of them."""
 
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, jobs: Jobs) -> None:
+        self._engine, self._jobs = engine, jobs
         self._folder = engine.settings.data_dir / FOLDER
-        self._held: set[str] = set()
-        """The files that are there, or are arriving."""
+        self._files: set[str] = set()
+        """Names of the files that are stored or still arriving."""
         self._building = CapacityLimiter(1)  # each writes as fast as the disk takes it
-        engine.jobs.register(KIND, self.run, self._discard)
+        jobs.register(KIND, self.run, self._discard)
 
     def clean(self) -> None:
-        """Remove all but what jobs wait for, as a crash left it; call it before the jobs start."""
-        waited_for = {job.arguments.get("file") for job in self._engine.jobs.all() if not job.ended}
+        """Remove the files that no job waits for, as a crash left them; call it before the jobs start."""
+        waited_for = {job.arguments.get("file") for job in self._jobs.all() if not job.ended}
         if self._folder.is_dir():
             for path in self._folder.iterdir():
                 if path.name not in waited_for:
                     with suppress(OSError):
                         path.unlink()
                 else:
-                    self._held.add(path.name)
+                    self._files.add(path.name)
 
-    # Arriving
+    # Receiving
 
     async def receive(
-        self, chunks: AsyncIterator[bytes], announced: int, digests: list[bytes], accept: Accept
-    ) -> Arrived:
-        """Write a file down as it arrives; it is looked at as soon as its manifest is there.
+        self, chunks: AsyncIterator[bytes], announced: int, digests: Sequence[bytes], accept: Accept
+    ) -> ReceivedFile:
+        """Store a file as it arrives, and check its manifest as soon as that is there.
 
         Args:
-            announced: its length; 0 if that is not known.
-            digests: what its SHA-256 has to be.
+            announced: length of the file in bytes; 0 if it is not known.
+            digests: each must be the SHA-256 of the file.
 
         Raises:
-            TooManyImports, InvalidArchive, ArchiveTooNew, DigestMismatch, StorageFull, StorageFailure.
-            Others: what ``accept`` and ``chunks`` raise.  Nothing of the file is left.
+            TooManyImports, InvalidArchive, ArchiveTooNew, DigestMismatch, StorageFull, StorageFailure, and whatever
+                ``accept`` and ``chunks`` raise: nothing of the file is left.
         """
-        if len(self._held) >= self._engine.settings.max_imports:
-            raise TooManyImports("Too many maps are being imported; send this one again in a while.")
-        name = secrets.token_hex(8)
-        self._held.add(name)
-        arriving = _ArrivingMap(self._folder / f".{name}", self._folder / name, announced, accept)
+        if len(self._files) >= self._engine.settings.max_imports:
+            raise TooManyImports("Too many maps are being imported; send this one again later.")
+        arrival = Arrival(self._folder, "store the map file")
+        self._files.add(arrival.name)
+        incoming = _IncomingFile(arrival, announced, accept)
         try:
-            await to_its_end(arriving.open)
-            async for piece in in_pieces(chunks):
-                await to_its_end(partial(arriving.write, piece))
-            await to_its_end(lambda: arriving.check_and_complete(digests))
+            async with arriving(arrival, incoming.check_room):
+                async for piece in in_pieces(chunks):
+                    await to_its_end(partial(incoming.add, piece))
+                return await to_its_end(lambda: incoming.complete(digests))
         except BaseException:
-            await to_its_end(lambda: self._give_up(arriving, name))
+            await to_its_end(lambda: self._remove(arrival.name))
             raise
-        manifest, tag, map_id = arriving.found
-        return Arrived(name, map_id, manifest, tag, arriving.size)
 
-    # Building
-
-    def check(self, manifest: Manifest, map_id: str | None, encoder: str | None) -> str:
-        """See, before all of it is there, that a file can become a map here; returns the map's id.
+    def check_manifest(self, manifest: Manifest, map_id: str | None, encoder: str | None) -> str:
+        """Check that a file can become a map here; needs only its manifest.
 
         Args:
-            map_id: the one that is asked for; None for the file's own.
-            encoder: name or identity that the caller expects.
+            map_id: the id that the client asks for; None for that of the file.
+            encoder: name or identity of the encoder that the client expects; None for any.
+
+        Returns:
+            The id of the map that is to be made.
 
         Raises:
-            WrongEncoder: its encoder is not the one expected, or not installed here.
+            WrongEncoder: the map's encoder is not the expected one, or is not installed here.
             InvalidIdentifier, MapExists, TooManyMaps, TooManyPlaces, InvalidArchive.
         """
-        record = manifest.map
+        record, most_places = manifest.map, self._engine.settings.max_places
         if encoder is not None and encoder not in (record.encoder, record.encoder.partition("@")[0]):
             raise WrongEncoder(f"The file's map is bound to {record.encoder[:140]}, not to {encoder[:140]}.")
-        installed = next((one for one in self._engine.catalogue.describe() if one.identity == record.encoder), None)
-        if installed is None or installed.damaged is not None:
-            raise WrongEncoder(f"The file's map is bound to {record.encoder[:140]}, which is not installed here.")
+        installed = self.check_encoder(manifest)
         if (record.dimension, record.local_shape) != (installed.dimension, installed.local_shape):
             raise InvalidArchive("The file's descriptors have another shape than those of its encoder.")
         check_sizes(manifest)
-        if manifest.places > self._engine.settings.max_places:
-            raise TooManyPlaces(f"The file has {manifest.places} places of at most {self._engine.settings.max_places}.")
+        if manifest.places > most_places:
+            raise TooManyPlaces(f"The file has {manifest.places} places; a map may have at most {most_places}.")
         name = record.id if map_id is None else map_id
-        self._engine.upkeep.check_free(check_map_id(name))
+        check_new_map(self._engine, self._jobs, check_map_id(name))
         return name
 
-    async def build(self, arrived: Arrived) -> None:
-        """Make the map, which is listed when this returns; the file is removed whatever comes.
+    def check_encoder(self, manifest: Manifest) -> EncoderSummary:
+        """The encoder of a file's map.
 
         Raises:
-            InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
+            WrongEncoder: it is not installed, or damaged.
         """
-        given_up = threading.Event()
+        for installed in self._engine.catalogue.describe():
+            if installed.identity == manifest.map.encoder and installed.damaged is None:
+                return installed
+        raise WrongEncoder(f"The file's map is bound to {manifest.map.encoder[:140]}, which is not installed here.")
 
-        def advance(_done: int, _all: int) -> None:
-            if given_up.is_set():
-                raise ClientGone("Nobody waits for the map any more.")
+    # Making maps
+
+    async def build(self, received: ReceivedFile) -> None:
+        """Make the map of a file; it is listed when this returns.  The file is removed in any case.
+
+        Raises:
+            WrongEncoder, InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
+        """
+        cancelled = threading.Event()
+
+        def advance(_done: int, _total: int) -> None:
+            if cancelled.is_set():
+                raise ClientGone("The client closed the connection before the map was made.")
 
         def work() -> None:
-            self._make(arrived.name, arrived.map_id, advance)
+            self._build(received.name, received.map_id, advance)
 
         try:
             async with self._building:
-                await to_its_end(work, CapacityLimiter(1), given_up.set)  # in no thread of the pool
+                await to_its_end(work, CapacityLimiter(1), cancelled.set)  # in no thread of the pool
         finally:
-            await to_its_end(lambda: self._remove(arrived.name))
+            await to_its_end(lambda: self._remove(received.name))
 
-    def _make(
-        self,
-        name: str,
-        map_id: str,
-        advance: Callable[[int, int], None],
-        before_listing: Callable[[Archive], None] = lambda _archive: None,
-    ) -> None:
-        with refusals("read what was sent"):
-            archive = Archive(self._folder / name)
-        with archive:
-            self.check_encoder(archive.manifest)
-            try:
-                with self._engine.atlas.building(map_id) as folder:
-                    largest = self._largest_picture()
-                    check = partial(_check_picture, limits=largest)
-                    build(
-                        archive,
-                        folder,
-                        map_id,
-                        advance=advance,
-                        check_picture=check,
-                        most_picture_bytes=largest.max_bytes,
-                    )
-                    before_listing(archive)
-            except Damage as damage:
-                raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
-        log.info("map imported", extra={"map": map_id, "places": archive.manifest.places, "manifest": archive.tag})
-
-    def check_encoder(self, manifest: Manifest) -> None:
-        """Raise WrongEncoder unless a file's encoder is installed."""
-        if all(one.identity != manifest.map.encoder for one in self._engine.catalogue.describe()):
-            raise WrongEncoder(f"The file's map is bound to {manifest.map.encoder[:140]}, which is not installed here.")
-
-    def _largest_picture(self) -> Limits:
-        """What a frame may have here, and a thumbnail."""
-        settings = self._engine.settings
-        most_bytes = max(settings.max_image_bytes, THUMBNAIL_BYTES)
-        return Limits(most_bytes, max(settings.max_image_pixels, THUMBNAIL_PIXELS), min_side=1)
-
-    def _remove(self, name: str) -> None:
-        with suppress(OSError):
-            (self._folder / name).unlink(missing_ok=True)
-            self._held.discard(name)
-
-    def _give_up(self, arriving: _ArrivingMap, name: str) -> None:
-        arriving.discard()
-        self._remove(name)
-
-    # As a job
-
-    def submit(self, arrived: Arrived) -> Job:
-        """Let a job make the map of a file.
+    def submit(self, received: ReceivedFile) -> Job:
+        """Submit a job that makes the map of a file.
 
         Raises:
-            JobQueueFull, StorageFull, StorageFailure: the file is gone.
+            JobQueueFull, StorageFull, StorageFailure: the file is removed.
         """
-        arguments = {"to": arrived.map_id, "file": arrived.name, "manifest": arrived.tag, "bytes": arrived.size}
+        arguments = {"to": received.map_id, "file": received.name, "manifest": received.tag, "bytes": received.size}
         try:
-            return self._engine.jobs.submit(KIND, arrived.map_id, arguments=arguments)
+            return self._jobs.submit(KIND, received.map_id, arguments=arguments)
         except BaseException:
-            self._remove(arrived.name)
+            self._remove(received.name)
             raise
 
     def run(self, context: JobContext) -> Mapping[str, Any]:
-        """Do, or do again from the start, what a job says: nothing of an earlier attempt was kept but the file."""
+        """Make the map of a job's file; an attempt after a restart begins again, since only the file is kept.
+
+        Raises:
+            WrongEncoder, InvalidArchive, MapExists, StorageFull, StorageFailure: nothing of the map is left.
+            JobCancelled, JobInterrupted.
+        """
         name, map_id = str(context.arguments["file"]), str(context.arguments["to"])
         if (made := context.notes.get("result")) is not None and self._is_listed(made):
-            return dict(made)  # killed between the listing of the map and the end of the job
+            return dict(made)  # the process was killed after the map was listed and before the job ended
 
         def advance(done: int, total: int) -> None:
             context.check_cancelled()
@@ -275,8 +223,41 @@ class Imports:
                 }
             )
 
-        self._make(name, map_id, advance, before_listing)
+        self._build(name, map_id, advance, before_listing)
         return dict(context.notes["result"])
+
+    def _build(
+        self,
+        name: str,
+        map_id: str,
+        advance: Callable[[int, int], None],
+        before_listing: Callable[[Archive], None] = lambda _archive: None,
+    ) -> None:
+        with disk_errors("read the map file"):
+            archive = Archive(self._folder / name)
+        with archive:
+            self.check_encoder(archive.manifest)
+            try:
+                with self._engine.atlas.building(map_id) as folder:
+                    limits = self._picture_limits()
+                    build(
+                        archive,
+                        folder,
+                        map_id,
+                        advance=advance,
+                        check_picture=partial(_check_picture, limits=limits),
+                        most_picture_bytes=limits.max_bytes,
+                    )
+                    before_listing(archive)
+            except Damage as damage:
+                raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
+        log.info("map imported", extra={"map": map_id, "places": archive.manifest.places, "manifest": archive.tag})
+
+    def _picture_limits(self) -> Limits:
+        """The larger of the limits of frames and of thumbnails."""
+        settings = self._engine.settings
+        most_bytes = max(settings.max_image_bytes, THUMBNAIL_BYTES)
+        return Limits(most_bytes, max(settings.max_image_pixels, THUMBNAIL_PIXELS), min_side=1)
 
     def _is_listed(self, made: Mapping[str, Any]) -> bool:
         try:
@@ -287,58 +268,67 @@ class Imports:
     def _discard(self, job: Job) -> None:
         self._remove(str(job.arguments["file"]))
 
+    def _remove(self, name: str) -> None:
+        with suppress(OSError):
+            (self._folder / name).unlink(missing_ok=True)
+            self._files.discard(name)
 
-class _ArrivingMap(IncomingFile):
-    """The file of a map that is being written; its manifest is examined as soon as it has arrived."""
 
-    def __init__(self, temporary: Path, final: Path, announced: int, accept: Accept) -> None:
-        super().__init__(temporary, final)
-        self._announced, self._accept = announced, accept
-        self._hash = hashlib.sha256()
-        self._found: tuple[Manifest, str, str] | None = None
+class _IncomingFile:
+    """A file that is arriving: its bytes are hashed as they come, and its manifest is read as soon as it is there.
 
-    def open(self) -> None:
-        folder, announced = self.temporary.parent, self._announced
-        with refusals("take in a map"):
-            folder.mkdir(exist_ok=True)
-            # For a moment the disk has to hold both the file and the map.
-            if shutil.disk_usage(folder).free < 2 * announced:
-                raise StorageFull(f"The disk has no room for {announced} bytes twice over, as a file and as a map.")
-            super().open()
+    For one thread at a time.
+    """
 
-    @property
-    def found(self) -> tuple[Manifest, str, str]:
-        """The manifest, its tag, and the id of the map that is to be made."""
-        assert self._found is not None
-        return self._found
+    def __init__(self, arrival: Arrival, announced: int, accept: Accept) -> None:
+        self._arrival, self._announced, self._accept = arrival, announced, accept
+        self._hash, self._size = hashlib.sha256(), 0
+        self._checked: tuple[Manifest, str, str] | None = None
+        """The manifest, its tag, and the id of the map, as soon as they are known."""
 
-    def write(self, data: bytes) -> None:
-        with refusals("take in a map"):
-            super().write(data)
+    def check_room(self) -> None:
+        """Raise StorageFull unless the disk has room for the announced bytes as a file and as a map."""
+        if shutil.disk_usage(self._arrival.temporary.parent).free < 2 * self._announced:
+            raise StorageFull(
+                f"The disk has no room for {self._announced} bytes twice, once as a file and once as a map."
+            )
+
+    def add(self, data: bytes) -> None:
+        """Write the next bytes; raises what ``accept`` raises, or InvalidArchive, if the manifest is refused."""
+        with disk_errors("store the map file"):
+            write_at(self._arrival.file, data, self._size)
         self._hash.update(data)
-        if self._found is None and self.size >= BLOCK:
-            self._look()
+        self._size += len(data)
+        if self._checked is None and self._size >= BLOCK:
+            self._check_manifest()
 
-    def _look(self) -> None:
-        file = self.descriptor
+    def _check_manifest(self) -> None:
+        file = self._arrival.file
         opening = opening_of(os.pread(file, BLOCK, 0), lambda offset, size: os.pread(file, size, offset))
         if opening is not None:
             manifest, tape, tag = opening
             if self._announced and tape.size != self._announced:
-                raise InvalidArchive(f"The file is to have {tape.size} bytes, but {self._announced} are announced.")
-            self._found = manifest, tag, self._accept(manifest)
+                raise InvalidArchive(
+                    f"By its manifest the file has {tape.size} bytes, but the request announces {self._announced}."
+                )
+            self._checked = manifest, tag, self._accept(manifest)
 
-    def check_and_complete(self, digests: list[bytes]) -> None:
-        """Check that the file is whole and has these digests, and give it its final name."""
+    def complete(self, digests: Sequence[bytes]) -> ReceivedFile:
+        """Give the file its name for good.
+
+        Raises:
+            DigestMismatch, InvalidArchive, StorageFull, StorageFailure.
+        """
         if any(digest != self._hash.digest() for digest in digests):
-            raise DigestMismatch("The body does not have the SHA-256 that its header says.")
-        if self._found is None:
-            raise InvalidArchive(f"The file ends after {self.size} bytes, within its manifest.")
-        with refusals("take in a map"):
-            self.complete()
+            raise DigestMismatch("The body does not have the SHA-256 that its header states.")
+        if self._checked is None:
+            raise InvalidArchive(f"The file ends after {self._size} bytes, within its manifest.")
+        manifest, tag, map_id = self._checked
+        self._arrival.complete()
+        return ReceivedFile(self._arrival.name, map_id, manifest, tag, self._size)
 
 
 def _check_picture(content: bytes, limits: Limits) -> None:
     header = read_header(content)
     if header.width * header.height > limits.max_pixels:
-        raise TooManyPixels(f"it has {header.width}x{header.height} pixels of at most {limits.max_pixels}")
+        raise TooManyPixels(f"it has {header.width}x{header.height} pixels; at most {limits.max_pixels} are allowed")

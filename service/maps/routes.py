@@ -6,13 +6,12 @@ from contextlib import suppress
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from starlette.responses import JSONResponse
 
 from core import errors
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
 from core.storage import Map, MapRecord, MapSettings, VerifyReport
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.errors.problems import problem_documentation
@@ -21,9 +20,10 @@ from service.http.headers import entity_tag, expected_revision
 from service.http.openapi import json_patch
 from service.http.route_classes import StrictRoute
 from service.http.schemas import PageParameters
-from service.jobs.routes import router as jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
+from service.maps import storage_jobs
+from service.maps.limits import check_map_count
 from service.maps.schemas import (
     CalibrationChanges,
     MapChanges,
@@ -83,7 +83,7 @@ def create_map(
     encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
-        engine.upkeep.check_room()
+        check_map_count(engine)
         map_ = engine.atlas.create(
             new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
         )
@@ -199,6 +199,7 @@ def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> No
 def verify_map(
     map_id: MapId,
     engine: EngineDep,
+    jobs: JobsDep,
     background: Annotated[
         bool, Query(description="Answer 202 with a job, whose result is the report: a large map takes minutes.")
     ] = False,
@@ -206,6 +207,5 @@ def verify_map(
     """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
     if not background:
         return engine.atlas.verify(map_id)
-    job = engine.jobs.submit(rebuilding.VERIFY, map_id, arguments={}, maps=rebuilding.incarnation(engine, map_id))
-    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+    job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))
+    return accepted(job, engine.settings)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.frames.masks import Mask
+from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
 from core.places import Timestamp
-from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, SequenceSummary, StorageStatus, TierSetting
+from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM
-from service.http.schemas import IDENTITY_EXAMPLE, Cursor
+from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",
@@ -134,15 +136,109 @@ class MapChanges(BaseModel):
     calibration: CalibrationChanges | None = None
 
 
-class SequencePage(BaseModel):
-    """Traverses in the order of their names."""
+CAMERA_EXAMPLE: dict[str, Any] = {
+    "name": "front",
+    "mask": {"polygons": [[[0, 0.85], [1, 0.85], [1, 1], [0, 1]]]},
+    "updated_at": "2026-11-20T10:00:00Z",
+}
 
-    items: list[SequenceSummary]
-    next_cursor: Cursor
+
+class CameraDefinition(BaseModel):
+    """What to ignore in the frames of a camera."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"mask": CAMERA_EXAMPLE["mask"]}]})
+
+    mask: Mask | None = Field(default=None, description="null: nothing is ignored.")
 
 
-class ForgottenSequence(BaseModel):
-    """A deleted traverse."""
+class CameraView(BaseModel):
+    """One camera of a map."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [CAMERA_EXAMPLE]})
 
     name: str
-    places: int = Field(description="Places that were forgotten with it.")
+    mask: Mask | None
+    updated_at: Timestamp
+
+
+class CameraList(BaseModel):
+    """All cameras of a map, by name; they are few, so there is one page."""
+
+    items: list[CameraView]
+    next_cursor: None = None
+
+
+Method = Literal["frames", "sequence", "map"]
+
+MOST_FRAMES = 2000
+
+ORDER_EXAMPLE: dict[str, Any] = {
+    "method": "sequence",
+    "sequence": "tuesday",
+    "target": {"rule": "precision", "value": 0.95},
+    "dry_run": True,
+}
+
+
+class Label(BaseModel):
+    """The true place of one frame of the form."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    file: str = Field(max_length=256, description="Name of the frame's part.")
+    place: str | None = Field(max_length=128, description="Id of the place that it shows; null: the map has it not.")
+    camera: CameraName = None
+
+
+class CalibrationOrder(BaseModel):
+    """By what a map is to be calibrated, and what for."""
+
+    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [ORDER_EXAMPLE]})
+
+    method: Method = Field(
+        description="`frames`: the labelled frames of this form. `sequence`: one traverse of the map, asked of the "
+        "others. `map`: the map's own frames, each asked of its neighbours; better than nothing."
+    )
+    target: Target = Field(default=Target(rule="precision", value=0.95), description="What the threshold is to reach.")
+    dry_run: bool = Field(strict=True, default=False, description="Measure and tell, store nothing.")
+    background: bool = Field(
+        strict=True, default=False, description="Answer 202 with a job, whose result is the report."
+    )
+    sequence: str | None = Field(default=None, max_length=128, description="The traverse that is asked.")
+    pairs: dict[str, str | None] | None = Field(
+        default=None,
+        min_length=1,
+        max_length=MOST_FRAMES,
+        description="Of places of the sequence to the places among the others that show the same, null for one that "
+        "they lack; only these are asked. Left out: the poses tell.",
+    )
+    most: int = Field(strict=True, default=300, ge=20, le=MOST_FRAMES, description="Frames to ask, spread evenly.")
+    labels: list[Label] | None = Field(
+        default=None, min_length=1, max_length=MOST_FRAMES, description="One for each frame of the form."
+    )
+
+    @model_validator(mode="after")
+    def _what_belongs_to_the_method(self) -> CalibrationOrder:
+        if (self.sequence is None) == (self.method == "sequence"):
+            raise ValueError("sequence belongs to the method sequence, and to it only")
+        if self.pairs is not None and self.method != "sequence":
+            raise ValueError("pairs belong to the method sequence")
+        if (self.labels is None) == (self.method == "frames"):
+            raise ValueError("labels belong to the method frames, and to it only")
+        if self.background and self.method == "frames":
+            raise ValueError("frames are calibrated by at once; background belongs to the other methods")
+        return self
+
+
+class CalibrationReport(BaseModel):
+    """A calibration, what was measured in making it, and what to know of it."""
+
+    map: str
+    encoder: str
+    method: Method
+    target: Target
+    stored: bool = Field(description="It is the map's own from now on; false for a dry run.")
+    calibration: Calibration
+    previous: Calibration = Field(description="The one that judged so far.")
+    measurement: Measurement
+    warnings: list[str]

@@ -1,7 +1,11 @@
-"""Maps as files: download one, bring one."""
+"""Routes that export a map as one file and import it again."""
 
 from __future__ import annotations
 
+import base64
+import binascii
+import re
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -10,10 +14,12 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.places import check_map_id
+from core.storage.archives.manifest import Manifest
 from service.errors.faults import (
     BodyTooLarge,
     DigestMismatch,
     ExportGone,
+    InvalidRequest,
     JobQueueFull,
     RangeNotSatisfiable,
     TooManyExports,
@@ -24,40 +30,52 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import intake_of
-from service.http.dependencies import EngineDep, MapId, PrincipalDep, single_values
+from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, single_values
 from service.http.headers import check_match, entity_tag, is_known, named_tags, wanted_slice
 from service.http.openapi import BINARY
 from service.http.route_classes import StrictRoute
 from service.http.schemas import Parameters
 from service.http.uploads import media_type
-from service.jobs.routes import router as jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
-from service.maps.exports import MEDIA_TYPE, ExportResponse
-from service.maps.imports import wanted_digests
+from service.maps.exports import MEDIA_TYPE, ExportResponse, Exports
+from service.maps.imports import Imports
+from service.maps.limits import check_new_map
 from service.maps.routes import show_map
 from service.maps.schemas import MapView
 from service.worker_threads import in_thread, to_its_end
+
+ExportsDep = Annotated[Exports, Depends(FromState("exports"))]
+ImportsDep = Annotated[Imports, Depends(FromState("imports"))]
 
 router = APIRouter(prefix="/v1/maps", tags=["transfer"], route_class=StrictRoute, dependencies=[Depends(single_values)])
 
 MEDIA_TYPES = (MEDIA_TYPE, "application/octet-stream")
 
 HEADERS = {
-    "ETag": {"description": "Names the bytes: the SHA-256 of the manifest.", "schema": {"type": "string"}},
+    "ETag": {
+        "description": "The SHA-256 of the manifest, which identifies the file.",
+        "schema": {"type": "string"},
+    },
     "Accept-Ranges": {"description": "bytes", "schema": {"type": "string"}},
 }
 
 
+_DIGEST = re.compile(r"\s*([a-z0-9*_.-]+)\s*=\s*:([A-Za-z0-9+/=]*):\s*")
+
+
 class ImportParameters(Parameters):
-    """What becomes of a file."""
+    """How a file is imported."""
 
     id: Annotated[str, AfterValidator(check_map_id)] | None = Field(
-        default=None, description="Id of the map that is made; the file's own if left out.", examples=["lab"]
+        default=None, description="Id of the new map; if left out, the one that the file states.", examples=["lab"]
     )
     encoder: str | None = Field(
-        default=None, max_length=256, description="Name or identity of the encoder that the caller expects."
+        default=None, max_length=256, description="Name or identity of the encoder that the map is expected to have."
     )
-    background: bool = Field(default=False, description="Answer as soon as the file is there; a job makes the map.")
+    background: bool = Field(
+        default=False, description="Answer 202 as soon as the file has arrived; a job makes the map."
+    )
 
 
 @router.get(
@@ -70,44 +88,45 @@ class ImportParameters(Parameters):
             "headers": {**HEADERS, "Content-Length": {"schema": {"type": "integer"}}},
         },
         206: {
-            "description": "The part of it that Range names.",
+            "description": "The part of the file that Range asks for.",
             "content": {MEDIA_TYPE: {"schema": BINARY}},
             "headers": {**HEADERS, "Content-Range": {"schema": {"type": "string"}}},
         },
-        304: {"description": "The map holds what If-None-Match names."},
+        304: {"description": "The map has not changed: its file is the one that If-None-Match names."},
         **problem_documentation(ExportGone, RangeNotSatisfiable, TooManyExports, errors.StorageFull),
     },
 )
-async def export_map(map_id: MapId, request: Request, engine: EngineDep) -> Response:
+async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports: ExportsDep) -> Response:
     """Download a map as one file: a tar of its settings, places, descriptors, pictures and cameras.
 
-    The file is that of one moment, whatever is enrolled or deleted while it is on its way; `docs/backup.md` tells
-    what it holds. A download that broke off goes on with `Range` and `If-Range` (or `If-Match`), as long as that
-    moment is kept. `If-None-Match` answers 304 for a map that holds what it held. The SHA-256 of every part stands
-    in the manifest, that of the manifest in the ETag.
+    The file shows the map as it was when the download began, even if places are enrolled or deleted meanwhile;
+    `docs/reference/exports.md` describes its contents. An interrupted download can be continued with `Range` and
+    `If-Range` (or `If-Match`) as long as the service keeps the export. With `If-None-Match` the answer is 304 if
+    the map has not changed. The manifest contains the SHA-256 of every part, and the ETag is the SHA-256 of the
+    manifest.
     """
-    export = engine.exports.find(map_id, named_tags(request.headers))
+    export = exports.find(map_id, named_tags(request.headers))
     if export is None:
-        export = await engine.exports.take(await engine.map(map_id))
-    playback = export.playback
+        export = await exports.create(await engine.map(map_id))
+    archive = export.archive
     headers = {
-        "ETag": f'"{playback.tag}"',
+        "ETag": f'"{archive.tag}"',
         "Accept-Ranges": "bytes",
         "Cache-Control": "private, no-cache",
         "Content-Disposition": f'attachment; filename="{map_id}.tar"',
     }
-    check_match(request.headers, playback.tag)
-    if is_known(request.headers, playback.tag):
+    check_match(request.headers, archive.tag)
+    if is_known(request.headers, archive.tag):
         return Response(status_code=304, headers=headers)
-    # A range is of what GET gives (RFC 9110, section 14.2).
-    alone = request.state.method == "HEAD"
-    part = wanted_slice({**request.headers, **({"range": ""} if alone else {})}, playback.tag, playback.size)
+    is_head = request.state.method == "HEAD"
+    # Range has a meaning only for GET (RFC 9110, section 14.2).
+    part = wanted_slice({**request.headers, **({"range": ""} if is_head else {})}, archive.tag, archive.size)
     headers["Content-Length"] = str(part.stop - part.start)
-    if alone:
+    if is_head:
         return Response(None, headers={**headers, "Content-Type": MEDIA_TYPE})
     if part.is_whole:
-        return ExportResponse(engine.exports, export, part, 200, headers)
-    return ExportResponse(engine.exports, export, part, 206, {**headers, "Content-Range": part.content_range})
+        return ExportResponse(exports, export, part, 200, headers)
+    return ExportResponse(exports, export, part, 206, {**headers, "Content-Range": part.content_range})
 
 
 BODY: dict[str, Any] = {
@@ -116,14 +135,14 @@ BODY: dict[str, Any] = {
             "name": name,
             "in": "header",
             "required": False,
-            "description": f"RFC 9530: `sha-256=:…:`, the SHA-256 of the {what}; 422 if it has another one.",
+            "description": f"`sha-256=:…:` (RFC 9530), the SHA-256 of the {what}; 422 if it does not match.",
             "schema": {"type": "string"},
         }
         for name, what in (("Content-Digest", "body"), ("Repr-Digest", "file, which the body is"))
     ],
     "requestBody": {
         "required": True,
-        "description": "A file that an export gave.",
+        "description": "A file that was exported.",
         "content": {kind: {"schema": BINARY} for kind in MEDIA_TYPES},
     },
 }
@@ -157,42 +176,67 @@ async def import_map(
     request: Request,
     options: Annotated[ImportParameters, Query()],
     engine: EngineDep,
+    jobs: JobsDep,
+    imports: ImportsDep,
     principal: PrincipalDep,
 ) -> Response:
-    """Bring a map that was exported, here or elsewhere; it is listed when all of it was checked, or not at all.
+    """Import a map that this or another service exported; it is listed only after all of it was checked.
 
-    The body is the file as it was downloaded. It is written to disk as it arrives, and refused as soon as it is
-    known that it cannot become a map here: for its encoder, its version, its id. With `background` the answer is a
-    job that makes the map of the file, over a restart too.
+    The body is the exported file. It is refused as soon as its beginning shows that it cannot become a map here, for
+    example because its encoder is not installed or the id is taken. With `background` the answer is a job that makes
+    the map from the file, and that goes on after a restart.
     """
     kind = media_type(request)
     if kind not in MEDIA_TYPES:
-        raise UnsupportedMediaType(f"A map is sent as {' or '.join(MEDIA_TYPES)}, not as {kind[:80] or 'nothing'}.")
+        raise UnsupportedMediaType(f"Send a map as {' or '.join(MEDIA_TYPES)}, not as {kind[:80] or 'nothing'}.")
     if options.background:
-        engine.jobs.check_room()
+        jobs.check_room()
     settings = engine.settings
     if options.id is not None:
         principal.require(options.id)
-        await in_thread(engine.upkeep.check_free, options.id)
+        await in_thread(check_new_map, engine, jobs, options.id)
     length = request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else 0
     if announced > settings.max_import_bytes:
-        raise BodyTooLarge(f"The file has more than the {settings.max_import_bytes} bytes that are taken here.")
+        raise BodyTooLarge(f"The file is larger than the {settings.max_import_bytes} bytes that are allowed.")
     intake_of(request).pass_on(settings.max_import_bytes, settings.import_timeout)
 
-    def accept(manifest: Any) -> str:
-        principal.require(options.id or str(manifest.map.id))  # first: whether there is one is not told to everybody
-        return engine.imports.check(manifest, options.id, options.encoder)
+    def accept(manifest: Manifest) -> str:
+        # The right comes first: who may not use a map must not learn whether it exists.
+        principal.require(options.id or manifest.map.id)
+        return imports.check_manifest(manifest, options.id, options.encoder)
 
-    arrived = await engine.imports.receive(request.stream(), announced, wanted_digests(request.headers), accept)
-    request.state.noted = {"map": arrived.map_id, "manifest": arrived.tag}
-    root = engine.settings.root_path
+    received = await imports.receive(request.stream(), announced, stated_digests(request.headers), accept)
+    request.state.noted = {"map": received.map_id, "manifest": received.tag}
     if options.background:
-        job = await to_its_end(lambda: engine.imports.submit(arrived))
-        shown = JobView.of(job).model_dump(mode="json")
-        return JSONResponse(shown, 202, {"Location": f"{root}{jobs.prefix}/{job.id}"})
-    await engine.imports.build(arrived)
-    map_ = await engine.map(arrived.map_id)
+        job = await to_its_end(lambda: imports.submit(received))
+        return accepted(job, settings)
+    await imports.build(received)
+    map_ = await engine.map(received.map_id)
     view = await in_thread(show_map, engine, map_)
-    headers = {"ETag": entity_tag(map_.record.revision), "Location": f"{root}{router.prefix}/{arrived.map_id}"}
+    headers = {
+        "ETag": entity_tag(map_.record.revision),
+        "Location": f"{settings.root_path}{router.prefix}/{received.map_id}",
+    }
     return JSONResponse(view.model_dump(mode="json"), 201, headers)
+
+
+def stated_digests(headers: Mapping[str, str]) -> list[bytes]:
+    """The SHA-256 digests that Content-Digest and Repr-Digest (RFC 9530) state; other algorithms are ignored.
+
+    Raises:
+        InvalidRequest: one of the headers cannot be read.
+    """
+    found = []
+    for header in ("content-digest", "repr-digest"):
+        for member in filter(None, headers.get(header, "").split(",")):
+            parsed = _DIGEST.fullmatch(member)
+            if parsed is None:
+                raise InvalidRequest(f"{header}: it must have the form sha-256=:…:.")
+            algorithm, digest = parsed.groups()
+            if algorithm == "sha-256":
+                try:
+                    found.append(base64.b64decode(digest, validate=True))
+                except binascii.Error:
+                    raise InvalidRequest(f"{header}: its value is not base64.") from None
+    return found

@@ -1,7 +1,7 @@
-"""Batches that are stored one after the other, though the next is read and encoded while the one before is stored.
+"""The order of batches: the next batch is received and encoded while the one before it is still being stored.
 
-The order of enrolment is the order of places in their sequence. A sender that names its batches can have two of them
-under way: the later one says after which it comes, is encoded behind it, and is stored only then.
+The order in which places are stored is their order in the sequence.  A client that names its batches can send two of
+them at a time: the later one names the batch that it follows, and is encoded and stored after that one.
 """
 
 from __future__ import annotations
@@ -12,52 +12,54 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import BatchOutOfOrder, ClientGone
 
 KEPT = 1024
-"""Names of batches that were stored; of two that come one after the other, the first is among the latest."""
+"""How many names of stored batches are remembered."""
 
 GRACE = 5.0
-"""Seconds that a batch waits for one that is not under way: it may be on its way, or be sent once more."""
+"""Seconds that a batch waits for a batch that has not arrived: it may still arrive, or be sent again."""
 
 
 class Stage(IntEnum):
-    """How far a batch has come; ``ENCODED`` also when only its last frames wait for the encoder."""
+    """How far a batch has come; a batch counts as ``ENCODED`` once its last frames wait for the encoder."""
 
     BEGUN, ENCODED, STORED = range(3)
 
 
-class Succession:
-    """Which batches are under way, and which are stored. Used from the event loop alone."""
+class BatchOrder:
+    """The stages of the batches that are in progress or were stored lately.  It is used only from the event loop."""
 
     def __init__(self) -> None:
-        self._stages: dict[tuple[str, str], Stage] = {}  # by map and batch; in the order of their last change
+        self._stages: dict[tuple[str, str], Stage] = {}  # by map and batch, in the order of their changes
         self._changed = asyncio.Event()
 
     @contextmanager
-    def enter(self, map_id: str, batch: str | None, after: str | None, patience: Patience) -> Iterator[Sequel]:
-        """A batch of this name in line, behind another; left without an error, it is stored.
+    def enter(
+        self, map_id: str, batch: str | None, after: str | None, deadline: RequestDeadline
+    ) -> Iterator[BatchTurn]:
+        """The turn of a batch; if the context ends without an error, the batch counts as stored.
 
         Args:
-            batch: None: nobody can come after it.
-            after: None: it waits for nobody.
+            batch: the name of the batch; None: no batch can follow it.
+            after: the name of the batch that it follows; None: it does not wait.
         """
-        sequel = Sequel(self, map_id, batch, after, patience)
-        sequel.reach(Stage.BEGUN)
+        turn = BatchTurn(self, map_id, batch, after, deadline)
+        turn.report(Stage.BEGUN)
         try:
-            yield sequel
+            yield turn
         except BaseException:
-            sequel.reach(None)
+            turn.report(None)
             raise
-        sequel.reach(Stage.STORED)
+        turn.report(Stage.STORED)
 
     def stage(self, map_id: str, batch: str) -> Stage | None:
-        """How far a batch has come; None if it is neither under way nor stored lately."""
+        """How far a batch has come; None if it is neither in progress nor stored lately."""
         return self._stages.get((map_id, batch))
 
     def change(self, map_id: str, batch: str, stage: Stage | None) -> None:
-        """Note how far a batch has come, or that it is gone; one that was stored once stays so."""
+        """Set the stage of a batch; None: the batch failed.  A batch that was stored stays stored."""
         name = (map_id, batch)
         if self._stages.get(name) == Stage.STORED:
             return
@@ -71,45 +73,47 @@ class Succession:
         self._changed = asyncio.Event()
 
     async def changes(self) -> None:
-        """Wait until a batch comes further."""
+        """Wait until the stage of a batch changes."""
         await self._changed.wait()
 
 
-class Sequel:
-    """One batch in line."""
+class BatchTurn:
+    """The turn of one batch among the others."""
 
-    def __init__(self, line: Succession, map_id: str, batch: str | None, after: str | None, patience: Patience) -> None:
-        self._line, self._patience = line, patience
+    def __init__(
+        self, order: BatchOrder, map_id: str, batch: str | None, after: str | None, deadline: RequestDeadline
+    ) -> None:
+        self._order, self._deadline = order, deadline
         self._map_id, self._batch, self._after = map_id, batch, after
 
-    def reach(self, stage: Stage | None) -> None:
-        """Tell those behind how far this batch has come; None: it ends here, and is not stored."""
+    def report(self, stage: Stage | None) -> None:
+        """Set the stage of this batch, for which the next batch may wait; None: the batch failed and is not stored."""
         if self._batch is not None:
-            self._line.change(self._map_id, self._batch, stage)
+            self._order.change(self._map_id, self._batch, stage)
 
     async def wait_for(self, stage: Stage) -> None:
-        """Wait until the batch before, if there is one, has come so far.
+        """Wait until the batch that this one follows, if any, has reached a stage.
 
         Raises:
-            BatchOutOfOrder: it has not in time, or is not even under way.
-            ClientGone: the caller hung up.
+            BatchOutOfOrder: it did not reach the stage before the deadline, or did not arrive within ``GRACE``.
+            ClientGone: the client hung up.
         """
         if self._after is None:
             return
         absent_since = time.monotonic()
-        gone = asyncio.ensure_future(self._patience.hung_up())
+        gone = asyncio.ensure_future(self._deadline.hung_up())
         try:
-            while (found := self._line.stage(self._map_id, self._after)) is None or found < stage:
-                left = self._patience.left()
+            while (found := self._order.stage(self._map_id, self._after)) is None or found < stage:
+                left = self._deadline.seconds_left()
                 if found is None:
                     left = min(left, absent_since + GRACE - time.monotonic())
                 else:
                     absent_since = time.monotonic()
                 if gone.done():
-                    raise ClientGone("The caller hung up before its batch could be stored.")
+                    raise ClientGone("The client hung up before its batch could be stored.")
                 if left <= 0:
                     raise BatchOutOfOrder(f"The batch {self._after!r} is not stored; send this one again once it is.")
-                change = asyncio.ensure_future(self._line.changes())
+                change = asyncio.ensure_future(self._order.changes())
                 try:
                     await asyncio.wait({change, gone}, timeout=left, return_when=asyncio.FIRST_COMPLETED)
                 finally:

@@ -1,4 +1,4 @@
-"""Many frames in one request: which errors are one frame's own, and which end the whole request."""
+"""Forms with many frames: how their entries are read, and which errors concern one frame or the whole request."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from service.errors.problems import Problem, request_problem
 from service.http.multipart import Part
 from service.http.schemas import validated
 from service.http.uploads import check_part
-from service.places.enrolment import Candidate
+from service.places.enrolment import FrameToEnrol
 from service.places.parameters import BatchItem
 from service.settings import Settings
 
-OWN_ERRORS = (
+FRAME_ERRORS = (
     errors.InvalidImage,
     errors.NoRegions,
     errors.InvalidIdentifier,
@@ -31,44 +31,46 @@ OWN_ERRORS = (
     UnsupportedMediaType,
 )
 
+"""Errors that concern one frame of a batch; the other frames are still processed."""
+
 log = logging.getLogger("placerec.batches")
 
 
-def item_problem(request: Request, error: Exception) -> Problem:
-    """The problem of one frame, so that the others go on.
+def frame_problem(request: Request, error: Exception) -> Problem:
+    """The problem of one frame of a batch, so that the other frames can go on.
 
-    An error that nobody foresaw counts as the frame's own: it is poisoned until shown otherwise.
+    An unforeseen error counts as the frame's own.
 
     Raises:
-        Fault, PlacerecError: ``error`` itself, where it is none of the frame (a full queue or disk, a
-            deadline, a damaged model).
+        Fault, PlacerecError: ``error`` itself, if it concerns the whole request (a full queue or disk, a deadline, a
+            damaged model).
     """
-    check_own(error, request.state.request_id)
+    check_frame_error(error, request.state.request_id)
     return request_problem(request, error)
 
 
-def check_own(error: Exception, request_id: str | None = None) -> None:
-    """Return if an error is one frame's own; one that nobody foresaw is logged.
+def check_frame_error(error: Exception, request_id: str | None = None) -> None:
+    """Raise an error that concerns the whole request; return if it concerns one frame.  Unforeseen errors are logged.
 
     Raises:
-        Fault, PlacerecError: ``error`` itself, where it is none of the frame.
+        Fault, PlacerecError: ``error`` itself.
     """
-    if not isinstance(error, OWN_ERRORS):
+    if not isinstance(error, FRAME_ERRORS):
         if isinstance(error, (Fault, errors.PlacerecError)):
             raise error
         log.error("a frame of a batch failed", exc_info=error, extra={"request_id": request_id})
 
 
 def check_batch(entries: Any, names: list[str], most: int) -> None:
-    """See that a form as a whole makes sense.
+    """Check a form of many frames as a whole.
 
     Args:
-        entries: value of its part ``places``.
-        names: of its file parts.
-        most: places.
+        entries: the JSON value of its part ``places``.
+        names: the names of its file parts.
+        most: the largest number of places.
 
     Raises:
-        InvalidRequest: it does not.
+        InvalidRequest: the form has no places or too many, a name twice, or a file that no place uses.
     """
     if not isinstance(entries, list) or not entries:
         raise InvalidRequest("The part 'places' is not a JSON array with at least one place.")
@@ -81,33 +83,36 @@ def check_batch(entries: Any, names: list[str], most: int) -> None:
         raise InvalidRequest(f"No place of the batch names the file part {spare[0][:80]!r}.")
 
 
-def candidate_of(
+def read_entry(
     entry: Any, names: Collection[str], read: Callable[[str], Part], map_: Map, settings: Settings
-) -> Candidate:
-    """What is to be enrolled by one entry of a batch.
+) -> FrameToEnrol:
+    """The frame that one entry of a batch describes.
 
     Args:
-        names: of the file parts.
-        read: gives one of them.
+        entry: one JSON value of the part ``places``.
+        names: the names of the file parts.
+        read: returns the file part of a name.
 
     Raises:
-        InvalidRequest, InvalidIdentifier, InvalidField, UnknownCamera, InvalidImage, UnsupportedMediaType.
+        InvalidRequest, InvalidIdentifier, InvalidField: the entry is malformed.
+        UnknownCamera: the map has no such camera.
+        InvalidImage, UnsupportedMediaType: the file is not an image that can be read.
     """
     item = validated(BatchItem, entry)
     check_place_id(item.id)
     fields = item.fields(item.metadata, settings)
     mask = map_.cameras.mask(fields.camera)
     if item.file is None:
-        return Candidate(item.id, fields, None, mask, sha256=bytes.fromhex(str(item.sha256)))
+        return FrameToEnrol(item.id, fields, None, mask, sha256=bytes.fromhex(str(item.sha256)))
     if item.file not in names:
         raise InvalidRequest(f"file: the form has no part named {item.file[:80]!r}.")
     part = read(item.file)
     check_part(part, settings)
-    return Candidate(item.id, fields, part.data, mask)
+    return FrameToEnrol(item.id, fields, part.data, mask)
 
 
-def given_id(entry: Any) -> str | None:
-    """The id that an entry of a batch names, if it is anything like one."""
+def entry_id(entry: Any) -> str | None:
+    """The id of an entry of a batch, at most 200 characters; None if the entry has no text as its id."""
     given = entry.get("id") if isinstance(entry, dict) else None
-    # Half a character can stand in JSON's escapes, but not in the answer.
+    # JSON can escape half a surrogate pair, which an answer cannot contain.
     return given[:200].encode("utf-8", "replace").decode() if isinstance(given, str) else None

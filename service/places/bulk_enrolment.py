@@ -1,96 +1,94 @@
-"""A traverse enrolled by one request and a job: its frames wait on disk, and are stored some at a time.
+"""Bulk enrolment: a request writes a form with a whole traverse to disk, and a job stores its frames in small commits.
 
-What the job has told of is stored; after a kill it goes on behind that.  What was stored and not told of yet is met
-again: a place that holds the frame already is left as it is.
+After each commit the job notes how far it is.  After a crash it goes on there; frames that were stored but not yet
+noted are recognized by their digest, and their places stay as they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.requests import Request
 
 from core.storage import Map
-from service.engine.queue import Patience
+from service.engine.engine import Engine
+from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import problem_of
 from service.http.bodies import intake_of, parse_json
 from service.http.multipart import Part
 from service.http.uploads import FIELD_PARTS, FORM, media_type
-from service.jobs.background import run_behind
-from service.jobs.context import born
-from service.jobs.jobs import JobContext
+from service.jobs.context import JobContext, creation_time, run_after_requests
+from service.jobs.jobs import Jobs
 from service.jobs.records import Job
-from service.places.batches import candidate_of, check_batch, check_own, given_id
-from service.places.enrolment import Candidate, Enrolled, enrol
-from service.places.staging import StagedForm, StagedPart
+from service.places.batches import check_batch, check_frame_error, entry_id, read_entry
+from service.places.enrolment import Enrolled, FrameToEnrol, enrol
+from service.places.staging import StagedForm, StagedPart, Staging
 from service.worker_threads import to_its_end
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 KIND = "enrol"
 
-TOGETHER = 64
-"""Places of one commit, at most."""
+PLACES_PER_COMMIT = 64
+"""The most places of one commit."""
 
-BYTES_TOGETHER = 32 << 20
-"""Bytes of their frames, at most, if there is more than one."""
+BYTES_PER_COMMIT = 32 << 20
+"""The most bytes of the frames of one commit, unless it is a single frame."""
 
-NAMED = 200
-"""Frames that could not be enrolled are counted, and so many named."""
+MOST_LISTED = 200
+"""The result of the job lists so many of the frames that could not be enrolled; the others are only counted."""
 
 PART = "places"
+"""The form's part with the JSON array of places."""
 
 
-async def receive(engine: Engine, map_: Map, request: Request) -> Job:
-    """Write a form down as it arrives, and let a job for it wait; both are on disk when this returns.
+async def receive(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request) -> Job:
+    """Write a form to disk as it arrives, and submit a job for it; both are on disk when this returns.
 
     Raises:
-        JobQueueFull, StagingFull: it was not read.
-        UnsupportedMediaType, MalformedBody, BodyTooLarge, InvalidRequest, DeadlineExceeded, ClientGone: it is none, or
-            did not come whole.
-        StorageFull, StorageFailure: nothing of it is left.
+        JobQueueFull, StagingFull: the form was not read.
+        UnsupportedMediaType, MalformedBody, BodyTooLarge, InvalidRequest: the form is malformed or too large.
+        DeadlineExceeded, ClientGone: the form did not arrive completely.
+        StorageFull, StorageFailure: the form could not be stored; nothing of it is left.
     """
-    engine.jobs.check_room()
+    jobs.check_room()
     if (kind := media_type(request)) != FORM:
-        raise UnsupportedMediaType(f"The frames are sent in a {FORM}, not as {kind[:80] or 'anything unnamed'}.")
+        raise UnsupportedMediaType(f"Send the frames in a {FORM}, not as {kind[:80] or 'a body without a media type'}.")
     settings, length = engine.settings, request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else settings.max_bulk_bytes
     if announced > settings.max_bulk_bytes:
-        raise BodyTooLarge(f"The body has more than the {settings.max_bulk_bytes} bytes that are taken here.")
+        raise BodyTooLarge(f"The body has more than {settings.max_bulk_bytes} bytes, which is the limit.")
     intake_of(request).pass_on(settings.max_bulk_bytes, settings.bulk_timeout)
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
-    name = await engine.staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, map_, name))
+    name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name))
 
 
-def _submit(engine: Engine, map_: Map, name: str) -> Job:
-    """Let a job wait for a form, which is removed if there comes none."""
+def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str) -> Job:
+    """Submit a job for a form; if that fails, the form is removed."""
     try:
-        count = len(_entries(engine, engine.staging.open(name))[0])
-        maps = {map_.record.id: born(map_)}
-        return engine.jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
+        count = len(_read_form(engine, staging.open(name))[0])
+        maps = {map_.record.id: creation_time(map_)}
+        return jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
     except BaseException:
-        engine.staging.remove(name)
+        staging.remove(name)
         raise
 
 
-def discard(engine: Engine, job: Job) -> None:
-    """Remove the frames of a job that has ended."""
+def discard(staging: Staging, job: Job) -> None:
+    """Remove the form of a job that has ended."""
     if (name := job.arguments.get("form")) is not None:
-        engine.staging.remove(name)
+        staging.remove(name)
 
 
-def _entries(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, StagedPart]]:
-    """The places that a form lists, and its file parts by name.
+def _read_form(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, StagedPart]]:
+    """The entries of a form's part ``places``, and its file parts by name.
 
     Raises:
-        InvalidRequest, MalformedBody: it makes no sense as a whole.
-        StorageFailure: it is damaged.
+        InvalidRequest, MalformedBody: the form as a whole is malformed.
+        StorageFailure: the form is damaged on disk.
     """
     listed = [part for part in form.parts if part.name == PART]
     if len(listed) != 1 or listed[0].oversized:
@@ -101,19 +99,28 @@ def _entries(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, Sta
     return entries, {part.name: part for part in files}
 
 
-def enrol_staged(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Do, or go on with, what the job says: enrol the frames of the form that waits for it.
+def enrol_staged(engine: Engine, staging: Staging, context: JobContext) -> Mapping[str, Any]:
+    """The work of a job: enrol the frames of its form, from where an earlier attempt stopped.
+
+    Returns:
+        The result of the job.
 
     Raises:
-        UnknownMap, MapQuarantined, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: what was enrolled
-            until then stays.
+        UnknownMap, MapQuarantined, EncoderNotInstalled, TooManyPlaces, StorageFull, StorageFailure: the frames that
+            were stored before stay.
+        JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
-    return _BulkEnrolment(engine, context).run()
+    return _BulkEnrolment(engine, staging, context).run()
 
 
 @dataclass
-class _Told:
-    """What became of the places so far: ``done`` of them in all."""
+class _Outcome:
+    """What became of the first ``done`` entries; it is stored in the job's notes.
+
+    changes: how many places were created, updated, replaced or unchanged.
+    failed: how many entries could not be enrolled.
+    named: the first of these, with their problems.
+    """
 
     done: int
     changes: dict[str, int]
@@ -122,81 +129,81 @@ class _Told:
 
     def fail(self, position: int, entry: Any, error: Exception) -> None:
         self.failed += 1
-        if len(self.named) < NAMED:
+        if len(self.named) < MOST_LISTED:
             problem = problem_of(error).model_dump(exclude_none=True)
-            told = {"position": position, "id": given_id(entry), "status": problem["status"], "problem": problem}
-            self.named.append(told)
+            item = {"position": position, "id": entry_id(entry), "status": problem["status"], "problem": problem}
+            self.named.append(item)
 
 
 class _BulkEnrolment:
-    """One attempt."""
+    """One attempt of the job."""
 
-    def __init__(self, engine: Engine, context: JobContext) -> None:
+    def __init__(self, engine: Engine, staging: Staging, context: JobContext) -> None:
         self.engine, self.context = engine, context
         self.map = context.map(engine.atlas)
-        self.form = engine.staging.open(context.arguments["form"])
-        self.entries, self.files = _entries(engine, self.form)
+        self.form = staging.open(context.arguments["form"])
+        self.entries, self.files = _read_form(engine, self.form)
         self.first: dict[str, int] = {}
-        """Where each id stands first."""
+        """The position of the first entry of each id."""
         for position, entry in enumerate(self.entries):
-            self.first.setdefault(given_id(entry) or "", position)
-        known = {"done": 0, "changes": {}, "failed": 0, "named": []}
-        self.told = _Told(**context.notes.get("told", known))
+            self.first.setdefault(entry_id(entry) or "", position)
+        nothing = {"done": 0, "changes": {}, "failed": 0, "named": []}
+        self.outcome = _Outcome(**context.notes.get("told", nothing))
 
     def run(self) -> Mapping[str, Any]:
-        told, total = self.told, len(self.entries)
-        while told.done < total:
-            self.context.progress(told.done, total)
+        outcome, total = self.outcome, len(self.entries)
+        while outcome.done < total:
+            self.context.progress(outcome.done, total)
             self.context.check_cancelled()
             self._enrol_some()
-            self.context.remember(told=vars(told))
+            self.context.remember(told=vars(outcome))
             self.context.give_way()
-        self.context.progress(told.done, total)
+        self.context.progress(outcome.done, total)
         return {
             "map": self.map.record.id,
             "encoder": self.map.record.encoder,
             "places": self.map.count_places(),
-            "changes": told.changes,
-            "failed": {"count": told.failed, "items": told.named},
+            "changes": outcome.changes,
+            "failed": {"count": outcome.failed, "items": outcome.named},
         }
 
     def _enrol_some(self) -> None:
-        """One commit."""
-        candidates: list[Candidate] = []
+        """Encode and store the frames of one commit."""
+        frames: list[FrameToEnrol] = []
         positions: list[int] = []
         failures: dict[int, Exception] = {}
-        stop, size = self.told.done, 0
-        while stop < len(self.entries) and len(candidates) < TOGETHER and size < BYTES_TOGETHER:
+        stop, size = self.outcome.done, 0
+        while stop < len(self.entries) and len(frames) < PLACES_PER_COMMIT and size < BYTES_PER_COMMIT:
             try:
-                candidates.append(self._candidate(stop))
+                frames.append(self._frame(stop))
             except Exception as error:
-                check_own(error)
+                check_frame_error(error)
                 failures[stop] = error
             else:
                 positions.append(stop)
-                size += len(candidates[-1].data or b"")
+                size += len(frames[-1].data or b"")
             stop += 1
 
         def reject(index: int, error: Exception) -> None:
-            check_own(error)
+            check_frame_error(error)
             failures[positions[index]] = error
 
-        async def work(patience: Patience) -> dict[int, Enrolled]:
-            return await enrol(self.engine, self.map, candidates, patience, reject, queued=False)
+        async def work(deadline: RequestDeadline) -> dict[int, Enrolled]:
+            return await enrol(self.engine, self.map, frames, deadline, reject, queued=False)
 
-        stored = run_behind(self.engine, self.context, work) if candidates else {}
+        stored = run_after_requests(self.engine, self.context, work) if frames else {}
         for one in stored.values():
-            self.told.changes[one.change] = self.told.changes.get(one.change, 0) + 1
+            self.outcome.changes[one.change] = self.outcome.changes.get(one.change, 0) + 1
         for position in sorted(failures):
-            self.told.fail(position, self.entries[position], failures[position])
-        self.told.done = stop
+            self.outcome.fail(position, self.entries[position], failures[position])
+        self.outcome.done = stop
 
-    def _candidate(self, position: int) -> Candidate:
+    def _frame(self, position: int) -> FrameToEnrol:
         entry = self.entries[position]
-        candidate = candidate_of(entry, self.files, self._read, self.map, self.engine.settings)
-        if self.first[candidate.id] != position:
-            raise InvalidRequest(f"id: {candidate.id} stands in the form twice.")
-        return candidate
+        frame = read_entry(entry, self.files, self._read, self.map, self.engine.settings)
+        if self.first[frame.id] != position:
+            raise InvalidRequest(f"id: the form has {frame.id} twice.")
+        return frame
 
     def _read(self, name: str) -> Part:
         return self.form.read(self.files[name])

@@ -1,4 +1,4 @@
-"""From frames as they were sent to places that are stored; one commit for all that are good; no HTTP."""
+"""Enrolment: frames are encoded and stored as places, all of a request in one commit."""
 
 from __future__ import annotations
 
@@ -7,28 +7,27 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
-from core.errors import NoRegions
-from core.frames.images import encode_thumbnail
 from core.frames.masks import Mask
 from core.places import Place, PlaceFields
+from core.recognition.recognition import describe, frame_digest
 from core.storage import Change, Enrolment, Map, SameFrame
-from service.engine.queue import AHEAD, Encoded, Patience
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
+from service.engine.queue import AHEAD, RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
-from service.places.batch_order import Sequel, Stage
+from service.places.batch_order import BatchTurn, Stage
 from service.worker_threads import in_thread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """One frame that a caller wants remembered as the place ``id``.
+class FrameToEnrol:
+    """One frame that a caller wants to store as the place ``id``.
 
-    data: the bytes of its file; None where the place is to keep the frame that it holds.
-    sha256: digest of that frame, 32 bytes; None where there are ``data``.
+    fields: pose, time, sequence, camera and metadata of the place.
+    data: the bytes of the file; None if the place already holds the frame and only its fields are set.
+    mask: the part of the frame that is ignored.
+    sha256: the digest of the frame that the place holds, 32 bytes; None if there are ``data``.
     """
 
     id: str
@@ -40,9 +39,10 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Enrolled:
-    """A place as it was stored, and what changed by it.
+    """A stored place.
 
-    milliseconds: of the stages of encoding; empty where the same picture was known already.
+    change: whether the place was created, updated or replaced, or is unchanged.
+    milliseconds: the times of the stages of encoding; empty if the map had encoded the frame before.
     """
 
     place: Place
@@ -50,10 +50,28 @@ class Enrolled:
     milliseconds: Mapping[str, float] = field(default_factory=dict)
 
 
-def frame_digest(candidate: Candidate) -> bytes:
-    """What tells whether a frame has been encoded already: its bytes and, if there is one, its mask."""
-    digest = candidate.sha256 or hashlib.sha256(candidate.data or b"").digest()
-    return digest if candidate.mask is None else hashlib.sha256(digest + candidate.mask.digest.encode()).digest()
+def digest_of(frame: FrameToEnrol) -> bytes:
+    """The ``frame_digest`` of a frame, 32 bytes; a map does not encode a frame again that it knows by this digest."""
+    sha256 = frame.sha256 or hashlib.sha256(frame.data or b"").digest()
+    return frame_digest(sha256, frame.mask)
+
+
+def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes, encoded: Encoded) -> Enrolment:
+    """The record that a map stores of an encoded frame.
+
+    Raises:
+        NoRegions: the frame is blank, or nearly so.
+    """
+    return describe(
+        map_,
+        frame.id,
+        frame.fields,
+        frame.data,
+        digest,
+        encoded.pixels,
+        encoded.encoding,
+        engine.settings.thumbnail_side,
+    )
 
 
 def _raise(_index: int, error: Exception) -> None:
@@ -63,65 +81,65 @@ def _raise(_index: int, error: Exception) -> None:
 async def enrol(
     engine: Engine,
     map_: Map,
-    candidates: Sequence[Candidate],
-    patience: Patience,
+    frames: Sequence[FrameToEnrol],
+    deadline: RequestDeadline,
     reject: Callable[[int, Exception], None] = _raise,
     queued: bool = True,
-    sequel: Sequel | None = None,
+    batch_turn: BatchTurn | None = None,
 ) -> dict[int, Enrolled]:
-    """Enrol frames; one that the place holds already is not encoded again.
+    """Encode frames and store them as places; a frame that its place already holds is not encoded again.
 
-    Nothing is stored before all frames are encoded, so a request that is dropped leaves nothing.
+    Nothing is stored before all frames are encoded, so a request that is aborted leaves nothing behind.
 
     Args:
-        candidates: of different ids.
-        reject: is told the index of a frame that cannot be encoded and why; it may raise to end all.
-        queued: it takes a place in the queue, as a request does; a job stands back instead.
-        sequel: in line behind another batch, which is to be encoded and stored before.
+        frames: frames with different ids.
+        reject: is called with the index of a frame that cannot be encoded, and the error; it may raise to abort all.
+        queued: whether the frames take a place in the queue, as those of a request do, but not those of a job.
+        batch_turn: the turn of this batch, if it has to be encoded and stored after another one.
 
     Returns:
-        What was stored, by index; durable, and seen by every later query.
+        The stored places by index; they are on disk, and every later query finds them.
 
     Raises:
         QueueFull, DeadlineExceeded, ClientGone, BatchOutOfOrder: nothing was stored.
+        TooManyPlaces: the map has no room for the places.
         StorageFull, StorageFailure: nothing of the last commit was kept.
+        Others: what ``reject`` raises.
     """
-    digests = await in_thread(lambda: [frame_digest(candidate) for candidate in candidates])
+    digests = await in_thread(lambda: [digest_of(frame) for frame in frames])
     stored: dict[int, Enrolled] = {}
-    open_ = set(range(len(candidates)))
-    known = await in_thread(lambda: {i for i in open_ if map_.digest(candidates[i].id) == digests[i]})
-    if sequel is not None:
-        await sequel.wait_for(Stage.ENCODED)
+    open_ = set(range(len(frames)))
+    known = await in_thread(lambda: {i for i in open_ if map_.digest(frames[i].id) == digests[i]})
+    if batch_turn is not None:
+        await batch_turn.wait_for(Stage.ENCODED)
     while open_:
         enrolments: dict[int, Enrolment] = {}
         times: dict[int, Mapping[str, float]] = {}
-        sent = [(i, data) for i in sorted(open_ - known) if (data := candidates[i].data) is not None]
+        sent = [(i, data) for i in sorted(open_ - known) if (data := frames[i].data) is not None]
         for i in sorted(open_ - known - {i for i, _ in sent}):
-            reject(i, FrameNeeded(f"The place {candidates[i].id!r} does not hold the frame of this digest; send it."))
+            reject(i, FrameNeeded(f"The place {frames[i].id!r} does not hold the frame of this digest; send it."))
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
-            masks = [candidates[i].mask for i in new]
-            with engine.inference.place_in_queue(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many_for(map_, bodies, patience, masks)) as outcomes:
+            masks = [frames[i].mask for i in new]
+            with engine.queue.place(len(sent)) if queued else nullcontext():
+                async with aclosing(engine.encode_many(map_.record.encoder, bodies, deadline, masks)) as outcomes:
                     async for some in outcomes:
-                        frames = {new[index]: outcome for index, outcome in some}
-                        # Thumbnails are made, and pixels let go, while the encoder is at the next frames.
-                        prepared = await in_thread(_prepare_all, engine, map_, candidates, digests, frames)
+                        encoded = {new[index]: outcome for index, outcome in some}
+                        # Thumbnails are made, and pixels freed, while the encoder works at the next frames.
+                        prepared = await in_thread(_prepare_all, engine, map_, frames, digests, encoded)
                         for i, made in prepared.items():
                             if isinstance(made, Exception):
                                 reject(i, made)
                             else:
                                 enrolments[i], times[i] = made
-                        if sequel is not None and len(sent) - len(enrolments) <= AHEAD:
-                            sequel.reach(Stage.ENCODED)
-        if sequel is not None:
-            sequel.reach(Stage.ENCODED)
-            await sequel.wait_for(Stage.STORED)
-        done = await in_thread(
-            _commit, engine, map_, enrolments, {i: (candidates[i], digests[i]) for i in sorted(known)}
-        )
+                        if batch_turn is not None and len(sent) - len(enrolments) <= AHEAD:
+                            batch_turn.report(Stage.ENCODED)
+        if batch_turn is not None:
+            batch_turn.report(Stage.ENCODED)
+            await batch_turn.wait_for(Stage.STORED)
+        done = await in_thread(_commit, engine, map_, enrolments, {i: (frames[i], digests[i]) for i in sorted(known)})
         stored.update({i: Enrolled(place, change, times.get(i, {})) for i, (place, change) in done.items()})
-        # Known a moment ago, but given another picture or forgotten in between: these have to be encoded.
+        # Places that were deleted, or got another frame, since their digest was read: their frames have to be encoded.
         open_, known = known - set(done), set()
     return stored
 
@@ -129,68 +147,55 @@ async def enrol(
 def _prepare_all(
     engine: Engine,
     map_: Map,
-    candidates: Sequence[Candidate],
+    frames: Sequence[FrameToEnrol],
     digests: Sequence[bytes],
-    frames: Mapping[int, Encoded | Exception],
+    outcomes: Mapping[int, Encoded | Exception],
 ) -> dict[int, tuple[Enrolment, Mapping[str, float]] | Exception]:
-    """What to commit for each frame and its times, or why it cannot be enrolled."""
+    """For each frame the record to commit and the times of its stages, or the error that keeps it from being stored."""
     made: dict[int, tuple[Enrolment, Mapping[str, float]] | Exception] = {}
-    for i, outcome in frames.items():
+    for i, outcome in outcomes.items():
         try:
             if isinstance(outcome, Exception):
                 raise outcome
-            made[i] = prepare(engine, map_, candidates[i], digests[i], outcome), outcome.milliseconds
+            made[i] = describe_frame(engine, map_, frames[i], digests[i], outcome), outcome.milliseconds
         except Exception as error:
             made[i] = error
     return made
-
-
-def prepare(engine: Engine, map_: Map, candidate: Candidate, digest: bytes, encoded: Encoded) -> Enrolment:
-    """What to commit for one frame: descriptors, fields, and of the picture what the map keeps."""
-    encoding, keep = encoded.encoding, map_.record.keep
-    if len(encoding.regions) == 0:
-        raise NoRegions("The frame has no region of interest: it is blank, or nearly so.")
-    thumbnail = encode_thumbnail(encoded.pixels, engine.settings.thumbnail_side) if keep == "thumbnail" else None
-    return Enrolment(
-        id=candidate.id,
-        fields=candidate.fields,
-        descriptor=encoding.descriptor,
-        local=encoding.local,
-        regions=len(encoding.regions),
-        digest=digest,
-        thumbnail=thumbnail,
-        image=candidate.data if keep == "image" else None,
-    )
 
 
 def _commit(
     engine: Engine,
     map_: Map,
     enrolments: Mapping[int, Enrolment],
-    known: Mapping[int, tuple[Candidate, bytes]],
+    known: Mapping[int, tuple[FrameToEnrol, bytes]],
 ) -> dict[int, tuple[Place, Change]]:
-    """Store new pictures, and new fields of pictures that are still the ones known, in one commit.
+    """Store new frames, and new fields of frames that the map still holds, in one commit.
 
-    In the order in which they were given: it is the order of the places in their sequence.
+    They are stored in the order of the request, which is the order of the places in their sequence.
+
+    Args:
+        known: the frames that the map held when their digests were read, with these digests.
     """
     items: dict[int, Enrolment | SameFrame] = dict(enrolments)
-    items |= {i: SameFrame(candidate.id, candidate.fields, digest) for i, (candidate, digest) in known.items()}
+    items |= {i: SameFrame(frame.id, frame.fields, digest) for i, (frame, digest) in known.items()}
     items = dict(sorted(items.items()))
     began = time.perf_counter()
     with engine.writing(map_.record.id):
         if enrolments:
-            check_places(engine, map_, [enrolment.id for enrolment in enrolments.values()])
-        found = zip(items, map_.transfer.enrol(list(items.values())), strict=True)
+            check_place_limit(engine, map_, [enrolment.id for enrolment in enrolments.values()])
+        found = zip(items, map_.enrol(list(items.values())), strict=True)
         done = {i: stored for i, stored in found if stored is not None}
     engine.metrics.commits.observe(time.perf_counter() - began)
     return done
 
 
-def check_places(engine: Engine, map_: Map, ids: Sequence[str]) -> None:
-    """See that a map has room for places of these ids, those that it has included; call it in possession of the map.
+def check_place_limit(engine: Engine, map_: Map, ids: Sequence[str]) -> None:
+    """Check that a map has room for places of these ids, some of which it may have already.
+
+    Call it while holding the map's lock (``engine.writing``).
 
     Raises:
-        TooManyPlaces: it has not.
+        TooManyPlaces: the map would have too many places.
     """
     most, there = engine.settings.max_places, map_.count_places()
     if there + len(ids) <= most:  # nearly always

@@ -1,16 +1,16 @@
-"""Places: enrol one frame or many, browse, read, edit, forget, see."""
+"""Routes of places and traverses: enrol one frame or many; list, read, edit and delete places; fetch thumbnails."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import Response
 
 from core import errors
-from core.storage.patches import merge_patch
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Patience
+from core.storage.records import merge_patch
+from service.engine.engine import Engine, camera_mask
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BatchOutOfOrder,
     EncoderNotInstalled,
@@ -23,10 +23,14 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
+    FromState,
     MapId,
-    PatienceDep,
+    Page,
     PlaceId,
+    SequenceName,
+    frame_for_map,
     json_body,
     milliseconds_since,
     rounded,
@@ -35,20 +39,40 @@ from service.http.dependencies import (
 )
 from service.http.openapi import form_body, frame_body, json_patch
 from service.http.route_classes import StrictRoute
-from service.http.uploads import json_part, read_frame, read_many
-from service.jobs.routes import router as jobs
+from service.http.uploads import json_part, read_many
+from service.jobs.jobs import Jobs
+from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.places import bulk_enrolment
-from service.places.batch_order import Sequel
-from service.places.batches import candidate_of, check_batch, given_id, item_problem
-from service.places.enrolment import Candidate, enrol
+from service.places.batch_order import BatchOrder, BatchTurn
+from service.places.batches import check_batch, entry_id, frame_problem, read_entry
+from service.places.enrolment import FrameToEnrol, enrol
 from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
-from service.places.schemas import BatchResult, BatchResults, EnrolledPlace, PlaceChanges, PlacePage, PlaceView
+from service.places.schemas import (
+    BatchResult,
+    BatchResults,
+    EnrolledPlace,
+    ForgottenSequence,
+    PlaceChanges,
+    PlacePage,
+    PlaceView,
+    SequencePage,
+)
+from service.places.staging import Staging
+from service.worker_threads import in_thread
+
+StagingDep = Annotated[Staging, Depends(FromState("staging"))]
+BatchOrderDep = Annotated[BatchOrder, Depends(FromState("batch_order"))]
 
 router = APIRouter(
     prefix="/v1/maps/{map}/places",
     tags=["places"],
     route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
+traverses = APIRouter(
+    prefix="/v1/maps/{map}/sequences",
+    tags=["sequences"],
     dependencies=[Depends(single_values)],
 )
 ENROLMENT_PROBLEMS = (
@@ -89,7 +113,7 @@ async def enrol_place(
     request: Request,
     response: Response,
     engine: EngineDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> EnrolledPlace:
     """Enrol one frame under an id of the caller's.
 
@@ -97,14 +121,10 @@ async def enrol_place(
     encoded again, so a request can be repeated until it succeeds. The answer comes when the place is
     on disk and found by every later query.
     """
-    engine.inference.check_room()
-    map_ = await engine.map(map_id)
-    frame = await read_frame(request, engine.settings)
-    options = options.joined(frame.fields)
-    engine.assert_encoder(map_, options.encoder)
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = options.place_fields(engine.settings)
     mask = await camera_mask(map_, fields.camera)
-    stored = (await enrol(engine, map_, [Candidate(place_id, fields, frame.data, mask)], patience))[0]
+    stored = (await enrol(engine, map_, [FrameToEnrol(place_id, fields, data, mask)], deadline))[0]
     response.status_code = 201 if stored.change == "created" else 200
     request.state.noted = {"map": map_id, "change": stored.change}
     return EnrolledPlace(
@@ -130,7 +150,10 @@ async def enrol_places(
     options: Annotated[BatchParameters, Query()],
     request: Request,
     engine: EngineDep,
-    patience: PatienceDep,
+    jobs: JobsDep,
+    staging: StagingDep,
+    batch_order: BatchOrderDep,
+    deadline: DeadlineDep,
 ) -> BatchResults | Response:
     """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
 
@@ -144,48 +167,53 @@ async def enrol_places(
     To have the next batch encoded while this one is being stored, name them: `?batch=a`, then `?batch=b&after=a`.
     """
     if options.background:
-        return await _enrol_later(map_id, options, request, engine)
-    with engine.succession.enter(map_id, options.batch, options.after, patience) as sequel:
-        return await _enrol_now(map_id, options, request, engine, patience, sequel)
+        return await _enrol_later(map_id, options, request, engine, jobs, staging)
+    with batch_order.enter(map_id, options.batch, options.after, deadline) as batch_turn:
+        return await _enrol_now(map_id, options, request, engine, deadline, batch_turn)
 
 
 async def _enrol_now(
-    map_id: str, options: BatchParameters, request: Request, engine: Engine, patience: Patience, sequel: Sequel
+    map_id: str,
+    options: BatchParameters,
+    request: Request,
+    engine: Engine,
+    deadline: RequestDeadline,
+    batch_turn: BatchTurn,
 ) -> BatchResults:
-    engine.inference.check_room()
+    engine.queue.check_room()
     map_ = await engine.map(map_id)
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)
     check_batch(entries, [part.name for part in files], engine.settings.max_batch_items)
-    await in_thread(map_.cameras.all)  # from disk, if they are not in memory yet
+    await in_thread(map_.cameras.all)  # so that the cameras are in memory
     engine.metrics.batches.labels("enrol").observe(len(entries))
 
     results: list[BatchResult | None] = [None] * len(entries)
 
     def reject(position: int, error: Exception) -> None:
-        problem = item_problem(request, error)
-        results[position] = BatchResult(id=given_id(entries[position]), status=problem.status, problem=problem)
+        problem = frame_problem(request, error)
+        results[position] = BatchResult(id=entry_id(entries[position]), status=problem.status, problem=problem)
 
     ids: set[str] = set()
-    candidates: dict[int, Candidate] = {}
+    frames: dict[int, FrameToEnrol] = {}
     by_name = {part.name: part for part in files}
     for position, entry in enumerate(entries):
         try:
-            candidate = candidate_of(entry, by_name, by_name.__getitem__, map_, engine.settings)
-            if candidate.id in ids:
-                raise InvalidRequest(f"id: {candidate.id} stands in the batch twice.")
-            ids.add(candidate.id)
-            candidates[position] = candidate
+            frame = read_entry(entry, by_name, by_name.__getitem__, map_, engine.settings)
+            if frame.id in ids:
+                raise InvalidRequest(f"id: the batch has {frame.id} twice.")
+            ids.add(frame.id)
+            frames[position] = frame
         except Exception as error:
             reject(position, error)
-    positions = list(candidates)
+    positions = list(frames)
     stored = await enrol(
         engine,
         map_,
-        list(candidates.values()),
-        patience,
+        list(frames.values()),
+        deadline,
         lambda index, error: reject(positions[index], error),
-        sequel=sequel,
+        batch_turn=batch_turn,
     )
     for index, one in stored.items():
         results[positions[index]] = BatchResult(
@@ -198,13 +226,14 @@ async def _enrol_now(
     return BatchResults(items=[result for result in results if result is not None], encoder=map_.record.encoder)
 
 
-async def _enrol_later(map_id: str, options: BatchParameters, request: Request, engine: Engine) -> Response:
+async def _enrol_later(
+    map_id: str, options: BatchParameters, request: Request, engine: Engine, jobs: Jobs, staging: Staging
+) -> Response:
     map_ = await engine.map(map_id)
     engine.assert_encoder(map_, options.encoder)
-    job = await bulk_enrolment.receive(engine, map_, request)
+    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request)
     request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
-    location = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
-    return JSONResponse(JobView.of(job).model_dump(mode="json"), 202, {"Location": location})
+    return accepted(job, engine.settings)
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
@@ -253,3 +282,18 @@ def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Respon
     """See a place as the map keeps it."""
     picture = engine.atlas.get(map_id).thumbnail(place_id)
     return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})
+
+
+@traverses.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage:
+    """List the traverses of a map in the order of their names."""
+    summaries, next_cursor = engine.atlas.get(map_id).sequences(page.cursor, page.limit)
+    return SequencePage(items=summaries, next_cursor=next_cursor)
+
+
+@traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
+def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
+    """Forget all places of a traverse at once."""
+    count = engine.atlas.get(map_id).forget_sequence(sequence)
+    request.state.noted = {"places": count}
+    return ForgottenSequence(name=sequence, places=count)

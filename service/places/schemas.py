@@ -1,4 +1,4 @@
-"""Places: as they are shown, enrolled and edited."""
+"""Places and traverses as JSON."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
 from core.places import Place, Pose, Sequence, Timestamp
-from core.storage import Change, Keep
+from core.storage import Change, Keep, SequenceSummary
 from service.errors.problems import Problem
 from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 
@@ -24,7 +24,7 @@ PLACE_EXAMPLE: dict[str, Any] = {
     "updated_at": "2026-11-20T10:00:01.250000Z",
 }
 
-# A pose shows the frame that it is in and nothing of the other.
+# A pose has either metric or geographic coordinates; those of the other kind are left out.
 ShownPose = Annotated[Pose, PlainSerializer(lambda pose: pose.model_dump(exclude_none=True))]
 
 
@@ -46,7 +46,7 @@ class PlaceView(BaseModel):
 
     @classmethod
     def of(cls, place: Place) -> PlaceView:
-        """A place as callers see it."""
+        """The JSON view of a place."""
         return cls.model_construct(**place.__dict__)
 
 
@@ -120,3 +120,17 @@ class BatchResults(BaseModel):
 
     items: list[BatchResult]
     encoder: str
+
+
+class SequencePage(BaseModel):
+    """Traverses in the order of their names."""
+
+    items: list[SequenceSummary]
+    next_cursor: Cursor
+
+
+class ForgottenSequence(BaseModel):
+    """A deleted traverse."""
+
+    name: str
+    places: int = Field(description="Places that were forgotten with it.")

@@ -1,16 +1,14 @@
-"""Forms of many frames, written to disk as they arrive, for jobs that work through them later.
+"""Staging: forms of many frames are written to disk as they arrive; jobs read them later.
 
-staging/<name>/form      the bytes of all parts, one behind the other
-staging/<name>/parts     JSON: which bytes are which part, with their digests
-staging/.<name>/…        one that is still arriving; nothing waits for it after a crash
+staging/<name>/form      the bytes of all parts, one after the other
+staging/<name>/parts     JSON: the position, size and digest of each part
+staging/.<name>/…        a form that is still arriving; it is removed after a crash
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import secrets
 import shutil
 import threading
 from collections.abc import AsyncIterator, Collection, Sequence
@@ -19,23 +17,23 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
+from core.disk.files import disk_errors, write_at, write_file
 from core.errors import StorageFailure, StorageFull
-from core.storage.files.disk import refusals, write_at, write_file
 from service.errors.faults import StagingFull
+from service.http.arrivals import Arrival, arriving
 from service.http.bodies import in_pieces
-from service.http.incoming_file import IncomingFile
 from service.http.multipart import FormReader, Part
 from service.worker_threads import to_its_end
 
 FOLDER = "staging"
 
 RESERVE = 256 << 20
-"""Bytes of the disk that forms leave free, for what the maps have to write meanwhile."""
+"""Bytes of the disk that forms leave free for the maps."""
 
 
 @dataclass(frozen=True)
 class StagedPart:
-    """One part of a form on disk: ``size`` bytes from ``offset`` on; none where it was ``oversized``."""
+    """One part of a form on disk: ``size`` bytes from ``offset``; an ``oversized`` part has no bytes on disk."""
 
     name: str
     filename: str | None
@@ -47,7 +45,7 @@ class StagedPart:
 
 
 class _Writer(FormReader):
-    """Feeds on chunks and puts the parts' bytes into a file; at most one chunk of them is in memory."""
+    """Parses a form from chunks and writes the bytes of its parts to a file; it holds at most one chunk in memory."""
 
     def __init__(self, content_type: str, max_parts: int, max_part_bytes: int, file: int) -> None:
         super().__init__(content_type, max_parts, max_part_bytes)
@@ -61,7 +59,7 @@ class _Writer(FormReader):
     def _add_data(self, data: bytes, start: int, end: int) -> None:
         self._part.size += end - start
         if self._part.size > self._max_part_bytes:
-            self._offset = self._start  # the next part takes its room
+            self._offset = self._start  # the next part overwrites this one
             return
         view = memoryview(data)[start:end]
         write_at(self._file, view, self._offset)
@@ -80,14 +78,14 @@ class StagedForm:
     """The parts of a form on disk."""
 
     def __init__(self, folder: Path) -> None:
-        """Of a folder of the staging.
+        """Open the form in a folder.
 
         Raises:
-            StorageFailure: it is not there, or damaged.
+            StorageFailure: the form is missing or damaged.
         """
         self._path = folder / "form"
         try:
-            with refusals(f"read {folder}"):
+            with disk_errors(f"read {folder}"):
                 listed = json.loads((folder / "parts").read_bytes())
             self.parts = [StagedPart(**part) for part in listed]
         except (ValueError, TypeError) as error:
@@ -97,9 +95,9 @@ class StagedForm:
         """A part with its bytes.
 
         Raises:
-            StorageFailure: they are not those that came, or cannot be read.
+            StorageFailure: the bytes cannot be read, or differ from those that arrived.
         """
-        with refusals(f"read {self._path}"), self._path.open("rb") as file:
+        with disk_errors(f"read {self._path}"), self._path.open("rb") as file:
             file.seek(part.offset)
             data = file.read(part.size)
         if hashlib.sha256(data).hexdigest() != part.sha256:
@@ -108,75 +106,73 @@ class StagedForm:
 
 
 class Staging:
-    """What waits on disk for jobs.  From any thread.
+    """The forms that wait on disk for jobs.  Thread-safe.
 
     Args:
-        directory: that of the data.
-        capacity: bytes that all of it may take.
-        reserve: bytes of the disk that it leaves to the maps.
+        directory: the data directory.
+        capacity: the most bytes that all forms together may have.
+        reserve: bytes of the disk that forms leave free.
     """
 
     def __init__(self, directory: Path, capacity: int, reserve: int = RESERVE) -> None:
         self._folder, self.capacity, self._reserve = directory / FOLDER, capacity, reserve
         self._lock = threading.Lock()
         self._sizes: dict[str, int] = {}
-        """Bytes of each form; of one that is still arriving those that are announced."""
+        """The bytes of each form; of a form that is still arriving, the announced bytes."""
         self._coming: dict[str, int] = {}
-        """Of those that are still arriving: bytes that are not there yet."""
+        """The bytes that have not arrived yet of each form that is arriving."""
 
     def open(self, name: str) -> StagedForm:
-        """A form that arrived whole.
+        """A form that has arrived completely.
 
         Raises:
-            StorageFailure: it is not there, or damaged.
+            StorageFailure: the form is missing or damaged.
         """
         return StagedForm(self._folder / name)
 
     def remove(self, name: str) -> None:
-        """Remove a form; nothing happens if there is none.
+        """Remove a form, if it exists.
 
         Raises:
             StorageFull, StorageFailure: the disk refuses.
         """
-        with refusals(f"remove {self._folder / name}"):
+        with disk_errors(f"remove {self._folder / name}"):
             if (self._folder / name).exists():
                 shutil.rmtree(self._folder / name)
         with self._lock:
             self._sizes.pop(name, None)
 
     def clean(self, waited_for: Collection[str]) -> None:
-        """Remove all but what is waited for, as a crash left it; call it before anything arrives."""
+        """Remove the forms that a crash left behind; call it before any form arrives.
+
+        Args:
+            waited_for: the names of the forms that jobs wait for; these are kept.
+        """
         if self._folder.is_dir():
             for found in self._folder.iterdir():
                 if found.name not in waited_for:
                     shutil.rmtree(found, ignore_errors=True)
                 else:
-                    with suppress(OSError):  # the job will say what it lacks
+                    with suppress(OSError):  # the job will report that the form is missing
                         self._sizes[found.name] = (found / "form").stat().st_size
 
     def size(self) -> int:
-        """Bytes that lie there now, or are announced."""
+        """The bytes of all forms, including announced bytes that have not arrived yet."""
         with self._lock:
             return sum(self._sizes.values())
 
     def _claim(self, name: str, size: int) -> None:
         with self._lock:
             if sum(self._sizes.values()) + size > self.capacity:
-                raise StagingFull("Too much waits to be enrolled already; send this again later.")
+                raise StagingFull("Too many frames are waiting to be enrolled already; send these again later.")
             self._sizes[name] = self._coming[name] = size
 
     def _expect_room(self) -> None:
-        """See that the disk has room for all that is still to come, and the reserve besides."""
+        """Check that the disk has room for all bytes that are still to arrive, and for the reserve."""
         with self._lock:
             coming = sum(self._coming.values())
         if shutil.disk_usage(self._folder).free < coming + self._reserve:
-            raise StorageFull(f"The disk has no room for {coming} bytes of frames that are to wait, and for the maps.")
-
-    def _open(self, form: IncomingFile) -> None:
-        with refusals(f"write {form.temporary}"):
-            form.temporary.mkdir(parents=True)
-            self._expect_room()
-            form.open()
+            raise StorageFull(f"The disk has no room for {coming} bytes of waiting frames beside the maps.")
 
     async def receive(
         self,
@@ -186,31 +182,32 @@ class Staging:
         max_parts: int,
         max_part_bytes: int,
     ) -> str:
-        """Write a form down as it arrives; its name, once it is there whole and synced.
+        """Write a form to disk as it arrives; returns its name when the form is complete and synced.
+
+        If an error is raised, nothing of the form is left.
 
         Args:
-            announced: bytes that it has, or may have.
+            announced: how many bytes the form has, or may have at most.
 
         Raises:
-            StagingFull: too much waits already.
-            MalformedBody: it is not multipart, or cut short.
-            BodyTooLarge: it has too many parts.
-            StorageFull, StorageFailure: nothing of it is left.
-            Others: what ``chunks`` raises; nothing of it is left either.
+            StagingFull: too many bytes are waiting already.
+            MalformedBody: the form is not multipart, or incomplete.
+            BodyTooLarge: the form has too many parts.
+            StorageFull, StorageFailure: the disk is full or refuses.
+            Others: what ``chunks`` raises.
         """
-        name = secrets.token_hex(8)
+        arrival = Arrival(self._folder, "store the frames", inside="form")
+        name = arrival.name
         self._claim(name, announced)
-        form = IncomingFile(self._folder / f".{name}", self._folder / name, "form")
         try:
-            await to_its_end(lambda: self._open(form))
-            writer = _Writer(content_type, max_parts, max_part_bytes, form.descriptor)
-            async for piece in in_pieces(chunks):
-                await to_its_end(partial(_feed, writer, piece))
-                self._coming[name] = max(0, self._coming[name] - len(piece))
-            writer.close()
-            size = await to_its_end(lambda: _complete(form, writer.staged))
+            async with arriving(arrival, self._expect_room):
+                writer = _Writer(content_type, max_parts, max_part_bytes, arrival.file)
+                async for piece in in_pieces(chunks):
+                    await to_its_end(partial(_feed, writer, piece))
+                    self._coming[name] = max(0, self._coming[name] - len(piece))
+                writer.close()
+                size = await to_its_end(lambda: _complete(arrival, writer.staged))
         except BaseException:
-            await to_its_end(form.discard)
             with self._lock:
                 del self._sizes[name], self._coming[name]
             raise
@@ -220,15 +217,13 @@ class Staging:
         return name
 
 
-def _complete(form: IncomingFile, parts: Sequence[StagedPart]) -> int:
-    """Write the list of a form's parts, and give the form its final name; its size in bytes."""
-    with refusals(f"write {form.final}"):
-        size = os.fstat(form.descriptor).st_size
-        write_file(form.temporary / "parts", json.dumps([asdict(part) for part in parts]).encode())
-        form.complete()
-    return size
+def _complete(arrival: Arrival, staged: Sequence[StagedPart]) -> int:
+    """Write the list of the parts beside their bytes, and complete the form; returns the bytes of the parts."""
+    with disk_errors("store the frames"):
+        write_file(arrival.temporary / "parts", json.dumps([asdict(part) for part in staged]).encode())
+    return arrival.complete()
 
 
 def _feed(writer: _Writer, data: bytes) -> None:
-    with refusals("write down what arrives"):
+    with disk_errors("store the frames"):
         writer.feed(data)

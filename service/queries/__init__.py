@@ -1,1 +1,1 @@
-"""Where was this frame taken?"""
+"""Queries: where was this frame taken?"""

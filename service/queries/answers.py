@@ -1,105 +1,82 @@
-"""From what was located to what callers are told."""
+"""The JSON answer to a query, from the answer of :mod:`core.recognition`; answers are counted for the metrics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from typing import Annotated
 
+from fastapi import Depends
+
+from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
-from core.recognition.localization import Located, calibration_of, locate
-from core.recognition.selection import Selection
+from core.recognition.recognition import Answer
+from core.recognition.stages import calibration_of
 from core.storage import Map
 from service.engine.engine import Engine
-from service.engine.queue import Encoded
-from service.http.dependencies import rounded
+from service.engine.microbatches import Encoded
+from service.engine.searches import Recognized
+from service.http.dependencies import FromState, rounded
 from service.places.schemas import PlaceView
 from service.queries.schemas import EstimatedPose, Match, QueryAnswer
+from service.queries.statistics import QueryStatistics, map_key
 
-MOST_AHEAD = 4000
-"""Places of a map that is searched where frames are encoded, in some milliseconds."""
+StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
 
 
-async def answer_queries(
-    engine: Engine, map_: Map, encoded: Sequence[Encoded], k: int, selection: Selection | None = None
-) -> list[QueryAnswer]:
-    """The answers to frames that were encoded by the map's encoder, in their order; counted.
-
-    Raises:
-        StorageFailure: the map's files cannot be read.
-    """
-    seen = [one for one in encoded if len(one.encoding.regions)]
-    if len(seen) == 1 and seen[0].followed is not None:
-        located: list[Located] = seen[0].followed
+def counted_answer(engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized) -> QueryAnswer:
+    """The JSON answer to a frame; it is counted in the service's metrics and in the statistics of the map."""
+    if recognized.answer is None:
+        answer = blank_answer(map_, recognized.encoded)
     else:
-        encodings = [one.encoding for one in seen]
-        located = await engine.searches.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
-    remaining = iter(located)
-    answers = []
-    for one in encoded:
-        answer = answer_of(one, next(remaining)) if len(one.encoding.regions) else blank_answer(map_, one)
-        count_answer(engine, map_, answer)
-        answers.append(answer)
-    return answers
+        answer = answer_of(recognized.encoded, recognized.answer)
+    count_answer(engine, statistics, map_, answer)
+    return answer
 
 
-@dataclass(frozen=True)
-class SearchAhead:
-    """The search for frames in a map, to be done where they were encoded; equal ones are done together."""
-
-    map_: Map
-    k: int
-
-    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Located] | None]:
-        """What was located of each frame; None for those that are searched for in their own place."""
-        seen = [one for one in encoded if len(one.encoding.regions)]
-        if not seen or not self.map_.snapshot().holds:  # what is not in memory comes from the disk
-            return [None] * len(encoded)
-        found = iter(locate(self.map_, seen[0].encoder, [one.encoding for one in seen], self.k))
-        return [[next(found)] if len(one.encoding.regions) else None for one in encoded]
-
-
-def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
-    """The search for a frame where it was encoded; None where other frames might wait long for it."""
-    if selection is not None or map_.count_places() > MOST_AHEAD:
-        return None
-    return SearchAhead(map_, k)
-
-
-def count_answer(engine: Engine, map_: Map, answer: QueryAnswer) -> None:
-    """Count an answer in the service's figures and in those of the map's health."""
+def count_answer(engine: Engine, statistics: QueryStatistics, map_: Map, answer: QueryAnswer) -> None:
+    """Count an answer in the service's metrics and in the statistics of its map."""
     engine.metrics.observe_answer(map_.record.id, answer.verdict, answer.score)
-    engine.upkeep.observe(map_.record.id, answer)
     if "search" in answer.milliseconds:
         engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
+    count_for_map(engine, statistics, map_.record.id, answer)
 
 
-def answer_of(encoded: Encoded, located: Located) -> QueryAnswer:
-    """The answer to a frame that was searched for."""
-    judgement = located.judgement
-    weights: Sequence[float | None] = located.weights or [None] * len(located.matches)
+def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer) -> None:
+    """Count an answer in the statistics of its map, if the map still exists."""
+    with suppress(PlacerecError):  # the map was deleted in the meantime
+        key = map_key(engine.atlas.find(map_id))
+        best = answer.matches[0].place.id if answer.matches else None
+        statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
+
+
+def answer_of(encoded: Encoded, found: Answer) -> QueryAnswer:
+    """The JSON answer to a frame that was searched for."""
+    judgement = found.judgement
+    weights: Sequence[float | None] = found.weights or [None] * len(found.matches)
     matches = [
         Match(rank=rank, score=score, weight=weight, place=PlaceView.of(place))
-        for rank, ((score, place), weight) in enumerate(zip(located.matches, weights, strict=True), start=1)
+        for rank, ((score, place), weight) in enumerate(zip(found.matches, weights, strict=True), start=1)
     ]
     recognized = judgement.verdict == "recognized"
     return QueryAnswer(
         verdict=judgement.verdict,
         place=matches[0].place if recognized else None,
         probability=judgement.probability,
-        pose=estimated_pose(located.pose, matches[0].place) if recognized else None,
+        pose=estimated_pose(found.pose, matches[0].place) if recognized else None,
         score=judgement.score,
         margin=judgement.margin,
         decision=judgement.decision,
-        threshold=located.calibration.threshold,
-        reason=None if matches else "no-place-allowed" if located.scored.places else "empty-map",
+        threshold=found.calibration.threshold,
+        reason=None if matches else "no-place-allowed" if found.candidates.places else "empty-map",
         matches=matches,
         encoder=encoded.encoder.identity,
-        milliseconds=rounded({**encoded.milliseconds, "search": located.search}),
+        milliseconds=rounded({**encoded.milliseconds, "search": found.search}),
     )
 
 
 def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedPose | None:
-    """An estimate as callers see it; in the plane where the best match's pose is."""
+    """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none."""
     if estimate is None:
         return None
     pose = estimate.pose
@@ -114,7 +91,7 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedP
 
 
 def blank_answer(map_: Map, encoded: Encoded) -> QueryAnswer:
-    """The answer to a frame without regions: there is nothing to compare."""
+    """The JSON answer to a frame without regions, which cannot be searched for."""
     return QueryAnswer(
         verdict="unknown",
         place=None,

@@ -1,4 +1,4 @@
-"""What a query is told of the reasons for its answer, and the pictures of it that can be fetched for a while."""
+"""Explanations: why the best match of a query scores as it does, as JSON and as a picture of both frames."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.method.encoder import Encoder
+from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
-from core.method.vlad import assign
 from core.places import Place
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
-from service.queries.explanation_schemas import (
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import RequestDeadline
+from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
+from service.queries.schemas import (
     CellPair,
     ExplainedRegion,
     ExplanationView,
@@ -27,52 +29,59 @@ from service.queries.explanation_schemas import (
     RegionPair,
     RelativeBox,
 )
-from service.queries.pictures import Line, Outline, scaled, side_by_side
-from service.upkeep.upkeep import key_of
+from service.queries.statistics import map_key
+from service.worker_threads import in_thread
 
 LISTED = 30
-"""Regions of a frame that are told of."""
+"""How many regions of a frame an explanation lists."""
 
 DRAWN = 60
-"""Lines of a picture at most."""
+"""How many lines a picture has at most."""
 
 
-def as_drawn(encoded: Encoded) -> Encoded:
-    """The same with pixels only as many as are drawn: a frame that waits for another may have forty million."""
+def scaled_for_drawing(encoded: Encoded) -> Encoded:
+    """A copy whose pixels are scaled to the size of the drawing: a frame of 40 megapixels would fill the memory."""
     return replace(encoded, pixels=scaled(encoded.pixels))
 
 
-async def explained_match(
-    engine: Engine, map_: Map, query: Encoded, place_id: str, patience: Patience
+async def explain_match(
+    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, deadline: RequestDeadline
 ) -> MatchExplanation | None:
-    """Why a query's best match scores as it does, with a picture of both; None if the place is gone by now.
+    """The explanation of a query's best match, with the path of a picture of both frames; None if the place is gone.
+
+    The picture that the map keeps of the place is encoded again, because the map does not store its regions.
+
+    Args:
+        query: the query, with pixels scaled for drawing.
+        place_id: the id of the best match.
 
     Raises:
-        As for ``Inference.encode``: the picture that is kept of the place is encoded again, for its regions.
+        QueueFull, EncoderNotInstalled: the picture cannot be encoded.
+        Others: see ``EncoderQueue.encode``.
     """
-    found = await in_thread(_stored, map_, place_id)
+    found = await in_thread(_stored_place, map_, place_id)
     if found is None:
         return None
     stored, place, picture = found
-    encoder, again = query.encoder, None
+    encoder, encoded = query.encoder, None
     if picture is not None:
         mask = None
-        with suppress(UnknownCamera):  # forgotten since; the place stays as it was enrolled
+        with suppress(UnknownCamera):  # the camera was deleted after the place was enrolled
             mask = await camera_mask(map_, place.camera)
-        with engine.inference.place_in_queue():
-            again = await engine.encode_for(map_, picture, patience, mask)
-    match = replace(stored, regions=None if again is None else again.encoding.regions)
+        with engine.queue.place():
+            encoded = await engine.encode_for(map_, picture, deadline, mask)
+    match = replace(stored, regions=None if encoded is None else encoded.encoding.regions)
     shown = Shown(query.encoding.descriptor, query.encoding.local, query.encoding.regions)
-    told = await in_thread(lambda: view(encoder, explain(encoder, shown, match), shown, match))
+    explained = await in_thread(lambda: explanation_view(encoder, explain(encoder, shown, match), shown, match))
     path = None
-    if again is not None:
-        drawn = await in_thread(drawing, told, query.pixels, again.pixels)
-        path = f"/v1/maps/{map_.record.id}/explanations/{engine.pictures.keep(key_of(map_), drawn)}"
-    return MatchExplanation(**told.__dict__, place=place_id, match_picture=place.picture, picture=path)
+    if encoded is not None:
+        drawn = await in_thread(draw_explanation, explained, query.pixels, encoded.pixels)
+        path = f"/v1/maps/{map_.record.id}/explanations/{pictures.keep(map_key(map_), drawn)}"
+    return MatchExplanation(**explained.__dict__, place=place_id, match_picture=place.picture, picture=path)
 
 
-def _stored(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | None:
-    """What a map holds of a place: its descriptors, its fields, the picture that is kept."""
+def _stored_place(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | None:
+    """The descriptors, the fields and the picture (or None) that a map stores of a place; None if the place is gone."""
     snapshot = map_.snapshot()
     (row,) = map_.rows_of([place_id])
     if row is None or row >= snapshot.rows:
@@ -89,20 +98,20 @@ def _stored(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | Non
 
 @dataclass(frozen=True)
 class _Listed:
-    """The regions of a frame that are told of: their indices, most important first, and their boxes."""
+    """The listed regions of a frame, the most important first, with their indices among all regions."""
 
     indices: list[int]
     regions: list[ExplainedRegion]
 
 
-def explained(query: Encoded, match: Encoded) -> ExplanationView:
-    """Why two frames that were encoded by one encoder score as they do."""
+def explain_pair(query: Encoded, match: Encoded) -> ExplanationView:
+    """The explanation of the score of two frames that one encoder has encoded."""
     shown = [Shown(one.encoding.descriptor, one.encoding.local, one.encoding.regions) for one in (query, match)]
-    return view(query.encoder, explain(query.encoder, *shown), *shown)
+    return explanation_view(query.encoder, explain(query.encoder, *shown), *shown)
 
 
-def view(encoder: Encoder, explanation: Explanation, query: Shown, match: Shown) -> ExplanationView:
-    """An explanation as callers see it."""
+def explanation_view(encoder: Encoder, explanation: Explanation, query: Shown, match: Shown) -> ExplanationView:
+    """The JSON view of an explanation."""
     sides = [
         _listed(encoder, shown.regions, losses)
         for shown, losses in zip((query, match), explanation.losses, strict=True)
@@ -142,10 +151,10 @@ def _listed(encoder: Encoder, regions: Regions | None, losses: np.ndarray | None
     names, corners = list(grids), boxes(regions, list(grids.values()), 1.0, 1.0)
     words = assign(regions.features, encoder.centers) if len(regions) else np.empty(0, np.int64)
     chosen = [int(index) for index in np.argsort(-losses, kind="stable")[:LISTED]]
-    told = []
+    listed = []
     for index in chosen:
         left, top, right, bottom = (round(corner, 4) for corner in corners[index].tolist())
-        told.append(
+        listed.append(
             ExplainedRegion(
                 layer=names[regions.layers[index]],
                 word=int(words[index]),
@@ -153,11 +162,17 @@ def _listed(encoder: Encoder, regions: Regions | None, losses: np.ndarray | None
                 loss=round(float(losses[index]), 6),
             )
         )
-    return _Listed(chosen, told)
+    return _Listed(chosen, listed)
 
 
-def drawing(shown: ExplanationView, query: Pixels, match: Pixels) -> bytes:
-    """A PNG with both frames: cells that answer each other, or else regions, joined; what carries most outlined."""
+def draw_explanation(shown: ExplanationView, query: Pixels, match: Pixels) -> bytes:
+    """A PNG of both frames side by side: matching cells are joined by lines, or, without a second stage, regions.
+
+    Without a second stage the regions that contribute to the score are outlined, too.
+
+    Args:
+        query, match: uint8 [H, W, 3], BGR.
+    """
     sides = (shown.query_regions, shown.match_regions or [])
     outlines = ([], []) if shown.cells else (_outlines(sides[0]), _outlines(sides[1]))
     return side_by_side(query, match, _lines(shown), outlines)
@@ -165,8 +180,8 @@ def drawing(shown: ExplanationView, query: Pixels, match: Pixels) -> bytes:
 
 def _outlines(regions: Sequence[ExplainedRegion]) -> list[Outline]:
     most = max((region.loss for region in regions), default=0.0)
-    told = [region for region in regions if region.loss > 0]
-    return [Outline((one.box.left, one.box.top, one.box.right, one.box.bottom), one.loss / most) for one in told]
+    drawn = [region for region in regions if region.loss > 0]
+    return [Outline((one.box.left, one.box.top, one.box.right, one.box.bottom), one.loss / most) for one in drawn]
 
 
 def _lines(shown: ExplanationView) -> list[Line]:

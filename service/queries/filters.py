@@ -1,4 +1,4 @@
-"""What callers know of where a frame was taken, as parameters: filters of what may be found, and soft priors."""
+"""The parameters of filters and priors: what a caller knows of the place where a frame was taken."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from core.judgement.priors import Box, Constraint, Disc, Facing, Period
 from core.places import Pose, Sequence, Timestamp, microseconds
-from core.recognition.selection import TRUST, Knowledge, Recent, Selection
+from core.recognition.selection import TRUST, Conditions, RecentFrames, Selection
 from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
@@ -19,7 +19,7 @@ from service.http.schemas import validated
 from service.places.parameters import PlaceDescription
 
 MOST_NAMES = 100
-"""Sequences, and keys of metadata, that one query may name."""
+"""The most sequences, and the most keys of metadata, that one query may name."""
 
 Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
 KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
@@ -93,28 +93,28 @@ class FilterParameters(PlaceDescription):
     )
 
     def position(self) -> Pose | None:
-        """Where the frame was taken, without a heading; None if that is not said.
+        """The position of the frame, without a heading; None if no coordinate is given.
 
         Raises:
-            InvalidRequest: it is incomplete, or of both kinds.
+            InvalidRequest: the position is incomplete, or both metric and geographic.
         """
         names = ("x", "y", "z", "latitude", "longitude")
         given = {name: value for name in names if (value := getattr(self, name)) is not None}
         return validated(Pose, given) if given else None
 
     def selection(self) -> Selection | None:
-        """What the query is to choose from; None: everything.
+        """The filters and priors of the query; None if there are none.
 
         Raises:
-            InvalidRequest: the parameters do not go together, or one is malformed.
+            InvalidRequest: the parameters contradict each other, or one of them is malformed.
         """
         geometry = self._geometry()
         sequences, metadata = self._sequences(), self._metadata()
         given = {*geometry, *(["sequences"] if sequences else []), *(["where"] if metadata else [])}
         soft = self._soft(given)
         made = Selection(
-            _knowledge(given - soft, geometry, sequences, metadata),
-            _knowledge(soft, geometry, sequences, metadata),
+            _conditions(given - soft, geometry, sequences, metadata),
+            _conditions(soft, geometry, sequences, metadata),
             TRUST if self.prior_trust is None else self.prior_trust,
             self._recent(),
         )
@@ -149,17 +149,17 @@ class FilterParameters(PlaceDescription):
         try:
             return tuple(_NAMES.validate_python(names, strict=True))
         except ValidationError as error:
-            raise InvalidRequest(f"sequences: they are no names of traverses, at most {MOST_NAMES}.") from error
+            raise InvalidRequest(f"sequences: give the names of 1 to {MOST_NAMES} traverses.") from error
 
     def _metadata(self) -> dict[str, Scalar]:
         if self.where is None:
             return {}
         found = parsed_json(self.where, "where")
         if not isinstance(found, dict) or not 0 < len(found) <= MOST_NAMES:
-            raise InvalidRequest(f"where: it is no JSON object with 1 to {MOST_NAMES} keys.")
+            raise InvalidRequest(f"where: the value is not a JSON object with 1 to {MOST_NAMES} keys.")
         for key, value in found.items():
             if isinstance(value, dict | list):
-                raise InvalidRequest(f"where: {key[:80]!r} has a value that is no text, number, true, false or null.")
+                raise InvalidRequest(f"where: the value of {key[:80]!r} must be a text, number, true, false or null.")
             if isinstance(value, str) and len(value) > LONGEST_INDEXED:
                 raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
         return found
@@ -167,16 +167,16 @@ class FilterParameters(PlaceDescription):
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
             if self.prior_trust is not None:
-                raise InvalidRequest("prior_trust: nothing is soft.")
+                raise InvalidRequest("prior_trust: it needs soft, which says what it is the trust in.")
             return set()
         names = set(self.soft.split(","))
         if unknown := sorted(names - set(KINDS)):
-            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is none of {', '.join(KINDS)}.")
+            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is not one of {', '.join(KINDS)}.")
         if absent := sorted(names - given):
-            raise InvalidRequest(f"soft: nothing is said of {absent[0]}.")
+            raise InvalidRequest(f"soft: the query has no parameter for {absent[0]}.")
         return names
 
-    def _recent(self) -> Recent | None:
+    def _recent(self) -> RecentFrames | None:
         if not self.exclude_frames and not self.exclude_seconds:
             return None
         if self.sequence is None:
@@ -184,16 +184,16 @@ class FilterParameters(PlaceDescription):
         if self.exclude_seconds and self.timestamp is None:
             raise InvalidRequest("exclude_seconds: it needs the frame's own timestamp.")
         moment = None if self.timestamp is None else microseconds(self.timestamp)
-        return Recent(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
+        return RecentFrames(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
 
 
-def _knowledge(
+def _conditions(
     names: set[str],
     geometry: Mapping[Kind, Constraint],
     sequences: tuple[str, ...] | None,
     metadata: Mapping[str, Scalar],
-) -> Knowledge:
-    return Knowledge(
+) -> Conditions:
+    return Conditions(
         tuple(constraint for name, constraint in geometry.items() if name in names),
         sequences if "sequences" in names else None,
         metadata if "where" in names else {},
@@ -201,17 +201,17 @@ def _knowledge(
 
 
 def parse_box(text: str) -> Box:
-    """west,south,east,north in degrees.
+    """The box of a text ``west,south,east,north`` in degrees.
 
     Raises:
-        InvalidRequest: it is not.
+        InvalidRequest: the text is no such box.
     """
     parts = [part.strip() for part in text.split(",")]
     if len(parts) != 4 or not all(_DEGREES.fullmatch(part) for part in parts):
-        raise InvalidRequest("bbox: it is not four numbers, west,south,east,north.")
+        raise InvalidRequest("bbox: the value is not four numbers, west,south,east,north.")
     west, south, east, north = map(float, parts)
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
-        raise InvalidRequest("bbox: it needs -180 to 180 for west and east, and -90 <= south <= north <= 90.")
+        raise InvalidRequest("bbox: west and east must be -180 to 180, and -90 <= south <= north <= 90.")
     return Box(west, south, east, north)
 
 
@@ -219,7 +219,7 @@ def parsed_json(text: str, what: str) -> Any:
     """The value of JSON text in a parameter.
 
     Raises:
-        InvalidRequest: it is not JSON, or holds what cannot be stored.
+        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair).
     """
 
     def refuse(constant: str) -> Any:
@@ -230,4 +230,4 @@ def parsed_json(text: str, what: str) -> Any:
         json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
         return found
     except (ValueError, RecursionError):
-        raise InvalidRequest(f"{what}: it is not JSON.") from None
+        raise InvalidRequest(f"{what}: the value is not JSON.") from None

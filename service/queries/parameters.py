@@ -1,4 +1,4 @@
-"""What callers say beside the frames that they ask about, for each operation."""
+"""The parameters of queries, one class for each operation."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from service.http.schemas import EncoderAssertion, Matches
 from service.queries.filters import FilterParameters, parsed_json
 
 MOST_MAPS = 100
-"""Maps that one query may name."""
+"""The most maps that one query may name."""
 
 _CAMERAS: TypeAdapter[dict[str, str]] = TypeAdapter(dict[str, Camera])
 
 
-class AskedParameters(FilterParameters):
-    """What is known of a frame that is asked about and not enrolled."""
+class LocateParameters(FilterParameters):
+    """The parameters of a frame that is located and not enrolled."""
 
     def selection(self) -> Selection | None:
-        """As ``FilterParameters.selection``; a position or a heading that would do nothing is refused, too."""
+        """See ``FilterParameters.selection``; a position or heading without its tolerance is refused as well."""
         if self.radius is None and self.position() is not None:
             raise InvalidRequest("A position needs a radius within which the place is.")
         if self.heading is not None and self.heading_tolerance is None:
@@ -30,8 +30,8 @@ class AskedParameters(FilterParameters):
         return super().selection()
 
 
-class QueryParameters(AskedParameters):
-    """Beside a query."""
+class QueryParameters(LocateParameters):
+    """The parameters of a query."""
 
     k: Matches = 5
     explain: bool = Field(default=False, description="Say why the best match scores as it does.")
@@ -39,7 +39,7 @@ class QueryParameters(AskedParameters):
 
 
 class ClosureParameters(FilterParameters):
-    """Beside a frame that is to be enrolled if nobody knows it; its pose, timestamp and sequence are enrolled too."""
+    """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
 
     id: str = Field(description="Id of the place to be made.", examples=["p9"])
     metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"floor": 2}'])
@@ -47,8 +47,8 @@ class ClosureParameters(FilterParameters):
     encoder: EncoderAssertion = None
 
 
-class SeveralParameters(AskedParameters):
-    """Beside one moment's frames that are asked of several maps."""
+class MultiMapParameters(LocateParameters):
+    """The parameters of a query of several maps."""
 
     maps: str | None = Field(
         default=None,
@@ -65,24 +65,24 @@ class SeveralParameters(AskedParameters):
     k: Matches = 5
 
     def map_ids(self) -> list[str] | None:
-        """The maps that are named; None: all.
+        """The ids of the maps that are named; None: all maps.
 
         Raises:
-            InvalidIdentifier: one cannot name a map.
-            InvalidRequest: there are too many, or one twice.
+            InvalidIdentifier: one of them is not a valid id.
+            InvalidRequest: there are too many ids, or one of them twice.
         """
         if self.maps is None:
             return None
         found = [check_map_id(name.strip()) for name in self.maps.split(",")]
         if len(found) > MOST_MAPS or len(set(found)) < len(found):
-            raise InvalidRequest(f"maps: at most {MOST_MAPS}, each once.")
+            raise InvalidRequest(f"maps: name at most {MOST_MAPS} maps, each of them once.")
         return found
 
     def camera_of(self, parts: Collection[str]) -> dict[str, str]:
-        """The camera of each of the form's parts of which one is named.
+        """The name of the camera of each part of the form, for parts that have one.
 
         Raises:
-            InvalidRequest: it is no such object, or names a part that is not there.
+            InvalidRequest: ``cameras`` is malformed, or names a part that the form does not have.
         """
         if self.cameras is None:
             return {} if self.camera is None else dict.fromkeys(parts, self.camera)
@@ -91,7 +91,7 @@ class SeveralParameters(AskedParameters):
         try:
             found = _CAMERAS.validate_python(parsed_json(self.cameras, "cameras"), strict=True)
         except ValidationError as error:
-            raise InvalidRequest("cameras: it is no JSON object of cameras' names by the form's parts.") from error
+            raise InvalidRequest("cameras: the value is not a JSON object of parts and their cameras.") from error
         if strange := sorted(set(found) - set(parts)):
             raise InvalidRequest(f"cameras: the form has no part {strange[0][:80]!r}.")
         return found

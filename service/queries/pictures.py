@@ -1,4 +1,4 @@
-"""Two frames side by side, with what connects them drawn over both, and the last such pictures."""
+"""Pictures of two frames side by side with lines and boxes drawn over them, and a store of the latest pictures."""
 
 from __future__ import annotations
 
@@ -15,26 +15,30 @@ import numpy as np
 from core.frames.images import encode_png
 from core.frames.preprocessing import Pixels
 from service.errors.faults import UnknownExplanation
-from service.upkeep.statistics import MapKey
+from service.queries.statistics import MapKey
 
 HEIGHT = 360
-"""Of each frame in the drawing, pixels."""
+"""The height of each frame in a picture, in pixels."""
 
 WIDEST = 960
-"""Of each frame in the drawing, pixels; a panorama is lower instead."""
+"""The largest width of each frame in a picture, in pixels; a panorama is scaled to this width and is lower."""
 
 GAP = 8
+"""The gap between the frames, in pixels."""
 
 KEPT = 64
-"""Pictures that can be fetched."""
+"""How many pictures are kept."""
 
 SECONDS = 600.0
-"""For so long."""
+"""For how long a picture can be fetched."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """From a point of the left frame to one of the right, (x, y) in shares of width and height; weight in 0 … 1."""
+    """A line from a point of the left frame to one of the right one, (x, y) in shares of width and height.
+
+    weight: 0 … 1; a heavier line is thicker.
+    """
 
     left: tuple[float, float]
     right: tuple[float, float]
@@ -43,7 +47,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Outline:
-    """A box in shares of width and height (left, top, right, bottom); weight in 0 … 1."""
+    """A box (left, top, right, bottom) in shares of width and height.
+
+    weight: 0 … 1; a heavier outline is thicker.
+    """
 
     box: tuple[float, float, float, float]
     weight: float
@@ -52,11 +59,11 @@ class Outline:
 def side_by_side(
     left: Pixels, right: Pixels, lines: Sequence[Line], outlines: tuple[Sequence[Outline], Sequence[Outline]]
 ) -> bytes:
-    """A PNG of two frames; what weighs more is drawn later and thicker.
+    """A PNG of two frames with lines and outlines; heavier ones are thicker and drawn over the others.
 
     Args:
-        left, right: H x W x 3 uint8, BGR.
-        outlines: boxes in the left frame and in the right one.
+        left, right: uint8 [H, W, 3], BGR.
+        outlines: the boxes in the left frame, and those in the right one.
     """
     frames = [scaled(left), scaled(right)]
     height = max(len(frame) for frame in frames)
@@ -79,7 +86,7 @@ def side_by_side(
 
 
 def scaled(frame: Pixels) -> Pixels:
-    """A frame in the size in which it is drawn; one of that size as it is."""
+    """A frame scaled to the size in which it is drawn, uint8 [h, w, 3] with h ≤ ``HEIGHT`` and w ≤ ``WIDEST``."""
     height, width = frame.shape[:2]
     factor = min(HEIGHT / height, WIDEST / width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
@@ -97,15 +104,15 @@ def _colour(share: float) -> tuple[int, int, int]:
     return blue, green, red
 
 
-class Pictures:
-    """The pictures of the last explanations, in memory; from any thread."""
+class ExplanationPictures:
+    """The pictures of the latest explanations, in memory.  Thread-safe."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[tuple[MapKey, str], tuple[float, bytes]] = OrderedDict()
         self._lock = threading.Lock()
 
     def keep(self, key: MapKey, picture: bytes) -> str:
-        """Keep a PNG for a while, for as long as its map is there; the name to fetch it by."""
+        """Keep a PNG for ``SECONDS``, or until its map is deleted; returns the name by which it can be fetched."""
         name = secrets.token_urlsafe(12)
         with self._lock:
             self._kept[key, name] = (time.monotonic() + SECONDS, picture)
@@ -114,10 +121,10 @@ class Pictures:
         return name
 
     def fetch(self, key: MapKey, name: str) -> bytes:
-        """The PNG.
+        """The PNG of a name.
 
         Raises:
-            UnknownExplanation: there is none of this name, or not any more.
+            UnknownExplanation: there is no such picture, or it is not kept any more.
         """
         with self._lock:
             until, picture = self._kept.get((key, name), (0.0, b""))

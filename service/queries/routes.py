@@ -1,30 +1,45 @@
-"""Queries: where was this frame taken?"""
+"""Routes of queries: one frame, many frames, and the pictures of explanations."""
 
 from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Path, Query, Request
+from starlette.responses import Response
 
 from core import errors
-from service.engine.engine import camera_mask, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import camera_mask
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     EncoderNotInstalled,
     InvalidRequest,
     QueueFull,
+    UnknownExplanation,
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, MapId, PatienceDep, milliseconds_since, rounded, single_values, started
-from service.http.openapi import form_body, frame_body
+from service.http.dependencies import (
+    DeadlineDep,
+    EngineDep,
+    FromState,
+    MapId,
+    frame_for_map,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
+from service.http.openapi import BINARY, form_body, frame_body
 from service.http.route_classes import QuickRoute
-from service.http.uploads import check_part, read_frame, read_many, split_form
-from service.places.batches import item_problem
-from service.queries.answers import answer_queries, search_ahead
-from service.queries.explanations import as_drawn, explained_match
+from service.http.uploads import check_part, read_many, split_form
+from service.places.batches import frame_problem
+from service.queries.answers import StatisticsDep, counted_answer
+from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.parameters import QueryParameters
+from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
+from service.queries.statistics import map_key
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -35,7 +50,9 @@ router = APIRouter(
         errors.UnknownCamera, errors.WrongEncoder, UnsupportedMediaType, QueueFull, EncoderNotInstalled
     ),
 )
+explanations = APIRouter(prefix="/v1/maps/{map}/explanations", tags=["queries"], dependencies=[Depends(single_values)])
 QueryOptions = Annotated[QueryParameters, Query()]
+PicturesDep = Annotated[ExplanationPictures, Depends(FromState("explanation_pictures"))]
 
 
 @router.post(
@@ -44,27 +61,26 @@ QueryOptions = Annotated[QueryParameters, Query()]
     responses=problem_documentation(errors.TooManyPixels, errors.NotAnImage, errors.TruncatedImage),
 )
 async def query(
-    map_id: MapId, options: QueryOptions, request: Request, engine: EngineDep, patience: PatienceDep
+    map_id: MapId,
+    options: QueryOptions,
+    request: Request,
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    pictures: PicturesDep,
+    deadline: DeadlineDep,
 ) -> QueryAnswer:
     """Locate one frame in a map.
 
     `place` is given only with the verdict `recognized`; `matches` lists the best places whatever the
     verdict. A place that nobody enrolled is `unknown`, which is an answer and no error.
     """
-    engine.inference.check_room()
-    map_ = await engine.map(map_id)
-    frame = await read_frame(request, engine.settings)
-    options = options.joined(frame.fields)
-    selection = options.selection()
-    engine.assert_encoder(map_, options.encoder)
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
-    with engine.inference.place_in_queue():
-        ahead = search_ahead(map_, options.k, selection)
-        encoded = await engine.encode_for(map_, frame.data, patience, mask, ahead)
-    (answer,) = await answer_queries(engine, map_, [encoded], options.k, selection)
+    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask)
+    answer = counted_answer(engine, statistics, map_, recognized)
     if options.explain and answer.matches:
-        encoded = await in_thread(as_drawn, encoded)
-        answer.explanation = await explained_match(engine, map_, encoded, answer.matches[0].place.id, patience)
+        encoded, best = await in_thread(scaled_for_drawing, recognized.encoded), answer.matches[0].place.id
+        answer.explanation = await explain_match(engine, pictures, map_, encoded, best, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     return answer
@@ -76,25 +92,32 @@ async def query(
     openapi_extra=form_body("The frames, each a file part under a name of its own.", {}, []),
 )
 async def query_batch(
-    map_id: MapId, options: QueryOptions, request: Request, engine: EngineDep, patience: PatienceDep
+    map_id: MapId,
+    options: QueryOptions,
+    request: Request,
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    deadline: DeadlineDep,
 ) -> BatchAnswers:
     """Locate many frames in a map; one that is bad fails alone."""
-    engine.inference.check_room()
+    engine.queue.check_room()
     map_ = await engine.map(map_id)
     files, fields = split_form(await read_many(request, engine.settings))
     options = options.joined(fields)
     selection = options.selection()
     engine.assert_encoder(map_, options.encoder)
     if options.explain:
-        raise InvalidRequest("explain: frames are explained one by one, by a query of their own.")
+        raise InvalidRequest("explain: a batch cannot be explained; send the frame as a single query.")
     mask = await camera_mask(map_, options.camera)
     if not files:
         raise InvalidRequest("The form has no file part.")
     engine.metrics.batches.labels("query").observe(len(files))
     items = [BatchAnswer(file=part.name, status=200) for part in files]
     encoded: dict[int, Encoded] = {}
-    with engine.inference.place_in_queue(len(files)):
-        outcomes = await engine.encode_all_for(map_, [part.data for part in files], patience, [mask] * len(files))
+    with engine.queue.place(len(files)):
+        outcomes = await engine.encode_all(
+            map_.record.encoder, [part.data for part in files], deadline, [mask] * len(files)
+        )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:
                 check_part(part, engine.settings)
@@ -102,11 +125,33 @@ async def query_batch(
                     raise outcome
                 encoded[index] = outcome
             except Exception as error:
-                problem = item_problem(request, error)
+                problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
-    answers = await answer_queries(engine, map_, list(encoded.values()), options.k, selection)
-    for index, answer in zip(encoded, answers, strict=True):
-        items[index].answer = answer
+    recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection)
+    for index, one in zip(encoded, recognized, strict=True):
+        items[index].answer = counted_answer(engine, statistics, map_, one)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)
+
+
+@explanations.get(
+    "/{explanation}",
+    response_class=Response,
+    responses={
+        200: {"description": "Both frames side by side.", "content": {"image/png": {"schema": BINARY}}},
+        **problem_documentation(UnknownExplanation),
+    },
+)
+def see_explanation(
+    map_id: MapId,
+    name: Annotated[str, Path(alias="explanation", max_length=64, description="As the answer to the query named it.")],
+    engine: EngineDep,
+    pictures: PicturesDep,
+) -> Response:
+    """See a query beside its best match: cells (or regions) that answer each other are joined by lines.
+
+    `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
+    """
+    picture = pictures.fetch(map_key(engine.atlas.find(map_id)), name)
+    return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

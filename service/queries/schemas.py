@@ -1,4 +1,4 @@
-"""Answers to queries."""
+"""Answers to queries as JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,66 @@ from core.judgement.verdict import Verdict
 from service.errors.problems import Problem
 from service.http.schemas import IDENTITY_EXAMPLE, Milliseconds
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
-from service.queries.explanation_schemas import MatchExplanation
+
+
+class RelativeBox(BaseModel):
+    """Shares of the upright frame's width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+class ExplainedRegion(BaseModel):
+    """A region of interest and what it carries."""
+
+    layer: str
+    word: int = Field(description="The word of the vocabulary that it was assigned to.")
+    box: RelativeBox
+    loss: float = Field(description="What the score would lose without it.")
+
+
+class RegionPair(BaseModel):
+    """Two regions of one word that are each other's nearest; positions in the two lists."""
+
+    query: int
+    match: int
+
+
+class CellPair(BaseModel):
+    """Two cells that choose each other; row and column of each in `grid`."""
+
+    query: tuple[int, int]
+    match: tuple[int, int]
+    gain: float = Field(description="What the pair adds to the score.")
+
+
+class ExplanationView(BaseModel):
+    """The score, taken apart: the sum of `words` and of the gains of all `cells`."""
+
+    score: float
+    words: list[float] = Field(description="What each word of the vocabulary adds (j_u, as it counts in the score).")
+    query_regions: list[ExplainedRegion] = Field(description="Those that carry most, the most important first.")
+    match_regions: list[ExplainedRegion] | None = Field(
+        description="The same of the other frame; null where no picture of it is kept."
+    )
+    regions: list[RegionPair] = Field(description="Which region answers to which, among those listed.")
+    cells: list[CellPair] = Field(description="Which cell answers to which; empty without a second stage.")
+    grid: tuple[int, int] = Field(description="Rows and columns of the cells; (0, 0) without a second stage.")
+
+
+class MatchExplanation(ExplanationView):
+    """Why a query's best match scores as it does."""
+
+    place: str = Field(description="Id of the best match.")
+    match_picture: str = Field(
+        description="From what the regions of the match were found again: image, thumbnail (which is smaller than "
+        "the frame that was enrolled, so they may differ a little), or none."
+    )
+    picture: str | None = Field(
+        description="Path of a PNG with both frames side by side, for some minutes; null where none is kept."
+    )
 
 
 class Match(BaseModel):
@@ -52,7 +111,7 @@ class EstimatedPose(BaseModel):
 
     @model_serializer(mode="wrap")
     def _one_frame(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A pose shows the frame that it is in and nothing of the other."""
+        """Leave out the coordinates that are not given: a pose is either metric or geographic."""
         shown: dict[str, Any] = handler(self)
         return {name: value for name, value in shown.items() if value is not None or name == "heading_spread"}
 
@@ -138,4 +197,81 @@ class BatchAnswers(BaseModel):
 
     items: list[BatchAnswer]
     encoder: str
+    milliseconds: Milliseconds
+
+
+class MapMatch(BaseModel):
+    """One of the best places of all maps."""
+
+    rank: int
+    map: str = Field(description="The map of the place.")
+    probability: float | None = Field(
+        description="That the match is right, each map's by its own calibration and before the maps are weighed "
+        "against each other; the matches stand in its order. Null where the map's calibration cannot tell: such "
+        "matches are ranked by how far their decision value is beyond the threshold."
+    )
+    score: float = Field(description="In units of the map's encoder; not to be compared between maps.")
+    weight: float | None = Field(default=None, description="As in the answer of one map.")
+    place: PlaceView
+
+
+class MapAnswer(BaseModel):
+    """What became of one map: its own verdict, or the problem that kept it from answering."""
+
+    map: str
+    status: int = Field(description="The status that a query to this map alone would have had.")
+    verdict: Verdict | None = Field(default=None, description="The map's own, without regard to the others.")
+    probability: float | None = None
+    score: float | None = None
+    margin: float | None = None
+    decision: float | None = None
+    threshold: float | None = None
+    reason: Reason | None = Field(default=None, description="Why there is nothing to compare, if so.")
+    encoder: str | None = None
+    problem: Problem | None = None
+
+
+class FrameReport(BaseModel):
+    """What became of one frame."""
+
+    frame: str = Field(description="Name of the form's part; `image` for a raw body.")
+    camera: str | None = Field(description="Whose mask was applied.")
+    status: int = Field(description="200, or the status of its problem.")
+    regions: int | None = Field(
+        default=None, description="Regions of interest found in it; 0: it is blank, and says nothing."
+    )
+    problem: Problem | None = None
+
+
+class SeveralAnswer(BaseModel):
+    """Where the frames were taken, and in which map, or that it is not known."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "verdict": "recognized",
+                    "map": "lab",
+                    "place": PLACE_EXAMPLE,
+                    "probability": 0.98,
+                    "pose": {"x": 1.5, "y": 2.0, "heading": 90.0, "spread": 0.9, "heading_spread": None, "places": 1},
+                    "matches": [{"rank": 1, "map": "lab", "probability": 0.99, "score": 0.41, "place": PLACE_EXAMPLE}],
+                    "maps": [{"map": "lab", "status": 200, "verdict": "recognized", "probability": 0.99}],
+                    "frames": [{"frame": "image", "camera": None, "status": 200, "regions": 600}],
+                    "milliseconds": {"total": 31.0},
+                }
+            ]
+        }
+    )
+
+    verdict: Verdict
+    map: str | None = Field(description="The map of the place; non-null only if recognized.")
+    place: PlaceView | None = Field(description="Non-null only if recognized.")
+    probability: float | None = Field(
+        description="That the best match is right, weighed against the other maps' best, for at most one can be."
+    )
+    pose: EstimatedPose | None = Field(description="In the frame of the map; null unless recognized.")
+    matches: list[MapMatch]
+    maps: list[MapAnswer] = Field(description="In the order in which they were named, or by id.")
+    frames: list[FrameReport]
     milliseconds: Milliseconds

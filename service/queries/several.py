@@ -1,4 +1,4 @@
-"""One moment's frames asked of several maps: each frame encoded once for each encoder, the maps ranked together."""
+"""Queries of several maps at once: each frame is encoded once per encoder, and all matches are ranked together."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from core.frames.masks import Mask
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import log_odds_per_score
 from core.judgement.verdict import Verdict
-from core.recognition.localization import Located
+from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Encoded, Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.engine.queue import RequestDeadline
 from service.errors.faults import EncoderNotInstalled
+from service.worker_threads import in_thread
 
-OWN_ERRORS = (
+MAP_ERRORS = (
     errors.UnknownMap,
     errors.MapQuarantined,
     errors.StorageFailure,
@@ -29,12 +31,12 @@ OWN_ERRORS = (
     errors.InvalidModel,
     EncoderNotInstalled,
 )
-"""What keeps one map from answering and none of the others."""
+"""Errors that keep one map from answering, but not the other maps."""
 
 
 @dataclass(frozen=True)
 class RigFrame:
-    """One of the frames of a moment: its name, its bytes, and the camera that took it, if that is said."""
+    """One frame of a rig: its name, the bytes of its file, and the name of its camera, if it is given."""
 
     name: str
     data: bytes
@@ -43,30 +45,33 @@ class RigFrame:
 
 @dataclass(frozen=True)
 class MapReport:
-    """What became of a map: located, or else the error that kept it from answering.
+    """The answer of one map, or the error that kept it from answering.
 
-    frames: of each frame what was encoded, or why it could not be; None where no encoder was asked.
+    map_: None if the map could not be opened.
+    answer: None if there is an error, or if no frame has regions.
+    frames: each frame as the map's encoder encoded it, or the error of that; empty if the encoder was not used.
     """
 
     map_id: str
     map_: Map | None = None
-    located: Located | None = None
+    answer: Answer | None = None
     error: Exception | None = None
     frames: tuple[Encoded | Exception, ...] = ()
 
     @property
     def log_odds(self) -> float:
-        """Of the map's best match being right."""
-        assert self.located is not None
-        return log_odds_of(self.located.judgement, self.located.calibration)
+        """The log odds that the map's best match is right."""
+        assert self.answer is not None
+        return log_odds_of(self.answer.judgement, self.answer.calibration)
 
 
 @dataclass(frozen=True)
-class Together:
+class JointVerdict:
     """The verdict over all maps.
 
-    best: the report of the map whose match is the most probable; None if none found any.
-    probability: that this match is right, the other maps' considered; None if its map's calibration cannot tell.
+    best: the report of the map with the most probable match; None if no map has a match.
+    probability: the probability that this match is right, given the matches of the other maps; None if the calibration
+        of its map has no curve.
     """
 
     verdict: Verdict
@@ -74,18 +79,21 @@ class Together:
     probability: float | None
 
 
-async def ask_maps(
+async def locate_in_maps(
     engine: Engine,
     map_ids: Sequence[str],
     frames: Sequence[RigFrame],
     k: int,
     selection: Selection | None,
-    patience: Patience,
+    deadline: RequestDeadline,
 ) -> list[MapReport]:
-    """What each map says of the frames, in the order of the ids; call it within ``inference.place_in_queue``.
+    """Locate the frames of a rig in each of several maps; call it within ``queue.place``.
+
+    Returns:
+        One report for each map, in the order of the ids.
 
     Raises:
-        QueueFull, DeadlineExceeded, ClientGone: of the request as a whole.
+        QueueFull, DeadlineExceeded, ClientGone: the whole request fails.
     """
     maps: dict[str, Map] = {}
     masks: dict[str, list[Mask | None]] = {}
@@ -94,23 +102,23 @@ async def ask_maps(
         try:
             maps[map_id] = await engine.map(map_id)
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
-        except OWN_ERRORS as error:
+        except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, patience)
+    encoded = await _encode(engine, maps, masks, frames, deadline)
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
         if isinstance(outcome, Exception):
             reports[map_id] = MapReport(map_id, map_, error=outcome)
             continue
         seen = [one for one in outcome if isinstance(one, Encoded) and len(one.encoding.regions)]
-        amiss = next((one for one in outcome if isinstance(one, OWN_ERRORS)), None)
-        report = MapReport(map_id, map_, error=amiss, frames=tuple(outcome))
-        if seen and amiss is None:
+        failure = next((one for one in outcome if isinstance(one, MAP_ERRORS)), None)
+        report = MapReport(map_id, map_, error=failure, frames=tuple(outcome))
+        if seen and failure is None:
             encodings = [one.encoding for one in seen]
             try:
-                located = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection)
-                report = replace(report, located=located)
-            except OWN_ERRORS as error:
+                answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection)
+                report = replace(report, answer=answer)
+            except MAP_ERRORS as error:
                 report = replace(report, error=error)
         reports[map_id] = report
     return [reports[map_id] for map_id in map_ids]
@@ -121,9 +129,9 @@ async def _encode(
     maps: dict[str, Map],
     masks: dict[str, list[Mask | None]],
     frames: Sequence[RigFrame],
-    patience: Patience,
+    deadline: RequestDeadline,
 ) -> dict[str, list[Encoded | Exception] | Exception]:
-    """By map what became of each frame: those that share an encoder and a mask share the work."""
+    """The encoded frames for each map, or errors; maps with the same encoder and mask share an encoding."""
     wanted: dict[str, dict[tuple[int, str], Mask | None]] = {}
     for map_id, map_ in maps.items():
         for index, mask in enumerate(masks[map_id]):
@@ -135,11 +143,11 @@ async def _encode(
             continue
         keys = list(wanted[identity])
         try:
-            outcomes = await engine.encode_all_for(
-                map_, [frames[index].data for index, _ in keys], patience, list(wanted[identity].values())
+            outcomes = await engine.encode_all(
+                identity, [frames[index].data for index, _ in keys], deadline, list(wanted[identity].values())
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
-        except OWN_ERRORS as error:
+        except MAP_ERRORS as error:
             made[identity] = error
     found: dict[str, list[Encoded | Exception] | Exception] = {}
     for map_id, map_ in maps.items():
@@ -155,29 +163,35 @@ def _key(mask: Mask | None) -> str:
     return "" if mask is None else mask.digest
 
 
-def judge_together(reports: Sequence[MapReport]) -> Together:
-    """The verdict over the maps that answered: that of the most probable match's own map, unless another map has a
-    match of another place that is nearly as probable, which makes it ambiguous."""
-    found = [report for report in reports if report.located is not None and report.located.matches]
+def judge_together(reports: Sequence[MapReport]) -> JointVerdict:
+    """The verdict over all maps that answered.
+
+    It is the verdict of the map with the most probable match.  If another map has a match of another place that is
+    nearly as probable, the verdict is ``ambiguous`` instead of ``recognized``.
+    """
+    found = [report for report in reports if report.answer is not None and report.answer.matches]
     if not found:
-        return Together("unknown", None, None)
+        return JointVerdict("unknown", None, None)
     best, *others = sorted(found, key=lambda report: -report.log_odds)
     rivals = [report.log_odds for report in others if not _same_place(best, report)]
-    assert best.located is not None
-    judgement = best.located.judgement
+    assert best.answer is not None
+    judgement = best.answer.judgement
     verdict = judgement.verdict
     if verdict == "recognized" and rivals and best.log_odds - rivals[0] < ALIKE:
         verdict = "ambiguous"
     if judgement.probability is None:
-        return Together(verdict, best, None)
-    return Together(verdict, best, float(joint_probabilities([best.log_odds, *rivals])[0]))
+        return JointVerdict(verdict, best, None)
+    return JointVerdict(verdict, best, float(joint_probabilities([best.log_odds, *rivals])[0]))
 
 
 def _same_place(a: MapReport, b: MapReport) -> bool:
-    """Whether the best matches of two maps are one place on the Earth; metres are those of each map's own frame."""
-    assert a.located is not None and b.located is not None
+    """Whether the best matches of two maps are the same place on the Earth.
+
+    Metric poses say nothing about this, because each map has a frame of its own.
+    """
+    assert a.answer is not None and b.answer is not None
     assert a.map_ is not None and b.map_ is not None
-    poses = [report.located.matches[0][1].pose for report in (a, b) if report.located is not None]
+    poses = [report.answer.matches[0][1].pose for report in (a, b) if report.answer is not None]
     first, second = poses
     if first is None or second is None or first.kind() != "geographic" or second.kind() != "geographic":
         return False
@@ -186,10 +200,12 @@ def _same_place(a: MapReport, b: MapReport) -> bool:
 
 
 def match_log_odds(report: MapReport) -> list[float]:
-    """Of each match of a map, to rank the matches of several maps together: those of the best match, less by what
-    the match scores less, with what is known of it."""
-    located = report.located
-    assert located is not None
-    ordered = located.scored.ordered[: len(located.matches)].astype(np.float64)
-    steepness = log_odds_per_score(located.calibration, bool(located.scored.examined.any()))
+    """The log odds of each match of a map, by which the matches of several maps are ranked together.
+
+    Those of the best match come from the verdict; the others are lower by what their scores are lower.
+    """
+    answer = report.answer
+    assert answer is not None
+    ordered = answer.candidates.ordered[: len(answer.matches)].astype(np.float64)
+    steepness = log_odds_per_score(answer.calibration, bool(answer.candidates.examined.any()))
     return (report.log_odds - steepness * (ordered[0] - ordered)).tolist() if len(ordered) else []

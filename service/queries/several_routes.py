@@ -1,4 +1,4 @@
-"""One moment's frames, of one camera or of a rig, asked of several maps at once."""
+"""The route of queries of several maps, with the frames of one camera or of a rig."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
-from service.engine.engine import Engine, in_thread
-from service.engine.queue import Encoded
+from service.engine.engine import Engine
+from service.engine.microbatches import Encoded
 from service.errors.faults import (
     InvalidRequest,
     QueueFull,
@@ -19,8 +19,8 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation, request_problem
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
-    PatienceDep,
     PrincipalDep,
     milliseconds_since,
     rounded,
@@ -29,12 +29,14 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frames_body
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
-from service.places.batches import item_problem
+from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
-from service.queries.answers import answer_of, blank_answer, estimated_pose
-from service.queries.parameters import SeveralParameters
-from service.queries.several import MapReport, RigFrame, ask_maps, judge_together, match_log_odds
-from service.queries.several_schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
+from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
+from service.queries.parameters import MultiMapParameters
+from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
+from service.queries.several import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
+from service.queries.statistics import QueryStatistics
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1",
@@ -44,16 +46,17 @@ router = APIRouter(
 )
 
 MOST_FRAMES = 16
-"""Cameras of a rig."""
+"""The most cameras of a rig."""
 
 
-@router.post("/query", openapi_extra=frames_body(SeveralParameters))
+@router.post("/query", openapi_extra=frames_body(MultiMapParameters))
 async def query_maps(
-    options: Annotated[SeveralParameters, Query()],
+    options: Annotated[MultiMapParameters, Query()],
     request: Request,
     engine: EngineDep,
+    statistics: StatisticsDep,
     principal: PrincipalDep,
-    patience: PatienceDep,
+    deadline: DeadlineDep,
 ) -> SeveralAnswer:
     """Locate one moment's frames in several maps, ranked together by calibrated probability.
 
@@ -63,27 +66,27 @@ async def query_maps(
     needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
     of another place.
     """
-    engine.inference.check_room()
+    engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
     selection = options.selection()
     map_ids = options.map_ids()
     if map_ids is None:
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
-    with engine.inference.place_in_queue():
-        reports = await ask_maps(engine, map_ids, frames, options.k, selection, patience)
+    with engine.queue.place():
+        reports = await locate_in_maps(engine, map_ids, frames, options.k, selection, deadline)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
     answers = [_map_answer(request, engine, report) for report in reports]
     for report in reports:
         if report is recognized or len(reports) == 1:
-            _count_for_health(engine, report)
+            _count_for_health(engine, statistics, report)
     matches = _matches(reports, options.k)
     place = pose = None
-    if recognized is not None and recognized.located is not None:
-        place = PlaceView.of(recognized.located.matches[0][1])
-        pose = estimated_pose(recognized.located.pose, place)
+    if recognized is not None and recognized.answer is not None:
+        place = PlaceView.of(recognized.answer.matches[0][1])
+        pose = estimated_pose(recognized.answer.pose, place)
     request.state.noted = {"maps": len(map_ids), "frames": len(frames), "verdict": together.verdict}
     return SeveralAnswer(
         verdict=together.verdict,
@@ -103,19 +106,19 @@ def _all_maps(engine: Engine) -> list[str]:
 
 
 async def _frames(
-    request: Request, options: SeveralParameters, engine: Engine
-) -> tuple[list[RigFrame], list[FrameReport], SeveralParameters]:
-    """The frames that can be tried, reports of those that cannot, and the parameters with the form's fields."""
+    request: Request, options: MultiMapParameters, engine: Engine
+) -> tuple[list[RigFrame], list[FrameReport], MultiMapParameters]:
+    """The frames that can be decoded, reports of the others, and the parameters together with the form's fields."""
     if media_type(request) != FORM:
         frame = await read_frame(request, engine.settings)
         if options.cameras is not None:
-            raise InvalidRequest("cameras: a raw body has no parts; name its camera as camera.")
+            raise InvalidRequest("cameras: a raw body has no parts; give the name of its camera as camera.")
         return [RigFrame("image", frame.data, options.camera)], [], options
     files, fields = split_form(await read_many(request, engine.settings))
     options = options.joined(fields)
     names = [part.name for part in files]
     if not 1 <= len(files) <= MOST_FRAMES or len(set(names)) < len(names):
-        raise InvalidRequest(f"The form needs 1 to {MOST_FRAMES} file parts under different names.")
+        raise InvalidRequest(f"The form needs 1 to {MOST_FRAMES} file parts with different names.")
     cameras = options.camera_of(names)
     frames: list[RigFrame] = []
     broken: list[FrameReport] = []
@@ -125,7 +128,7 @@ async def _frames(
             check_part(part, engine.settings)
             frames.append(RigFrame(part.name, part.data, cameras.get(part.name)))
         except Exception as error:
-            problem = item_problem(request, error)
+            problem = frame_problem(request, error)
             first = first or error
             report = FrameReport(frame=part.name, camera=cameras.get(part.name), status=problem.status, problem=problem)
             broken.append(report)
@@ -135,7 +138,7 @@ async def _frames(
 
 
 def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequence[MapReport]) -> list[FrameReport]:
-    """What became of each frame; if none could be decoded, the first one's error is that of the request."""
+    """A report for each frame; if none could be encoded, the error of the first one is raised."""
     found: list[FrameReport] = []
     first: Exception | None = None
     outcomes = next((report.frames for report in reports if report.frames), ())
@@ -143,7 +146,7 @@ def _frame_reports(request: Request, frames: Sequence[RigFrame], reports: Sequen
         outcome = outcomes[index] if outcomes else None
         if isinstance(outcome, Exception):
             first = first or outcome
-            problem = item_problem(request, outcome)
+            problem = frame_problem(request, outcome)
             found.append(FrameReport(frame=frame.name, camera=frame.camera, status=problem.status, problem=problem))
         else:
             regions = len(outcome.encoding.regions) if isinstance(outcome, Encoded) else None
@@ -158,13 +161,13 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
     if report.error is not None:
         problem = request_problem(request, report.error)
         return MapAnswer(map=report.map_id, status=problem.status, encoder=encoder, problem=problem)
-    if report.located is None:
+    if report.answer is None:
         engine.metrics.observe_answer(report.map_id, "unknown", None)
         return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason="no-regions", encoder=encoder)
     seen = next(one for one in report.frames if isinstance(one, Encoded) and len(one.encoding.regions))
-    answer = answer_of(seen, report.located)
+    answer = answer_of(seen, report.answer)
     engine.metrics.observe_answer(report.map_id, answer.verdict, answer.score)
-    engine.metrics.searches.observe(report.located.search / 1e3)
+    engine.metrics.searches.observe(report.answer.search / 1e3)
     return MapAnswer(
         map=report.map_id,
         status=200,
@@ -179,25 +182,24 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
     )
 
 
-def _count_for_health(engine: Engine, report: MapReport) -> None:
-    """Count an answer for the health of its map: of several only the one that has the place, for a frame of elsewhere
-    says nothing of the others."""
+def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
+    """Count an answer in the statistics of a map; of several maps only the one that recognized the place is counted."""
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return
-    answer = blank_answer(report.map_, seen) if report.located is None else answer_of(seen, report.located)
-    engine.upkeep.observe(report.map_id, answer)
+    answer = blank_answer(report.map_, seen) if report.answer is None else answer_of(seen, report.answer)
+    count_for_map(engine, statistics, report.map_id, answer)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:
-    """The best of all maps' matches."""
+    """The ``k`` most probable matches of all maps, best first."""
     found: list[tuple[float, MapMatch]] = []
     for report in reports:
-        if report.located is None:
+        if report.answer is None:
             continue
-        weights: Sequence[float | None] = report.located.weights or [None] * len(report.located.matches)
-        is_calibrated = report.located.probability is not None
-        for odds, (score, place), weight in zip(match_log_odds(report), report.located.matches, weights, strict=True):
+        weights: Sequence[float | None] = report.answer.weights or [None] * len(report.answer.matches)
+        is_calibrated = report.answer.probability is not None
+        for odds, (score, place), weight in zip(match_log_odds(report), report.answer.matches, weights, strict=True):
             probability = float(sigmoid(np.array(odds))) if is_calibrated else None
             match = MapMatch(
                 rank=0,

@@ -1,1 +1,1 @@
-"""A robot's run, frame by frame."""
+"""Sessions: a robot's run, frame by frame, as a belief over places."""

@@ -7,15 +7,17 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, evidence
-from core.recognition.localization import Located, neighborhood_of
+from core.recognition.recognition import Answer
+from core.recognition.stages import neighborhood_of
 from core.storage import Map
-from service.engine.engine import Engine, camera_mask, in_thread
-from service.engine.queue import Patience
+from service.engine.engine import Engine, camera_mask
+from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.http.dependencies import rounded
 from service.places.schemas import PlaceView
-from service.queries.answers import answer_of, blank_answer, count_answer
+from service.queries.answers import counted_answer
 from service.queries.schemas import QueryAnswer
+from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
     BeliefView,
     BelievedPlace,
@@ -26,16 +28,19 @@ from service.sessions.schemas import (
     SessionReport,
     SessionView,
 )
-from service.sessions.sessions import Session, alive_rows
+from service.sessions.sessions import Session, Sessions, alive_rows
+from service.worker_threads import in_thread
 
 
 async def take_in(
     engine: Engine,
+    sessions: Sessions,
+    statistics: QueryStatistics,
     map_: Map,
     session: Session,
     data: bytes,
     options: FrameParameters,
-    patience: Patience,
+    deadline: RequestDeadline,
     request_id: str | None,
 ) -> SessionAnswer:
     """Answer one frame of a session, in its turn.
@@ -54,30 +59,25 @@ async def take_in(
     engine.assert_encoder(map_, options.encoder)
     _check_options(session, options)
     async with session.turn():
-        run = await in_thread(_found_run, engine, map_, session)
+        run = await in_thread(_found_run, sessions, map_, session)
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
         mask = await camera_mask(map_, session.options.camera)
-        with engine.inference.place_in_queue():
-            encoded = await engine.encode_for(map_, data, patience, mask)
-        located: Located | None = None
-        if len(encoded.encoding.regions):
-            (located,) = await engine.searches.locate(
-                map_, encoded.encoder, [encoded.encoding], options.k, session.selection
-            )
-        single = blank_answer(map_, encoded) if located is None else answer_of(encoded, located)
-        count_answer(engine, map_, single)
+        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask)
+        single = counted_answer(engine, statistics, map_, recognized)
         try:
-            return await in_thread(_advanced, engine, map_, session, run, located, single, options, request_id, began)
+            return await in_thread(
+                _advanced, sessions, map_, session, run, recognized.answer, single, options, request_id, began
+            )
         except Exception:
             session.run = None  # it is taken up again as it was written down after the frame before
             raise
 
 
-def _found_run(engine: Engine, map_: Map, session: Session) -> Run:
+def _found_run(sessions: Sessions, map_: Map, session: Session) -> Run:
     """The run of a session, which may have been deleted while this frame waited."""
-    engine.sessions.find(map_, session.id)
-    return engine.sessions.run(map_, session)
+    sessions.find(map_, session.id)
+    return sessions.run(map_, session)
 
 
 def _check_options(session: Session, options: FrameParameters) -> None:
@@ -105,11 +105,11 @@ def _repeated(session: Session, options: FrameParameters, request_id: str | None
 
 
 def _advanced(
-    engine: Engine,
+    sessions: Sessions,
     map_: Map,
     session: Session,
     run: Run,
-    located: Located | None,
+    answered: Answer | None,
     single: QueryAnswer,
     options: FrameParameters,
     request_id: str | None,
@@ -118,7 +118,7 @@ def _advanced(
     """Move the belief on, write it down, and tell it."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    run.advance(_evidence(map_, located), step)
+    run.advance(_evidence(map_, answered), step)
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -154,7 +154,7 @@ def _advanced(
         session.number = options.frame
     if options.timestamp is not None:
         session.moment = options.timestamp.timestamp()
-    answer.saved = engine.sessions.save(session)
+    answer.saved = sessions.save(session)
     answer.milliseconds |= rounded({"save": 1e3 * (time.perf_counter() - started) - believed})
     return answer
 
@@ -176,17 +176,12 @@ def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, M
     return Step(odometry, reach, frames), motion
 
 
-def _evidence(map_: Map, located: Located | None) -> Evidence:
-    if located is None:
+def _evidence(map_: Map, found: Answer | None) -> Evidence:
+    if found is None:
         return NOTHING
-    scored = located.scored
+    ranked = found.candidates
     return evidence(
-        scored.rows,
-        scored.scores,
-        scored.whereabouts,
-        located.calibration,
-        neighborhood_of(map_),
-        scored.examined,
+        ranked.rows, ranked.scores, ranked.whereabouts, found.calibration, neighborhood_of(map_), ranked.examined
     )
 
 
@@ -230,9 +225,9 @@ def session_view(session: Session, frames: int) -> SessionView:
     )
 
 
-def session_report(engine: Engine, map_: Map, session: Session, k: int = 5) -> SessionReport:
+def session_report(sessions: Sessions, map_: Map, session: Session, k: int = 5) -> SessionReport:
     """A session and what is believed now; call it in the session's turn, in a thread."""
-    run = engine.sessions.run(map_, session)
+    run = sessions.run(map_, session)
     found = run.look(k, alive_rows(map_))
     view = session_view(session, run.frames)
     return SessionReport(**view.model_dump(), belief=belief_view(map_, run, found))

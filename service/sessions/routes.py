@@ -7,8 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.database.cursors import Listing, decode_name, encode_cursor
-from service.engine.engine import in_thread
+from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,
@@ -20,10 +19,12 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.dependencies import (
+    DeadlineDep,
     EngineDep,
+    FromState,
     MapId,
     Page,
-    PatienceDep,
+    frame_for_map,
     json_body,
     milliseconds_since,
     rounded,
@@ -32,10 +33,14 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frame_body
 from service.http.route_classes import StrictRoute
-from service.http.uploads import read_frame
+from service.queries.answers import StatisticsDep
 from service.sessions.frames import session_report, session_view, take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView
+from service.sessions.sessions import Sessions
 from service.telemetry.requests import REQUEST_ID
+from service.worker_threads import in_thread
+
+SessionsDep = Annotated[Sessions, Depends(FromState("sessions"))]
 
 router = APIRouter(
     prefix="/v1/maps/{map}/sessions",
@@ -56,45 +61,47 @@ GONE = problem_documentation(UnknownSession, SessionExpired)
         UnsupportedMediaType, errors.UnknownSequence, errors.UnknownCamera, TooManySessions, errors.StorageFull
     ),
 )
-def create_session(map_id: MapId, new: NewSession, engine: EngineDep, response: Response) -> SessionView:
+def create_session(
+    map_id: MapId, new: NewSession, engine: EngineDep, sessions: SessionsDep, response: Response
+) -> SessionView:
     """Begin a run. It ends when it is deleted, or when no frame has come for `expires_after` seconds."""
     map_ = engine.atlas.get(map_id)
     if new.camera is not None:
         map_.cameras.mask(new.camera)
-    session = engine.sessions.create(map_, new)
+    session = sessions.create(map_, new)
     response.headers["Location"] = f"{engine.settings.root_path}/v1/maps/{map_id}/sessions/{session.id}"
     return session_view(session, 0)
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-async def list_sessions(map_id: MapId, page: Page, engine: EngineDep) -> SessionPage:
+async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: SessionsDep) -> SessionPage:
     """List the sessions of a map that are under way."""
     map_ = await engine.map(map_id)
     listing: Listing = ["sessions-of", map_id]
     after = decode_name(listing, page.cursor)
-    found = [session for session in await in_thread(engine.sessions.of_map, map_) if session.id > after]
+    found = [session for session in await in_thread(sessions.of_map, map_) if session.id > after]
     shown = found[: page.limit]
     more = encode_cursor(listing, shown[-1].id) if len(found) > len(shown) else None
-    counts = await in_thread(lambda: [engine.sessions.frames_of(session) for session in shown])
+    counts = await in_thread(lambda: [sessions.frames_of(session) for session in shown])
     items = [session_view(session, count) for session, count in zip(shown, counts, strict=True)]
     return SessionPage(items=items, next_cursor=more)
 
 
 @router.get("/{session}", responses=GONE)
-async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep) -> SessionReport:
+async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> SessionReport:
     """Read a session and what is believed of its robot now."""
     map_ = await engine.map(map_id)
-    session = await in_thread(engine.sessions.find, map_, session_id)
+    session = await in_thread(sessions.find, map_, session_id)
     async with session.turn():
-        return await in_thread(session_report, engine, map_, session)
+        return await in_thread(session_report, sessions, map_, session)
 
 
 @router.delete("/{session}", status_code=204, responses=GONE)
-async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep) -> None:
+async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> None:
     """End a run."""
     map_ = await engine.map(map_id)
-    session = await in_thread(engine.sessions.find, map_, session_id)
-    await in_thread(engine.sessions.delete, session)
+    session = await in_thread(sessions.find, map_, session_id)
+    await in_thread(sessions.delete, session)
 
 
 @router.post(
@@ -120,7 +127,9 @@ async def send_frame(
     options: FrameOptions,
     request: Request,
     engine: EngineDep,
-    patience: PatienceDep,
+    sessions: SessionsDep,
+    statistics: StatisticsDep,
+    deadline: DeadlineDep,
 ) -> SessionAnswer:
     """Take in one frame of a run, and tell where the robot is.
 
@@ -128,15 +137,12 @@ async def send_frame(
     the same `frame` number or, without one, under the same `X-Request-Id`, is counted once and gets the same answer.
     A frame that is answered with a problem was not taken in.
     """
-    engine.inference.check_room()
-    map_ = await engine.map(map_id)
-    session = await in_thread(engine.sessions.find, map_, session_id)
-    frame = await read_frame(request, engine.settings)
-    options = options.joined(frame.fields)
+    engine.queue.check_room()
+    session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # before the body is read
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")
-    answer = await take_in(
-        engine, map_, session, frame.data, options, patience, given if REQUEST_ID.fullmatch(given) else None
-    )
+    given_id = given if REQUEST_ID.fullmatch(given) else None
+    answer = await take_in(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "session": session_id, "verdict": answer.verdict}
     return answer

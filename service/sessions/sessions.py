@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
+from core.disk.files import disk_errors
 from core.errors import UnknownSequence
-from core.judgement.verdict import Neighborhood
-from core.recognition.selection import Knowledge, Selection
+from core.places import Neighborhood
+from core.recognition.selection import Conditions, Selection
 from core.storage import Map, Snapshot
-from core.storage.files.disk import refusals
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.sessions.schemas import NewSession
 from service.sessions.store import SessionStore, StoredSession
@@ -95,7 +95,7 @@ class Session:
     def selection(self) -> Selection | None:
         """What of the map it is about; None: everything."""
         names = self.options.sequences
-        return None if names is None else Selection(Knowledge(sequences=tuple(names)))
+        return None if names is None else Selection(Conditions(sequences=tuple(names)))
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
@@ -186,7 +186,7 @@ class Sessions:
         names = options.sequences or []
         if absent := set(names) - set(map_.attributes.sequence_codes(names)):
             raise UnknownSequence(f"The map has no sequence {min(absent)!r}.")
-        graph = self.graph(map_, None if options.sequences is None else Selection(Knowledge(sequences=tuple(names))))
+        graph = self.graph(map_, None if options.sequences is None else Selection(Conditions(sequences=tuple(names))))
         now, longest = time.time(), self._settings.session_expiry
         expires_after = min(options.expires_after or longest, longest)
         session = Session(
@@ -208,7 +208,7 @@ class Sessions:
                 )
             self._living[session.id] = session
         try:
-            with refusals("keep a session"):
+            with disk_errors("keep a session"):
                 self._store.write(_stored(session))
         except BaseException:
             with self._lock:
@@ -253,7 +253,7 @@ class Sessions:
             StorageFull, StorageFailure: the disk refuses.
         """
         with self._lock:  # a frame of it that is under way is not to write it down again
-            with refusals("delete a session"):
+            with disk_errors("delete a session"):
                 self._store.forget(session.id)
             self._living.pop(session.id, None)
             self._drop_charts()
@@ -295,7 +295,7 @@ class Sessions:
                 return known.graph
             living = snapshot.alive
             if selection is not None:
-                allowed = selection.choice(map_, snapshot).allowed
+                allowed = selection.scope(map_, snapshot).allowed
                 living = living if allowed is None else living & allowed
             graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
             done = time.monotonic()

@@ -7,23 +7,20 @@ service that starts.
 
 from __future__ import annotations
 
-import logging
-import sqlite3
 import threading
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from core.storage.files.disk import refusals
+from core.disk.files import disk_errors
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile
 
 FILE = "sessions.sqlite"
-APPLICATION_ID = 0x504C5253  # "PLRS"
-FORMAT = 1
 
 LOG_PAGES = 256
-"""After so many pages the log is written back."""
+"""Pages of SQLite's log after which it is written back to the file."""
 
-_SCHEMA = """
+_TABLE = """
 CREATE TABLE sessions (
     id TEXT PRIMARY KEY,
     map TEXT NOT NULL,
@@ -40,8 +37,7 @@ CREATE TABLE sessions (
     answer TEXT
 ) STRICT
 """
-
-log = logging.getLogger("placerec.sessions")
+_SCHEMA = Schema(application_id=0x504C5253, version=1, create=[_TABLE])  # "PLRS"
 
 
 @dataclass(frozen=True)
@@ -81,28 +77,17 @@ class SessionStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Open the file, or make it; one that is damaged is put aside under ``sessions.sqlite.damaged``.
+        """Open the file or make it; a damaged one is put aside.
 
         Raises:
             StorageFull, StorageFailure: the disk refuses.
         """
-        path = folder / FILE
         self._lock = threading.Lock()
-        with refusals(f"open {path}"):
-            self._connection = self._opened_or_new(path)
-
-    def _opened_or_new(self, path: Path) -> sqlite3.Connection:
-        try:
-            return _opened(path)
-        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-            told = str(error)
-            if isinstance(error, sqlite3.OperationalError) and "no such" not in told and "decode" not in told:
-                raise  # the disk refuses, which says nothing of the file
-            log.error("%s cannot be read and is put aside; its sessions are lost: %s", FILE, error)
-            for suffix in ("-wal", "-shm"):
-                path.with_name(FILE + suffix).unlink(missing_ok=True)
-            path.replace(path.with_name(FILE + ".damaged"))
-            return _opened(path)
+        settings = {**DURABLE, "wal_autocheckpoint": LOG_PAGES}
+        readable = [f"SELECT {', '.join(HEAD)} FROM sessions", f"SELECT {', '.join(COLUMNS)} FROM sessions LIMIT 1"]
+        file = SqliteFile(folder / FILE, _SCHEMA, settings, readable)
+        with disk_errors(f"open {file.path}", FILE):
+            self._connection = file.open_or_replace()
 
     def close(self) -> None:
         """Write the log back and let the file go."""
@@ -150,33 +135,3 @@ class SessionStore:
         """Remove all trace of a session."""
         with self._lock:
             self._connection.execute("DELETE FROM sessions WHERE id = ?", [session_id])
-
-
-def _opened(path: Path) -> sqlite3.Connection:
-    connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute(f"PRAGMA wal_autocheckpoint = {LOG_PAGES}")
-        with closing(connection.execute("PRAGMA user_version")) as cursor:
-            (version,) = cursor.fetchone()
-        if version == 0:
-            connection.execute("BEGIN IMMEDIATE")
-            connection.execute(_SCHEMA)
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {FORMAT}")
-            connection.execute("COMMIT")
-        elif version != FORMAT:
-            raise sqlite3.DatabaseError(f"it is of format {version}, not {FORMAT}")
-        for (line,) in connection.execute("PRAGMA quick_check").fetchall():
-            if line != "ok":
-                raise sqlite3.DatabaseError(line)
-        connection.execute(f"SELECT {', '.join(HEAD)} FROM sessions").fetchall()
-        connection.execute(f"SELECT {', '.join(COLUMNS)} FROM sessions LIMIT 1").fetchall()
-        # SQLite opens a file for reading alone where writing is refused, and it would stay so.
-        connection.execute("UPDATE sessions SET id = id WHERE false")
-    except BaseException:
-        connection.close()
-        raise
-    return connection

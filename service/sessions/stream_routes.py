@@ -14,14 +14,15 @@ import time
 from typing import Any
 
 from fastapi import APIRouter, WebSocket
+from starlette.datastructures import State
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from core.errors import PlacerecError
 from core.places import check_map_id
-from service.engine.engine import Engine, in_thread
-from service.engine.queue import Patience
+from service.engine.engine import Engine
+from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BodyTooLarge,
     Fault,
@@ -41,7 +42,8 @@ from service.http.schemas import validated
 from service.http.uploads import check_frame
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters
-from service.sessions.sessions import Session
+from service.sessions.sessions import Session, Sessions
+from service.worker_threads import in_thread
 
 router = APIRouter()
 
@@ -51,11 +53,13 @@ POLICY_VIOLATION = 1008
 @router.websocket("/v1/maps/{map}/sessions/{session}/stream")
 async def stream_frames(socket: WebSocket) -> None:
     """Take in the frames of a run as they come, until the robot closes the connection or the session ends."""
-    engine: Engine = socket.app.state.engine
+    state = socket.app.state
+    engine: Engine = state.engine
+    sessions: Sessions = state.sessions
     try:
         map_id, session_id = check_map_id(socket.path_params["map"]), socket.path_params["session"]
         map_ = await engine.map(map_id)
-        session = await in_thread(engine.sessions.find, map_, session_id)
+        session = await in_thread(sessions.find, map_, session_id)
         if session.streaming:
             raise StreamTaken("Another connection streams into this session; close that one first.")
     except (Fault, PlacerecError) as error:
@@ -65,12 +69,12 @@ async def stream_frames(socket: WebSocket) -> None:
     try:
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
-            await _serve(engine, map_id, session, socket)
+            await _serve(socket.app.state, map_id, session, socket)
     finally:
         session.streaming = False
 
 
-async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocket) -> None:
+async def _serve(state: State, map_id: str, session: Session, socket: WebSocket) -> None:
     told: dict[str, Any] | None = None
     refused = False
     while True:
@@ -87,14 +91,14 @@ async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocke
                 previous, told, refused = told, None, True
                 if previous is not None:
                     raise InvalidRequest("Two text messages came without a frame between them; both are dropped.")
-                told, refused = _parameters(message.get("text") or "", engine), False
+                told, refused = _parameters(message.get("text") or "", state.engine), False
                 continue
             given, told = told, None
             if refused:
                 refused = False
                 continue
             await socket.app.state.gate.turn(socket.scope)
-            answer = await _answer(engine, map_id, session, message["bytes"], given or {})
+            answer = await _answer(state, map_id, session, message["bytes"], given or {})
         except (Fault, PlacerecError) as error:
             await _tell(socket, error)
             if isinstance(error, UnknownSession | SessionExpired):
@@ -108,15 +112,15 @@ async def _serve(engine: Engine, map_id: str, session: Session, socket: WebSocke
             await socket.send_text(answer)
 
 
-async def _answer(engine: Engine, map_id: str, session: Session, data: bytes, given: dict[str, Any]) -> str:
-    options = validated(FrameParameters, given)
+async def _answer(state: State, map_id: str, session: Session, data: bytes, given: dict[str, Any]) -> str:
+    options, engine = validated(FrameParameters, given), state.engine
     if len(data) > engine.settings.max_image_bytes:
         raise BodyTooLarge(f"The frame has more than {engine.settings.max_image_bytes} bytes.")
     check_frame(data, None)
     map_ = await engine.map(map_id)
-    await in_thread(engine.sessions.find, map_, session.id)
-    patience = Patience(time.monotonic() + engine.settings.request_timeout, _never)
-    answer = await take_in(engine, map_, session, data, options, patience, None)
+    await in_thread(state.sessions.find, map_, session.id)
+    deadline = RequestDeadline(time.monotonic() + engine.settings.request_timeout, _never)
+    answer = await take_in(engine, state.sessions, state.statistics, map_, session, data, options, deadline, None)
     return answer.model_dump_json()
 
 

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.method.encoder import Encoder
+from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.storage import Map
 from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
 from core.upkeep.drift import Trend, score_trend, unknown_trend
 from core.upkeep.hubness import Alias
 from core.upkeep.revisits import Reason, Sign, silent_runs, stretches
-from service.places.own_frames import TOGETHER, OwnFrames, spread
+from service.queries.statistics import Statistics
 from service.upkeep.schemas import (
     AliasingView,
     AliasView,
@@ -29,7 +30,6 @@ from service.upkeep.schemas import (
     TrendView,
     WeekView,
 )
-from service.upkeep.statistics import Statistics
 
 HALF = 0.5
 """Of the time: the map's frames are held against it first, then its sequences are walked along."""
@@ -69,7 +69,7 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         MapQuarantined, StorageFailure, UnknownMap: it cannot be read.
     """
     began = time.monotonic()
-    own = OwnFrames(map_, encoder)
+    own = SelfQueries(map_, encoder)
     aliasing = _aliasing(own, began + HALF * seconds)
     walks, all_walked = _walks(own, began + seconds)
     silent = [i for i, place in enumerate(own.places) if place.id not in statistics.places]
@@ -134,7 +134,7 @@ def _trend(found: Trend | None) -> TrendView | None:
     return None if found is None else TrendView(**asdict(found), significant=found.significant)
 
 
-def _silent(own: OwnFrames, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
+def _silent(own: SelfQueries, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
     asked = sum(week.compared for week in statistics.weeks)
     if not asked or not len(own):
         return None
@@ -143,10 +143,10 @@ def _silent(own: OwnFrames, statistics: Statistics, silent: list[int], limit: in
     return SilentPlaces(count=len(silent), by_chance=by_chance, places=[own.places[i].id for i in ordered[:limit]])
 
 
-def _aliasing(own: OwnFrames, until: float) -> _Aliasing:
+def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
     """Which places are among the most alike others of many, and which look more like others than like their own."""
     k = min(hubness.NEIGHBOURS, max(1, len(own) // 10))
-    order = spread(len(own)).tolist()
+    order = spread_order(len(own)).tolist()
     lists: list[NDArray[np.int64]] = [np.empty((0, k), np.int64)]
     aliases: list[Alias] = []
     everything = np.arange(len(own))
@@ -167,7 +167,7 @@ def _aliasing(own: OwnFrames, until: float) -> _Aliasing:
     return _Aliasing(done, k, counts, hubness.hubs(counts), aliases)
 
 
-def _shown(own: OwnFrames, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
+def _shown(own: SelfQueries, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
     names = [place.id for place in own.places]
     counted = [statistics.places.get(name) for name in names]
     unsure = np.array([0 if count is None else count.best - count.recognized for count in counted], np.int64)
@@ -193,7 +193,7 @@ def _hubs(names: list[str], counts: NDArray[np.int64], limit: int) -> list[HubVi
     ]
 
 
-def _walks(own: OwnFrames, until: float) -> tuple[list[_Walk], bool]:
+def _walks(own: SelfQueries, until: float) -> tuple[list[_Walk], bool]:
     """Every sequence from its first frame to its last; False if some was walked without looking at the frames."""
     by_name: dict[str | None, list[int]] = {}
     for position, place in enumerate(own.places):
@@ -213,19 +213,19 @@ def _walks(own: OwnFrames, until: float) -> tuple[list[_Walk], bool]:
     return walks, complete
 
 
-def _similarities(own: OwnFrames, ordered: NDArray[np.int64], until: float) -> tuple[NDArray[np.float64], bool]:
+def _similarities(own: SelfQueries, ordered: NDArray[np.int64], until: float) -> tuple[NDArray[np.float64], bool]:
     """How alike each frame looks to the next; NaN behind where the time was up."""
     found = np.full(max(0, len(ordered) - 1), np.nan)
     pairs = np.stack([ordered[:-1], ordered[1:]], axis=1)
     for first in range(0, len(pairs), STEPS_TOGETHER):
         if time.monotonic() > until:
             return found, False
-        found[first : first + STEPS_TOGETHER] = own.alike(pairs[first : first + STEPS_TOGETHER])
+        found[first : first + STEPS_TOGETHER] = own.first_stage_scores(pairs[first : first + STEPS_TOGETHER])
     return found, True
 
 
 def _retraverse(
-    own: OwnFrames, walks: list[_Walk], aliasing: _Aliasing, statistics: Statistics, silent: set[int]
+    own: SelfQueries, walks: list[_Walk], aliasing: _Aliasing, statistics: Statistics, silent: set[int]
 ) -> list[StretchView]:
     """Stretches where several signs come together, the weightiest first."""
     aliased, hubs = {alias.place for alias in aliasing.aliases}, set(aliasing.hubs.tolist())

@@ -10,21 +10,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from statistics import median
+from typing import Any
 
 import numpy as np
 
 from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, UnknownCamera, UnknownMap, WrongEncoder
+from core.method.encoder import Encoding
+from core.method.regions import Regions
 from core.places import PlaceFields, check_place_id
+from core.recognition.recognition import locate
+from core.recognition.self_queries import TOGETHER, spread_order
 from core.storage import Enrolment, History, Map, Snapshot
 from core.storage.transfer import Outline
+from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
-from service.jobs.background import stand_back
-from service.jobs.jobs import JobContext, JobInterrupted
-from service.upkeep.overlap import overlap
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext, JobInterrupted, yield_to_requests
 
 KIND = "merge"
 
@@ -230,7 +231,7 @@ def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
                 map_.cameras.put(name, camera.mask)
         snapshot = other.snapshot()
         for first in range(0, len(due), CHUNK):
-            stand_back(engine, context)
+            yield_to_requests(engine, context)
             # No place may be enrolled under one of the ids between the look at them and the commit.
             with engine.writing(map_.record.id):
                 _adopt(context, map_, other, snapshot, _still_free(context, map_, due[first : first + CHUNK]))
@@ -256,7 +257,7 @@ def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str
 def _adopt(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
     """One commit."""
     names, ends = context.notes["report"]["renamed"], context.notes["ends"]
-    pictures = {place.id: other.transfer.picture(place.id) for place, _ in due}
+    pictures = {place.id: other.picture(place.id) for place, _ in due}
     # Read behind the pictures: a place that is still in its row shows the frame that was read.  What was changed or
     # forgotten since it was listed is for the next round.
     found = other.transfer.find([place.id for place, _ in due])
@@ -321,3 +322,51 @@ def _undo(context: JobContext, map_: Map, other: Map | None, error: BaseExceptio
             f"The merge ended ({error or type(error).__name__}), and what it had brought could not be taken out again "
             f"({further}): places of the map {context.arguments['from']} remain; merge it again, or forget them."
         ) from error
+
+
+NAMED = 20
+
+_NO_REGIONS = Regions(
+    np.empty((0, 4), np.int32),
+    np.empty(0, np.float32),
+    np.empty(0, np.int32),
+    np.empty(0, np.int32),
+    np.empty((0, 0), np.float32),
+)
+"""What was found in a frame that is not at hand any more; a search does not look at it."""
+
+
+def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[str, Any]:
+    """How many of the other map's places this one recognizes, by a sample of them spread over it."""
+    encoder = engine.load_encoder(map_)
+    outline, snapshot = other.transfer.outline(), other.snapshot()
+    outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
+    chosen = [outline[i] for i in spread_order(len(outline))[: context.arguments["sample"]]]
+    verdicts = {"recognized": 0, "ambiguous": 0, "unknown": 0}
+    pairs: list[dict[str, Any]] = []
+    apart: list[float] = []
+    for first in range(0, len(chosen), TOGETHER):
+        yield_to_requests(engine, context)
+        some = chosen[first : first + TOGETHER]
+        rows = np.array([place.row for place in some], np.int64)
+        descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
+        encodings = [Encoding(d, cells, _NO_REGIONS, {}) for d, cells in zip(descriptors, local, strict=True)]
+        there = other.transfer.find([place.id for place in some])
+        for place, located in zip(some, locate(map_, encoder, encodings, 1), strict=True):
+            verdicts[located.judgement.verdict] += 1
+            if located.judgement.verdict != "recognized" or place.id not in there:
+                continue
+            score, match = located.matches[0]
+            pairs.append({"place": place.id, "match": match.id, "score": float(score)})
+            ours, theirs = match.pose, there[place.id][0].pose
+            if ours is not None and theirs is not None and ours.kind() == theirs.kind():
+                apart.append(float(np.linalg.norm(ours.position() - theirs.position())))
+        context.progress(first + len(some), len(chosen), "compares the maps")
+    pairs.sort(key=lambda pair: -pair["score"])
+    return {
+        "examined": len(chosen),
+        "of": len(outline),
+        **verdicts,
+        "metres_apart": median(apart) if apart else None,
+        "pairs": pairs[:NAMED],
+    }

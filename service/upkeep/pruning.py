@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.reliability import wilson
+from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
+from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
-from service.jobs.background import stand_back
-from service.jobs.jobs import JobContext
-from service.places.own_frames import TOGETHER, OwnFrames, load_encoder, spread
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext, yield_to_requests
 
 KIND = "prune"
 
@@ -63,7 +60,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
     """The report, and the digests of the places that go, by their ids."""
     wanted = context.arguments
     map_ = context.map(engine.atlas)
-    own = OwnFrames(map_, load_encoder(engine, map_))
+    own = SelfQueries(map_, engine.load_encoder(map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
     asking = _named(names, wanted["queries"])
     references = ~asking if wanted["queries"] is not None else np.ones(len(own), np.bool_)
@@ -115,11 +112,13 @@ def _share(right: NDArray[np.bool_]) -> dict[str, Any]:
     return wilson(int(right.sum()), len(right)).model_dump()
 
 
-def _similarities(engine: Engine, context: JobContext, own: OwnFrames, pairs: NDArray[np.int64]) -> NDArray[np.float32]:
+def _similarities(
+    engine: Engine, context: JobContext, own: SelfQueries, pairs: NDArray[np.int64]
+) -> NDArray[np.float32]:
     found = [np.empty(0, np.float32)]
     for first in range(0, len(pairs), PAIRS_TOGETHER):
-        stand_back(engine, context)
-        found.append(own.alike(pairs[first : first + PAIRS_TOGETHER]))
+        yield_to_requests(engine, context)
+        found.append(own.first_stage_scores(pairs[first : first + PAIRS_TOGETHER]))
         context.progress(min(first + PAIRS_TOGETHER, len(pairs)), len(pairs), "compares neighbours")
     return np.concatenate(found)
 
@@ -127,19 +126,19 @@ def _similarities(engine: Engine, context: JobContext, own: OwnFrames, pairs: ND
 def _try(
     engine: Engine,
     context: JobContext,
-    own: OwnFrames,
+    own: SelfQueries,
     asking: NDArray[np.bool_],
     references: NDArray[np.bool_],
     wanted: Mapping[str, Any],
 ) -> Trial:
     """Hold the frames that ask against the others, each without itself."""
     candidates = np.flatnonzero(asking)
-    chosen = candidates[spread(len(candidates))[: wanted["sample"]]]
+    chosen = candidates[spread_order(len(candidates))[: wanted["sample"]]]
     depth, stage = min(DEPTH, max(1, len(own))), own.encoder.candidates
     found: list[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]] = []
     everything = np.flatnonzero(references)
     for first in range(0, len(chosen), TOGETHER):
-        stand_back(engine, context)
+        yield_to_requests(engine, context)
         some = chosen[first : first + TOGETHER].tolist()
         for position, others, scores in own.search(some, references):
             if not own.near(position, everything[everything != position]).any():
@@ -147,7 +146,9 @@ def _try(
             best = others[:depth]
             gains = np.zeros(len(best), np.float32)
             if stage:
-                gains = own.encoder.agreement(own.local(np.array([position]))[0], own.local(best))
+                gains = own.encoder.agreement(
+                    own.local_descriptors(np.array([position]))[0], own.local_descriptors(best)
+                )
             right = own.near(position, best)
             padding = (0, depth - len(best))
             found.append((

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +18,9 @@ from core.frames.masks import Mask
 from core.places import PlaceFields
 from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
+from service.engine.engine import Engine
 from service.errors.faults import ImagesMissing
-from service.jobs.background import encode_behind
-from service.jobs.context import born
-from service.jobs.jobs import JobContext, JobInterrupted
-
-if TYPE_CHECKING:
-    from service.engine.engine import Engine
+from service.jobs.context import JobContext, JobInterrupted, creation_time, encode_after_requests
 
 KIND = "re-encode"
 
@@ -77,7 +73,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 def _is_published(engine: Engine, target: str, made: str) -> bool:
     try:
-        return born(engine.atlas.find(target)) == made
+        return creation_time(engine.atlas.find(target)) == made
     except UnknownMap:
         return False
 
@@ -108,10 +104,10 @@ class _Reencoding:
     def run(self) -> Mapping[str, Any]:
         for _ in range(ROUNDS):
             self._catch_up()
-            with self.source.transfer.quiet():
+            with self.source.transfer.paused_writes():
                 if self._is_level():
                     return self._publish()
-        with self.source.transfer.quiet():  # it is changed faster than it can be encoded
+        with self.source.transfer.paused_writes():  # it is changed faster than it can be encoded
             self._catch_up()
             if not self._is_level():
                 raise RuntimeError("the new map is not what the old one is")
@@ -152,14 +148,14 @@ class _Reencoding:
 
     def _move(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
         """Commit some places: new ones with their frames encoded, known ones with their fields and order as of now."""
-        images = {place.id: self.source.transfer.picture(place.id) for place in new}
+        images = {place.id: self.source.picture(place.id) for place in new}
         # Read behind the images: a place that is still in its row shows the frame that was read.  What was changed
         # or forgotten since it was listed is found by the next round.
         fields = self.source.transfer.find([place.id for place in (*new, *known)])
         ready = [place for place in new if place.id in fields and fields[place.id][1] == place.row]
         frames = [images[place.id] or b"" for place in ready]
         masks = [self._mask(place.camera) for place in ready]
-        outcomes = encode_behind(self.engine, self.context, self.identity, frames, masks) if ready else []
+        outcomes = encode_after_requests(self.engine, self.context, self.identity, frames, masks) if ready else []
         items: list[tuple[Enrolment, History]] = []
         for place, image, outcome in zip(ready, frames, outcomes, strict=True):
             try:
@@ -210,7 +206,7 @@ class _Reencoding:
             "places": self.made.count_places(),
             "left_out": {"count": len(self.left_out), "places": named},
         }
-        self.context.remember(result=result, made=born(self.made))
+        self.context.remember(result=result, made=creation_time(self.made))
         self.engine.atlas.publish(self.target)
         return result
 

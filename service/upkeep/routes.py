@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Query, Response
 from pydantic import Field
 
 from core import errors
 from core.places import check_map_id
 from core.storage import Map
-from service.engine.engine import Engine, in_thread
+from service.engine.engine import Engine
 from service.errors.faults import (
     EncoderNotInstalled,
     ImagesMissing,
@@ -21,17 +23,21 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, MapId, PrincipalDep, json_body, single_values
+from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
 from service.http.route_classes import StrictRoute
 from service.http.schemas import Parameters
-from service.jobs.context import born
-from service.jobs.routes import router as jobs
+from service.jobs.context import creation_time
+from service.jobs.jobs import Jobs
+from service.jobs.routes import JobsDep, location_of
 from service.jobs.schemas import JobView
-from service.maps import rebuilding
+from service.maps import storage_jobs
+from service.maps.limits import check_new_map
+from service.queries.answers import StatisticsDep
+from service.queries.statistics import map_key
 from service.upkeep import merging, pruning, reencoding
 from service.upkeep.health import examine_health
 from service.upkeep.schemas import MapHealth, Merging, Pruning, Reencoding
-from service.upkeep.upkeep import key_of
+from service.worker_threads import in_thread
 
 router = APIRouter(
     prefix="/v1/maps/{map}",
@@ -56,16 +62,16 @@ class HealthParameters(Parameters):
 
 
 def submit(
-    engine: Engine, response: Response, kind: str, arguments: dict[str, Any], map_: Map, *others: Map
+    engine: Engine, jobs: Jobs, response: Response, kind: str, arguments: dict[str, Any], map_: Map, *others: Map
 ) -> JobView:
     """Ask for a job of a registered kind, on this map and none that comes under its id later.
 
     Raises:
         JobQueueFull, StorageFull, StorageFailure.
     """
-    maps = {one.record.id: born(one) for one in (map_, *others)}
-    job = engine.jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
-    response.headers["Location"] = f"{engine.settings.root_path}{jobs.prefix}/{job.id}"
+    maps = {one.record.id: creation_time(one) for one in (map_, *others)}
+    job = jobs.submit(kind, map_.record.id, arguments=arguments, maps=maps)
+    response.headers["Location"] = location_of(job, engine.settings)
     return JobView.of(job)
 
 
@@ -78,7 +84,7 @@ def submit(
     ),
 )
 def reencode_map(
-    map_id: MapId, wanted: Reencoding, engine: EngineDep, principal: PrincipalDep, response: Response
+    map_id: MapId, wanted: Reencoding, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
     """Make a map anew, under another id, for another encoder or for the masks as they are now.
 
@@ -90,23 +96,29 @@ def reencode_map(
     map_ = engine.atlas.get(map_id)
     identity = engine.resolve(wanted.encoder)
     reencoding.check_images(map_)
-    engine.upkeep.check_free(wanted.to)
-    return submit(engine, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
+    check_new_map(engine, jobs, wanted.to)
+    return submit(engine, jobs, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
 
 
 @router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
-def rebuild_map(map_id: MapId, engine: EngineDep, response: Response) -> JobView:
+def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
     """Make what a map is searched by, codes and lists, anew from its checksummed descriptors.
 
     Searches go on in what is there until the new ones are put in their place, from one moment to the next. For a
     map whose places are not what they were when its codes were learnt, or whose caches somebody put back from a
     backup. A map that is searched exactly has nothing to be made.
     """
-    return submit(engine, response, rebuilding.REBUILD, {}, engine.atlas.get(map_id))
+    return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))
-async def check_health(map_id: MapId, options: Annotated[HealthParameters, Query()], engine: EngineDep) -> MapHealth:
+async def check_health(
+    map_id: MapId,
+    options: Annotated[HealthParameters, Query()],
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    one_at_a_time: Annotated[CapacityLimiter, Depends(FromState("health_examinations"))],
+) -> MapHealth:
     """See how a map does, and where somebody should go again.
 
     Told are places that never match and places that match everything, gaps along each sequence, and how the
@@ -115,12 +127,12 @@ async def check_health(map_id: MapId, options: Annotated[HealthParameters, Query
     """
     map_ = await engine.map(map_id)
     try:
-        encoder = await engine.inference.load(map_.record.encoder)
+        encoder = await engine.queue.load(map_.record.encoder)
     except errors.UnknownEncoder as error:
         raise EncoderNotInstalled(str(error)) from error
-    async with engine.upkeep.examining:  # one at a time: each is a long search
-        statistics = await in_thread(engine.upkeep.statistics.read, key_of(map_))
-        return await in_thread(examine_health, map_, encoder, statistics, options.seconds, options.limit)
+    counted = await in_thread(statistics.read, map_key(map_))
+    examine = partial(examine_health, map_, encoder, counted, options.seconds, options.limit)
+    return await to_thread.run_sync(examine, limiter=one_at_a_time)
 
 
 @router.post(
@@ -129,7 +141,7 @@ async def check_health(map_id: MapId, options: Annotated[HealthParameters, Query
     dependencies=[Depends(json_body)],
     responses=problem_documentation(*ASKING_PROBLEMS, errors.UnknownSequence),
 )
-def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, response: Response) -> JobView:
+def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
     """Forget places that their neighbours stand in for; at first only report what that would cost in recall.
 
     A place goes only if a place that stays is the same place by the map's settings and looks alike. With
@@ -142,7 +154,7 @@ def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, response: Respo
             raise errors.UnknownSequence(f"The map has no sequence {name!r}.")
     if wanted.queries is not None and wanted.queries == wanted.sequence:
         raise InvalidRequest("queries: the frames that are asked for are not pruned; name another sequence.")
-    return submit(engine, response, pruning.KIND, wanted.model_dump(), map_)
+    return submit(engine, jobs, response, pruning.KIND, wanted.model_dump(), map_)
 
 
 @router.post(
@@ -152,7 +164,7 @@ def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, response: Respo
     responses=problem_documentation(*ASKING_PROBLEMS, errors.WrongEncoder, MergeConflict),
 )
 def merge_map(
-    map_id: MapId, wanted: Merging, engine: EngineDep, principal: PrincipalDep, response: Response
+    map_id: MapId, wanted: Merging, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
     """Take the places of another map of the same encoder into this one; at first only report.
 
@@ -170,4 +182,4 @@ def merge_map(
         plan = merging.planned(map_, other, arguments, map_.transfer.outline())
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
-    return submit(engine, response, merging.KIND, arguments, map_, other)
+    return submit(engine, jobs, response, merging.KIND, arguments, map_, other)

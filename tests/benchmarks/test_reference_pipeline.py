@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.reference_pipeline import reference_vlad
 from benchmarks.thesis_pipeline import THESIS, literal, ours
-from core.evaluation.timing import jpeg, sample_picture
+from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.method.catalogue import EncoderCatalogue
 from core.method.vlad import Words, aggregate
@@ -23,14 +23,14 @@ def test_the_literal_vlad_is_the_compiled_one() -> None:
 @pytest.mark.parametrize("step", [2.0, 0.5])
 def test_both_pipelines_give_one_vector(step: float) -> None:
     encoder = EncoderCatalogue().get(THESIS)
-    data = jpeg(sample_picture(3))
+    data = jpeg(sample_frame(3))
     a, b = literal(encoder, data, step), ours(encoder, data, step, Words(encoder.centers))
     assert float(a @ b) >= 0.995 * np.linalg.norm(a) * np.linalg.norm(b)
 
 
 def test_at_the_packaged_step_it_is_the_encoders_own_vector() -> None:
     encoder = EncoderCatalogue().get(THESIS)
-    picture = sample_picture(4)
-    data = jpeg(picture)
+    frame = sample_frame(4)
+    data = jpeg(frame)
     vector = ours(encoder, data, encoder.definition.steps[0], Words(encoder.centers))
     np.testing.assert_allclose(vector, encoder.encode(decode(data)).descriptor, atol=1e-5)

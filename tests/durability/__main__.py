@@ -1,4 +1,4 @@
-"""Crashes for as long as one likes: ``scripts/soak storage --kills 1000 --seed 7``; the suite runs a little of each."""
+"""Long campaigns of crashes, as by ``scripts/soak storage --kills 1000 --seed 7``; the suite runs a little of each."""
 
 from __future__ import annotations
 
@@ -11,15 +11,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from random import Random
 
-from tests.durability import server_power, storage_points, storage_power
-from tests.durability.lives import Lives
 from tests.durability.model import Lost
-from tests.durability.server_kills import ServerKills
-from tests.durability.servers import Servers
-from tests.durability.storage_kills import WORKERS, StorageKills
-from tests.durability.storage_points import PointTally
-from tests.durability.storage_power import PowerTally
-from tests.durability.storage_process import UNSYNCED
+from tests.durability.server import power_cuts as server_power
+from tests.durability.server.kills import ServerKills
+from tests.durability.server.processes import ServerProcesses
+from tests.durability.storage import kill_points
+from tests.durability.storage import power_cuts as storage_power
+from tests.durability.storage.driver import UNSYNCED
+from tests.durability.storage.kill_points import PointTally
+from tests.durability.storage.kills import WORKERS, StorageKills
+from tests.durability.storage.power_cuts import PowerTally
+from tests.durability.storage.processes import StorageProcesses
 
 TOLD_EVERY = 25
 OPERATIONS = 100
@@ -29,21 +31,21 @@ OPERATIONS = 100
 def storage(folder: Path, arguments: argparse.Namespace) -> str:
     """Kill a process that drives the storage layer at random moments."""
     campaign = StorageKills(folder, arguments.seed)
-    with Lives(folder, WORKERS) as lives:
+    with StorageProcesses(folder, WORKERS) as processes:
         for kills in range(TOLD_EVERY, arguments.kills + TOLD_EVERY, TOLD_EVERY):
-            campaign.run(lives, min(kills, arguments.kills))
+            campaign.run(processes, min(kills, arguments.kills))
             print(campaign.tally, flush=True)
     return f"{campaign.tally}: nothing lost, nothing half done"
 
 
 def points(folder: Path, arguments: argparse.Namespace) -> str:
-    """Kill it at every call by which it writes, one after the other."""
+    """Kill that process at every call by which it writes, one after the other."""
     tally = PointTally()
-    with Lives(folder) as lives:
-        every = storage_points.points(lives, folder, arguments.seed)
+    with StorageProcesses(folder) as processes:
+        every = kill_points.points(processes, folder, arguments.seed)
         chosen = every if arguments.kills is None else Random(arguments.seed).sample(every, arguments.kills)
         for point in chosen:
-            met, begun = storage_points.kill_at(lives, folder, arguments.seed, point)
+            met, begun = kill_points.kill_at(processes, folder, arguments.seed, point)
             tally = PointTally(tally.points + 1, tally.killed + met, tally.operations + begun)
             if tally.points % TOLD_EVERY == 0:
                 print(f"{tally} of {len(chosen)}", flush=True)
@@ -51,17 +53,17 @@ def points(folder: Path, arguments: argparse.Namespace) -> str:
 
 
 def power(folder: Path, arguments: argparse.Namespace) -> str:
-    """Trace it, or the service, and look at what is left when all that was not synced is lost, or a part of it."""
+    """Trace that process, or the service, and lose all or part of what was not synced."""
     total = PowerTally()
-    with Lives(folder, unsynced=arguments.unsynced) as lives, ExitStack() as stack:
-        servers = stack.enter_context(Servers(folder)) if arguments.server else None
+    with StorageProcesses(folder, unsynced=arguments.unsynced) as processes, ExitStack() as stack:
+        servers = stack.enter_context(ServerProcesses(folder)) if arguments.server else None
         for number in range(arguments.runs):
             work, seed = folder / f"run-{number}", f"{arguments.seed}/{number}"
             work.mkdir()
             if servers is None:
-                total += storage_power.power(lives, work, seed, OPERATIONS, arguments.disks)
+                total += storage_power.power(processes, work, seed, OPERATIONS, arguments.disks)
             else:
-                total += server_power.power(servers, lives, work, seed, OPERATIONS, arguments.disks)
+                total += server_power.power(servers, processes, work, seed, OPERATIONS, arguments.disks)
             shutil.rmtree(work)
             print(total, flush=True)
     return f"{total}: nothing lost, nothing half done"
@@ -70,9 +72,9 @@ def power(folder: Path, arguments: argparse.Namespace) -> str:
 def server(folder: Path, arguments: argparse.Namespace) -> str:
     """Kill the whole service at random moments, while several clients use it."""
     campaign = ServerKills(folder, arguments.seed)
-    with Lives(folder) as lives, Servers(folder) as servers:
+    with StorageProcesses(folder) as processes, ServerProcesses(folder) as servers:
         for kills in range(1, arguments.kills + 1):
-            campaign.run(lives, servers, kills)
+            campaign.run(processes, servers, kills)
             print(campaign.tally, flush=True)
     return f"{campaign.tally}: nothing lost, nothing half done"
 
@@ -87,13 +89,13 @@ def main() -> int:
         kind.set_defaults(run=run)
     kind = kinds.add_parser("power", help=power.__doc__)
     kind.add_argument("--runs", type=int, default=10, help=f"of {OPERATIONS} operations each (default: %(default)s)")
-    kind.add_argument("--disks", type=int, default=200, help="to be looked at in each run (default: %(default)s)")
+    kind.add_argument("--disks", type=int, default=200, help="that are compared in each run (default: %(default)s)")
     kind.add_argument("--unsynced", choices=UNSYNCED, help="break the storage layer so: the loss must be found")
     kind.add_argument("--server", action="store_true", help="the whole service, not the storage layer alone")
     kind.set_defaults(run=power)
     for kind in kinds.choices.values():
-        kind.add_argument("--seed", default=secrets.token_hex(4), help="one that was printed, to do the same again")
-        kind.add_argument("--folder", type=Path, help="where to work; kept when something was lost")
+        kind.add_argument("--seed", default=secrets.token_hex(4), help="printed by an earlier run, to repeat it")
+        kind.add_argument("--folder", type=Path, help="where to work; it is kept when something was lost")
     arguments = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="soak-", dir=arguments.folder))
     print(f"{arguments.kind}: seed {arguments.seed}, in {folder}", flush=True)

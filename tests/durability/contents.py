@@ -1,4 +1,4 @@
-"""Everything that a data directory holds, read by the real code, as plain values that can be compared."""
+"""Reads everything that a data directory holds, by the real code, as plain values that can be compared."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _places(map_: Map) -> list[dict[str, Any]]:
     assert list(by_id) == [place.id for place in outline], "the two listings differ"
     found, rankings = [], snapshot.search_batch(descriptors)
     for position, place in enumerate(outline):
-        picture = map_.transfer.picture(place.id)
+        picture = map_.picture(place.id)
         found.append({
             **by_id[place.id],
             "digest": place.digest.hex(),

@@ -1,7 +1,7 @@
-"""What must be true of a data directory: maps, places and their order, in plain values, with none of the real code.
+"""A model of a data directory in plain values: maps, places and their order, with none of the real code.
 
 Only the rules of field values (:class:`core.places.PlaceFields`) are shared with what is tested.  A value that is not
-known, such as the time of a write that nobody was told of, is ``ANY`` and learnt from what is found.
+known, such as the time of a write that was never acknowledged, is ``ANY`` and learnt when it is found.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame: what is told of it, and SHA-256 of what may be kept of it, all hexadecimal or ``ANY``.
+    """What may be kept of a frame: hexadecimal SHA-256 sums, or ``ANY``.
 
     descriptor, local: by the precision of the map.
     """
@@ -69,12 +69,12 @@ class PlaceModel:
 
 
 def canonical(fields: Fields) -> Fields:
-    """Fields as they are told."""
+    """Fields as an answer has them."""
     return PlaceFields.model_validate(fields).model_dump(mode="json")
 
 
 def merged(target: Any, patch: Any) -> Any:
-    """RFC 7396."""
+    """``target`` after a JSON merge patch (RFC 7396)."""
     if not isinstance(patch, dict):
         return patch
     result = dict(target) if isinstance(target, dict) else {}
@@ -101,10 +101,10 @@ class MapModel:
     ends: dict[str | None, int] = field(default_factory=lambda: {None: 0})
     cameras: dict[str, Any] = field(default_factory=dict)
 
-    # Writes; each returns what the answer must say
+    # Writes; each returns the answer that it must get
 
     def enrol(self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None) -> str:
-        """One frame: created, replaced, updated or unchanged."""
+        """Enrol a frame; created, replaced, updated or unchanged."""
         known = self.places.get(place_id)
         if known is not None and known.shown.digest == shown.digest:
             return self.set_fields(place_id, fields)
@@ -120,7 +120,7 @@ class MapModel:
         return "created" if known is None else "replaced"
 
     def set_fields(self, place_id: str, fields: Fields) -> str:
-        """Other fields for the same frame."""
+        """Change the fields of a place and keep its frame."""
         place = self.place(place_id)
         if canonical(place.fields) == canonical(fields):
             return "unchanged"
@@ -129,11 +129,11 @@ class MapModel:
         return "updated"
 
     def patch(self, place_id: str, changes: Fields) -> str:
-        """A merge patch."""
+        """Apply a merge patch to the fields of a place."""
         return self.set_fields(place_id, merged(self.place(place_id).fields, changes))
 
     def adopt(self, place_id: str, of: PlaceModel, ordinal: int | None) -> None:
-        """A place of another map with its history."""
+        """Take over a place of another map with its history."""
         before = self.places.get(place_id)
         same = before is not None and before.shown.digest == of.shown.digest
         self.enrol(place_id, of.shown, of.fields, of.kept)
@@ -145,13 +145,13 @@ class MapModel:
         self.ends[place.sequence] = max(self.ends[place.sequence], place.ordinal + 1)
 
     def forget(self, place_id: str) -> None:
-        """One place."""
+        """Remove a place."""
         gone = self.place(place_id)
         del self.places[place_id]
         self._drop_if_empty(gone.sequence)
 
     def forget_sequence(self, name: str) -> int:
-        """All of a traverse."""
+        """Remove all places of a traverse; their number."""
         gone = [place_id for place_id, place in self.places.items() if place.sequence == name]
         if not gone:
             raise Refused("UnknownSequence")
@@ -160,7 +160,7 @@ class MapModel:
         return len(gone)
 
     def edit(self, changes: dict[str, Any]) -> int:
-        """Settings; the revision that follows."""
+        """Change settings; the new revision."""
         if any(self.settings[name] != value for name, value in changes.items()):
             self.settings = {**self.settings, **changes}
             self.revision, self.updated = self.revision + 1, ANY
@@ -187,10 +187,10 @@ class MapModel:
         if sequence is not None and all(place.sequence != sequence for place in self.places.values()):
             self.ends.pop(sequence, None)
 
-    # What is to be found
+    # What must be found
 
     def expected(self) -> dict[str, Any]:
-        """As :func:`tests.durability.contents.contents` tells of a map."""
+        """The map in the form of :func:`tests.durability.contents.map_contents`."""
         return {
             "listed": self.listed,
             "settings": self.settings,
@@ -223,10 +223,10 @@ class MapModel:
         }
 
     def told(self, places: Sequence[Mapping[str, Any]]) -> None:
-        """Fill in the times of places that an answer told; what was known already must be said again.
+        """Note the times of places in an answer.
 
         Raises:
-            Lost: it is not.
+            Lost: a time differs from one that is known already.
         """
         for told in places:
             place = self.places[told["id"]]
@@ -235,7 +235,7 @@ class MapModel:
             place.created, place.updated = told["created_at"], told["updated_at"]
 
     def learn(self, found: Mapping[str, Any]) -> None:
-        """Fill in what was not known from what was found."""
+        """Note what was found where nothing was known."""
         self.created, self.updated = found["created_at"], found["updated_at"]
         self.calibration = found["calibration"]
         for told in found["places"]:
@@ -261,7 +261,7 @@ def changed(world: World, change: Change) -> tuple[World, Any]:
 
 
 def differences(expected: Any, found: Any, where: str = "") -> list[str]:
-    """In words, where what is found is not what is expected."""
+    """Where two values differ, a sentence each."""
     if expected is ANY:
         return []
     if isinstance(expected, dict) and isinstance(found, dict):
@@ -288,14 +288,14 @@ def differences(expected: Any, found: Any, where: str = "") -> list[str]:
 
 
 class Lost(AssertionError):
-    """What is on disk is none of what it may be."""
+    """The disk holds none of the worlds that it may hold."""
 
 
 def settled(candidates: Sequence[World], found: Mapping[str, Mapping[str, Any]]) -> tuple[World, int]:
-    """The one of several worlds that was found, with all that was unknown learnt, and its number.
+    """The world among the candidates that was found, with what was unknown filled in, and its index.
 
     Raises:
-        Lost: none of them is.
+        Lost: none of them was found.
     """
     told = []
     for number, world in enumerate(candidates):

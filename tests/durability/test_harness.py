@@ -1,4 +1,4 @@
-"""The harness itself: a loss is seen, and a disk without power holds what was synced and nothing else for certain."""
+"""The harness itself: it sees a loss, and after a power cut its disk holds what was synced, and all else by chance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def world() -> World:
 
 
 @pytest.mark.parametrize("part", ["places", "ends", "cameras", "revision"])
-def test_whatever_is_not_as_it_must_be_is_lost(part: str) -> None:
+def test_any_difference_is_a_loss(part: str) -> None:
     before = world()
     after = copy.deepcopy(before)
     after["lab"].forget("a")
@@ -48,7 +48,7 @@ def test_half_of_a_place_is_lost() -> None:
         settled([before], found)
 
 
-def test_what_nobody_was_told_is_learnt_once() -> None:
+def test_what_was_never_acknowledged_is_learnt_once() -> None:
     before = world()
     assert before["lab"].places["a"].created is ANY
     found = {"lab": copy.deepcopy(before["lab"].expected())}

@@ -1,4 +1,4 @@
-"""A disk made of a trace: what is on it for certain, and what may be, at every moment of a process.
+"""A model of a disk, made from a trace of a process: what is on it for certain, and what may be, at every moment.
 
 The trace (:func:`arguments`) holds the bytes of every write.  A file's contents are certain when they were written
 before a sync of it began that has returned; a name is certain when its folder was synced so.  Everything else a power
@@ -38,7 +38,7 @@ SECTOR = 512
 
 
 def arguments(trace_file: Path) -> list[str]:
-    """What to put before a command, or before ``-p`` and a process, so that its trace can be replayed."""
+    """The words before a command, or before ``-p`` and a process id, that trace it so that it can be replayed."""
     calls = f"trace={','.join(TRACED)}"
     return [strace() or "strace", "-f", "-y", "-xx", "-s", str(1 << 24), "-e", calls, "-o", str(trace_file)]
 
@@ -118,7 +118,7 @@ def _torn(step: _Step, random: Random) -> Iterator[_Step]:
 
 @dataclass(frozen=True)
 class Variant:
-    """What becomes of what is not certain.
+    """What a power cut does to writes that are not certain.
 
     data: share of the writes that are kept; torn: of those that are kept, only some sectors.
     names: share of each folder's changes that are kept, from the first on, as a journal does.

@@ -1,8 +1,8 @@
-"""A clock that jumps: ``python -m tests.faults.clock FILE command …`` runs a Python command under another time.
+"""A clock that jumps: ``python -m tests.faults.clock FILE command …`` runs a Python command with another wall clock.
 
-The wall clock of the process is off by the seconds that FILE holds, looked up at every question.  That is the one seam:
-the system's own clock is everybody's, and a time namespace leaves the wall clock as it is.  What counts durations, the
-monotonic clock, is left alone, as it is by a clock that is set.
+The wall clock of the process is off by the seconds in FILE, which is read at every call.  Python's functions are
+replaced for this, because the system's own clock is shared and a time namespace does not change the wall clock.  The
+monotonic clock stays as it is, as it does when a system's clock is set.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ _time = time.time
 
 
 class Offset:
-    """So many seconds the clock is off."""
+    """The seconds by which the clock is off."""
 
     def __init__(self, path: Path) -> None:
-        self._file = os.open(path, os.O_RDONLY)  # for good: files may run short meanwhile
+        self._file = os.open(path, os.O_RDONLY)  # kept open: the process may run out of file descriptors
 
     def seconds(self) -> float:
-        """As the file says now."""
+        """The number in the file now."""
         return float(os.pread(self._file, 32, 0) or 0)
 
 
 def install(offset: Offset) -> None:
-    """Put the other clock in the place of the process's own; before anything else is imported."""
+    """Replace the clock of this process; call this before anything else is imported."""
 
     class Kind(type):
-        """Every moment is one of the moved clock's, whoever made it."""
+        """Makes every ``datetime`` an instance of the class below."""
 
         def __instancecheck__(cls, value: object) -> bool:
             return isinstance(value, _datetime)
 
     class Moved(_datetime, metaclass=Kind):
-        """``datetime`` whose ``now`` is the other clock's."""
+        """``datetime`` with the time of the clock that is off."""
 
         @classmethod
         def now(cls, tz: Any = None) -> Any:
@@ -55,7 +55,7 @@ def install(offset: Offset) -> None:
 
 
 def main() -> None:
-    """FILE, then the words of a command that begins with the interpreter and ``-m module``."""
+    """Run the command in the arguments: FILE, the interpreter, ``-m``, a module and its arguments."""
     path, _, flag, module, *arguments = sys.argv[1:]
     assert flag == "-m"
     install(Offset(Path(path)))

@@ -1,4 +1,4 @@
-"""What can become of a file that lies on a disk: bits flipped, cut, emptied, mixed up, in the way."""
+"""Ways in which a file on a disk can be damaged."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAGE = 4096
 
 
 def flip(path: Path, offset: int, bit: int = 0) -> None:
-    """Turn one bit round."""
+    """Flip one bit."""
     content = bytearray(path.read_bytes())
     content[offset] ^= 1 << bit
     path.write_bytes(content)
@@ -32,13 +32,13 @@ def flip_last_page(path: Path, chosen: random.Random) -> None:
 
 
 def flip_used(path: Path, chosen: random.Random) -> None:
-    """One of the bytes that are not zero, where something is kept."""
+    """Flip a bit of a byte that is not zero, because such bytes are in use."""
     used = [offset for offset, byte in enumerate(path.read_bytes()) if byte]
     flip(path, chosen.choice(used), chosen.randrange(8))
 
 
 def cut(path: Path, chosen: random.Random) -> None:
-    """At a length that means something, or at any."""
+    """Cut the file at a length that means something, or at any."""
     size = path.stat().st_size
     lengths = {0, 1, 31, 32, 99, 100, PAGE - 1, PAGE, PAGE + 1, size // 2, size - 1, size - PAGE}
     lengths.add(chosen.randrange(size))
@@ -85,7 +85,7 @@ def link_in_circles(path: Path, chosen: random.Random) -> None:
 
 
 def take_of_another(path: Path, chosen: random.Random) -> None:
-    """The file of the same name of the map beside it, or if that has none another file of this one."""
+    """Replace a file by the one of the same name of another map, or by another file of this map."""
     other = path.parents[1] / "hall" / path.name
     others = sorted(one for one in path.parent.iterdir() if one.is_file() and one != path)
     shutil.copyfile(other if other.exists() else chosen.choice(others), path)

@@ -1,4 +1,4 @@
-"""Faults by strace: which system calls a process makes in a folder, and refusing one or some of them."""
+"""Fault injection by strace: lists the system calls that a process makes in a folder, and lets some of them fail."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WRITE_CALLS = (
     "openat", "write", "pwrite64", "fsync", "fdatasync", "ftruncate", "fallocate", "mkdir", "rename", "unlink", "rmdir",
     "mmap",
 )  # fmt: skip
-"""The calls by which the storage layer, SQLite within it included, writes: each instance is a write point."""
+"""The calls by which the storage layer and its SQLite write; each instance is a write point."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Point:
 
 @contextmanager
 def attached(process: int, arguments: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
-    """strace on a running process and all its threads; it lets go at the end, or ends with the process."""
+    """Run strace on a process and all its threads until the end of the context, or of the process."""
     command = [strace() or "strace", "-f", *arguments, "-p", str(process)]
     tracer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
@@ -51,16 +51,16 @@ def attached(process: int, arguments: Sequence[str]) -> Iterator[subprocess.Pope
         tracer.communicate(timeout=30)
 
 
-class Nursery:
-    """Children that do the script (:mod:`tests.faults.script`), each under its own faults."""
+class ScriptProcesses:
+    """Starts processes that run the script (:mod:`tests.faults.script`), each with faults of its own."""
 
     def __init__(self) -> None:
-        command = [sys.executable, "-m", "tests.faults.nursery"]
+        command = [sys.executable, "-m", "tests.faults.script_forks"]
         self._process = subprocess.Popen(
             command, cwd=REPOSITORY, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
 
-    def __enter__(self) -> Nursery:
+    def __enter__(self) -> ScriptProcesses:
         return self
 
     def __exit__(
@@ -71,7 +71,7 @@ class Nursery:
         self._process.wait(30)
 
     def run(self, folder: Path, arguments: Sequence[str], indexed: bool = False) -> dict[str, Any]:
-        """What the script tells (:func:`tests.faults.script.run`) that has its data in ``folder / "data"``."""
+        """Run the script with its data in ``folder / "data"``; its report (:func:`tests.faults.script.run`)."""
         folder.mkdir(parents=True, exist_ok=True)
         go, result = folder / "go", folder / "result"
         assert self._process.stdin is not None and self._process.stdout is not None
@@ -95,12 +95,12 @@ def _wait_for(path: Path, process: int) -> None:
         time.sleep(0.002)
 
 
-def write_points(nursery: Nursery, indexed: bool = False) -> list[Point]:
-    """All of the script's write points, from one run without a fault."""
+def write_points(scripts: ScriptProcesses, indexed: bool = False) -> list[Point]:
+    """All write points of the script, from one run without a fault."""
     folder = Path(tempfile.mkdtemp(prefix="points-"))
     try:
         trace = folder / "trace"
-        nursery.run(folder, ["-y", "-o", str(trace), "-e", f"trace={','.join(WRITE_CALLS)}"], indexed)
+        scripts.run(folder, ["-y", "-o", str(trace), "-e", f"trace={','.join(WRITE_CALLS)}"], indexed)
         return points_of(trace.read_text(), str(folder / "data"))
     finally:
         shutil.rmtree(folder)

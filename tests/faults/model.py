@@ -1,4 +1,4 @@
-"""What must be true of the maps after each operation: plain dictionaries, which know nothing of files."""
+"""A model of the maps after each operation, in plain dictionaries, without files."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from core.storage import Atlas, Map
 from tests.core.storage.frames import descriptor_of, local_of, stored_of
 
 State = dict[str, Any]
-"""Maps by id; of each its description, tier setting, cameras, and its places in the order of their enrolment."""
+"""Maps by id: the description, tier setting, cameras, and places in the order of their enrolment."""
 
 
 def place(shown: str, keep: str = "thumbnail", **fields: Any) -> State:
-    """A place as it must be told: whatever is not said of it is nothing."""
+    """A place as :func:`told` has it; fields that are not given are empty."""
     pose, sequence, metadata = fields.get("x"), fields.get("sequence"), fields.get("metadata", {})
     picture = {"thumbnail": f"thumbnail of {shown}", "image": f"image of {shown}"}[keep]
     return {
@@ -31,12 +31,12 @@ def place(shown: str, keep: str = "thumbnail", **fields: Any) -> State:
 
 
 def told(map_: Map) -> State:
-    """A map as it is told through its own interface, read anew; what is searched is compared as well."""
+    """A map as its public interface tells it now, with checksums of the stored descriptors."""
     snapshot, listed = map_.snapshot(), map_.places(None, 1000)[0]
     rows = map_.rows_of([found.id for found in listed])
     places = {}
     for found, row in zip(listed, rows, strict=True):
-        kept = map_.transfer.picture(found.id)
+        kept = map_.picture(found.id)
         places[found.id] = {
             "x": None if found.pose is None else found.pose.x,
             "sequence": found.sequence,

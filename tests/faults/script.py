@@ -1,8 +1,8 @@
-"""A fixed script of every kind of write, in one process that goes on after each refusal and tells what became of each.
+"""A fixed script of every kind of write, in one process that goes on after each refusal and reports every outcome.
 
-Every step is an operation of the storage layer beside what it must do to the model (:mod:`tests.faults.model`).
-The outcome of a step is ``taken`` or the name of the error's class.  What the process tells goes out by ``writev``,
-which no fault is injected into.
+Every step is an operation of the storage layer beside its effect on the model (:mod:`tests.faults.model`).  The
+outcome of a step is ``taken`` or the name of the error's class.  The report is written by ``writev``, into which no
+fault is injected.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ Effect = Callable[[State], None]
 
 @dataclass
 class World:
-    """What the steps work on; ``atlas`` is None before it is open."""
+    """The data directory; ``atlas`` is None while it is closed."""
 
     directory: Path
     atlas: Atlas | None = None
 
     def open(self) -> None:
-        """Take the directory, as a start of the service does."""
+        """Open the directory, as a start of the service does."""
         if self.atlas is None:
             self.atlas = Atlas(self.directory, rows_per_segment=4)
 
     def close(self) -> None:
-        """Give it back."""
+        """Close the directory."""
         if self.atlas is not None:
             self.atlas.close()
         self.atlas = None
@@ -57,9 +57,9 @@ class World:
 class Step:
     """One operation.
 
-    effect: what it does to the model when it is taken.
-    of_atlas: it writes nothing into the map "lab".
-    is_whole: one that was refused has changed nothing; else it may have happened all the same, whole.
+    effect: on the model, when the operation succeeds.
+    of_atlas: the operation writes nothing into the map "lab".
+    is_whole: when it is refused, it has changed nothing; otherwise it may have happened completely all the same.
     """
 
     name: str
@@ -177,14 +177,14 @@ STEPS: tuple[Step, ...] = (
 )
 
 PLAIN = tuple(step for step in STEPS if "index" not in step.name and "codes" not in step.name)
-"""Without the codes, whose recall is measured at length."""
+"""The steps without codes, because measuring their recall takes long."""
 
 AFTERWARDS = _enrol("afterwards")
-"""Taken when the fault has passed, without a restart."""
+"""Must succeed when the fault has passed, without a restart."""
 
 
 def outcome_of(world: World, step: Step) -> str:
-    """Do a step."""
+    """Do a step; ``taken``, or what went wrong."""
     try:
         step.act(world)
     except PlacerecError as error:
@@ -197,13 +197,13 @@ def outcome_of(world: World, step: Step) -> str:
 
 
 def run(directory: Path, go: Path, result: Path, indexed: bool) -> None:
-    """The script, begun when the file ``go`` is there; what became of it goes to ``result``.
+    """Run the script as soon as the file ``go`` exists, and write the report to ``result``.
 
-    After the steps ``passing`` is made beside ``go``, and until ``passed`` is there too, nothing is done: in between
-    the faults are taken away.
+    After the steps the file ``passing`` is made beside ``go``, and the script waits for ``passed``; in between the
+    faults are removed.
 
     Args:
-        indexed: with the steps that have codes made.
+        indexed: include the steps that make codes.
     """
     index_files.GROUP_ROWS = 4
     sink = os.open(result.with_suffix(".part"), os.O_WRONLY | os.O_CREAT, 0o644)
@@ -232,7 +232,7 @@ def _wait_for(path: Path) -> None:
 
 
 def _afterwards(world: World) -> dict[str, Any]:
-    """The state in the same process, and that writes are taken again."""
+    """The state in the same process, and whether writes succeed again."""
     world.open()
     assert world.atlas is not None
     for map_id in world.atlas.quarantined():  # one that the disk refused to open is tried again when it is asked for

@@ -1,4 +1,4 @@
-"""Faults under a running service, through HTTP: refused and told, the rest goes on, all recovers without a restart."""
+"""Faults under a running service: it refuses what it cannot do, goes on otherwise, and recovers without a restart."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.storage import Atlas
 from tests.core.storage.frames import frame
+from tests.faults.damage import flip
 from tests.faults.injection import attached
 from tests.service.places.test_durability import all_places, answers
 from tests.service.scenes import jpeg
@@ -41,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def clock(folder: Path) -> Path:
-    """The file that says how many seconds the service's wall clock is off."""
+    """The file with the seconds by which the service's wall clock is off."""
     path = folder / "clock"
     path.write_text("0")
     return path
@@ -86,7 +87,7 @@ def faults(server: Server, *arguments: str) -> Iterator[None]:
 
 
 def check_refused(server: Server, status: int, slug: str) -> None:
-    """Writes are refused as a problem, queries and other maps go on, and nothing is half there."""
+    """Writes are answered with a problem, queries and other maps go on, and nothing was half written."""
     before = all_places(server, "lab")
     assert_problem(server.enrol("lab", "refused", jpeg(7)), status, slug)
     assert_problem(server.client.patch("/v1/maps/lab", json={"description": "refused"}), status, slug)
@@ -98,7 +99,7 @@ def check_refused(server: Server, status: int, slug: str) -> None:
 
 
 def check_recovered(server: Server) -> None:
-    """What was refused is not there, the next write is taken, and all is in order."""
+    """What was refused is not there, the next write succeeds, and the map is sound."""
     assert "refused" not in all_places(server, "lab")
     assert server.client.get("/v1/maps/refused").status_code == 404
     assert server.client.get("/v1/maps/lab").json()["description"] == ""
@@ -140,7 +141,7 @@ def test_a_disk_that_is_read_only(server: Server, lab: str) -> None:
 @needs_strace
 def test_a_sync_that_takes_seconds_keeps_no_query_waiting(server: Server, lab: str) -> None:
     with ThreadPoolExecutor(1) as pool, httpx.Client(base_url=server.client.base_url, timeout=60) as other:
-        with faults(server, "fsync,fdatasync:delay_enter=2000000"):
+        with faults(server, "fsync,fdatasync:delay_enter=30000000"):
             slow = pool.submit(
                 other.put, "/v1/maps/lab/places/slow", content=jpeg(9), headers={"Content-Type": "image/jpeg"}
             )
@@ -215,12 +216,6 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".png", pixels)[1].tobytes()
 
 
-def spoil(path: Path, offset: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[offset] ^= 4
-    path.write_bytes(content)
-
-
 def prepare(data: Path, models: Path) -> None:
     """A sound map, a damaged one, and damage to every file beside the maps; descriptors are made up."""
     (encoder,) = (one for one in EncoderCatalogue().describe() if one.name == DEFAULT_ENCODER)
@@ -230,7 +225,7 @@ def prepare(data: Path, models: Path) -> None:
         made.enrol([frame("p0", dimension=encoder.dimension, local_shape=encoder.local_shape)])
     atlas.close()
     segment = data / "maps" / "damaged" / "descriptors-000001.seg"
-    spoil(segment, segment.stat().st_size - 100)
+    flip(segment, segment.stat().st_size - 100, bit=2)
     models.mkdir()
     (models / "broken.encoder.safetensors").write_bytes(b"\xff" * 4096)
     for name, content in DAMAGED_FILES.items():
@@ -245,7 +240,7 @@ DAMAGED_FILES = {
 
 
 def test_damaged_files_at_the_start(server: Server) -> None:
-    """A damaged map and a damaged model beside sound ones, and every small file damaged: it serves all the same."""
+    """With a damaged map, a damaged model and every small file damaged, the rest is served."""
     client, headers = server.client, {"Content-Type": "image/jpeg"}
     assert server.query("sound", jpeg(0))["matches"][0]["place"]["id"] == "p0"
     refused = client.post("/v1/maps/damaged/query", content=jpeg(0), headers=headers)
@@ -285,7 +280,7 @@ def test_a_frame_that_the_memory_does_not_suffice_for(server: Server, lab: str) 
 
 
 def test_a_start_on_a_full_disk(tmp_path: Path) -> None:
-    """It says so and ends, or serves and says so; when there is room it starts."""
+    """It says so and ends with an error."""
     full = Server(tmp_path, wrapper=("/bin/sh", "-c", 'ulimit -f 0; exec "$@"', "sh"))
     try:
         status = full.process.wait(60)

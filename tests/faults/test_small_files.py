@@ -1,4 +1,4 @@
-"""The small files beside the maps, and exports: damaged ones are put aside or refused; nothing ends in a crash."""
+"""Damaged small files beside the maps, and damaged exports, are put aside or refused and end in no crash."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from core.storage.archives.reading import Archive, check
 from service.access.keys import KeyStore
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords
+from service.queries.statistics import QueryStatistics, Statistics
 from service.sessions.store import SessionStore, StoredSession
-from service.upkeep.statistics import QueryStatistics, Statistics
 from tests.core.storage.archives.files import exported
 from tests.faults.damage import DAMAGES
 from tests.faults.test_damaged_files import make_map
@@ -28,7 +28,7 @@ from tests.faults.test_damaged_files import make_map
 SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
 CASES = 8
 CONTENT = [damage for damage in DAMAGES if damage.__name__.startswith(("flip", "cut", "zero", "append"))]
-"""An export is what somebody brings; that it cannot be opened is between them and their disk."""
+"""Damage to contents: an export comes from a user, so it is not replaced by a folder or a link."""
 
 Use = Callable[[Path], object]
 REFUSALS = (StorageFull, StorageFailure, DataDirectoryTooNew, KeysUnreadable, InvalidArchive, ArchiveTooNew)
@@ -36,7 +36,7 @@ KEY = ("lab", "2026-11-21T10:00:00+00:00")
 
 
 def use_jobs(folder: Path) -> object:
-    """All jobs there are; then one more is taken."""
+    """Read all jobs, then add one."""
     records = JobRecords(folder)
     try:
         found = [(job.id, job.kind, job.state, dict(job.arguments)) for job in records.read()]
@@ -48,7 +48,7 @@ def use_jobs(folder: Path) -> object:
 
 
 def use_sessions(folder: Path) -> object:
-    """All sessions there are, with what they believe; then one more is taken."""
+    """Read all sessions with their beliefs, then add one."""
     store = SessionStore(folder)
     try:
         found = [store.read(session.id) for session in store.all()]
@@ -59,7 +59,7 @@ def use_sessions(folder: Path) -> object:
 
 
 def use_statistics(folder: Path) -> object:
-    """What was counted of a map; then one more answer is."""
+    """Read the statistics of a map, then count one more answer."""
     statistics = QueryStatistics(folder, 3600, lambda: {KEY: 5}, lambda _: set())
     try:
         found: Statistics = statistics.read(KEY)
@@ -71,12 +71,12 @@ def use_statistics(folder: Path) -> object:
 
 
 def use_keys(folder: Path) -> object:
-    """Who may come in."""
+    """Read all keys."""
     return [(key.id, key.name, key.role, key.maps, key.digest) for key in KeyStore(folder).all()]
 
 
 def use_export(folder: Path) -> object:
-    """All parts of an export, compared with their checksums."""
+    """Compare all parts of an export with their checksums."""
     with Archive(folder / "export.tar") as archive:
         check(archive)
     return True
@@ -93,7 +93,7 @@ USES: dict[str, Use] = {
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with one of each, in use for a while."""
+    """A folder with one file of each kind, used several times."""
     folder = tmp_path_factory.mktemp("small")
     for _ in range(4):
         for use in (use_jobs, use_sessions, use_statistics):
@@ -122,7 +122,7 @@ def test_a_damaged_file_in_every_way(sound: Path, tmp_path: Path, name: str) -> 
 
 
 def run_cases(sound: Path, folder: Path, name: str, count: int) -> Counter[str]:
-    """``count`` seeded cases of damage to a file; what became of them, counted."""
+    """Damage a file in ``count`` ways; the number of cases with each outcome."""
     chosen, outcomes, failures = random.Random(SEED), Counter[str](), []
     expected = USES[name](shutil.copytree(sound, folder / "sound"))
     for number in range(count):

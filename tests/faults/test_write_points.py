@@ -1,4 +1,4 @@
-"""ENOSPC and EIO at every write point of the storage layer: what is taken is there, what is refused is not."""
+"""ENOSPC and EIO at every write point of the storage layer: what succeeded is there, what was refused is not."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from core.storage import Atlas
-from tests.faults.injection import Nursery, Point, write_points
+from tests.faults.injection import Point, ScriptProcesses, write_points
 from tests.faults.model import State, all_told
 from tests.faults.script import AFTERWARDS, PLAIN, STEPS, Step, empty
 from tests.syscalls import strace
@@ -21,22 +21,22 @@ from tests.syscalls import strace
 pytestmark = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
 
 SEED = int(os.environ.get("PLACEREC_FAULT_SEED", "0"))
-"""Chooses the points of the short run; named when one fails."""
+"""Chooses the points of the short run; every failure names it."""
 
 REFUSALS = {"StorageFull", "StorageFailure"}
 FOLLOWING = {"UnknownMap", "UnknownPlace", "UnknownSequence", "KeyError", "AssertionError"}
-"""What a step says whose own ground was refused before it: no such map, because it was not made."""
+"""Outcomes of a step that follow from an earlier refusal: a map is unknown because it was not made."""
 
 
 @pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    with Nursery() as nursery:
-        yield nursery
+def scripts() -> Iterator[ScriptProcesses]:
+    with ScriptProcesses() as scripts:
+        yield scripts
 
 
 @pytest.fixture(scope="module")
-def points(nursery: Nursery) -> list[Point]:
-    return write_points(nursery)
+def points(scripts: ScriptProcesses) -> list[Point]:
+    return write_points(scripts)
 
 
 def possible_states(steps: Sequence[Step], outcomes: Sequence[str]) -> list[State]:
@@ -73,7 +73,7 @@ def changed_by(step: Step, state: State) -> State | None:
 
 
 def check(told: dict[str, Any], directory: Path, steps: Sequence[Step]) -> None:
-    """No surprise on the way, the state one of those that may be, and the same after a restart."""
+    """No unexpected error, a state that is possible after the outcomes, and the same state after a restart."""
     assert "unexpected" not in told, told["unexpected"]
     outcomes = told["outcomes"]
     assert not [outcome for outcome in outcomes if outcome.startswith("unexpected")], outcomes
@@ -101,13 +101,15 @@ def check(told: dict[str, Any], directory: Path, steps: Sequence[Step]) -> None:
     assert not [path for path in (directory / "maps").iterdir() if path.name.startswith((".making", ".removing"))]
 
 
-def inject(nursery: Nursery, folder: Path, point: Point, error: str, count: int = 1, indexed: bool = False) -> None:
-    """Refuse ``count`` calls from a point on, and check."""
+def inject(
+    scripts: ScriptProcesses, folder: Path, point: Point, error: str, count: int = 1, indexed: bool = False
+) -> None:
+    """Let ``count`` calls fail from a point on, and check the result."""
     when = f"{point.number}..{point.number + count - 1}" if count > 1 else str(point.number)
     fault = f"inject={point.call}:error={error}:when={when}"
     arguments = ["-o", str(folder.with_suffix(".trace")), "-e", f"trace={point.call}", "-e", fault]
     try:
-        told = nursery.run(folder, arguments, indexed)
+        told = scripts.run(folder, arguments, indexed)
         assert "INJECTED" in folder.with_suffix(".trace").read_text() or indexed
         check(told, folder / "data", STEPS if indexed else PLAIN)
     except AssertionError as error_found:
@@ -125,7 +127,7 @@ def test_the_write_points_are_of_every_kind(points: list[Point]) -> None:
 
 
 def sample(points: Sequence[Point], count: int) -> list[Point]:
-    """Of each kind of call so many, the same for the same seed."""
+    """``count`` points of each kind of call, the same for the same seed."""
     chosen = random.Random(SEED)
     calls = sorted({point.call for point in points})
     by_call = {call: [point for point in points if point.call == call] for call in calls}
@@ -133,34 +135,38 @@ def sample(points: Sequence[Point], count: int) -> list[Point]:
 
 
 @pytest.mark.parametrize("error", ["ENOSPC", "EIO"])
-def test_a_refused_call_at_a_write_point(nursery: Nursery, points: list[Point], tmp_path: Path, error: str) -> None:
+def test_a_refused_call_at_a_write_point(
+    scripts: ScriptProcesses, points: list[Point], tmp_path: Path, error: str
+) -> None:
     for number, point in enumerate(sample(points, 1)):
-        inject(nursery, tmp_path / str(number), point, error)
+        inject(scripts, tmp_path / str(number), point, error)
 
 
-def test_a_disk_that_is_full_for_a_while(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
-    """Not one call fails but all of a kind, for a time; then the same process goes on."""
+def test_a_disk_that_is_full_for_a_while(scripts: ScriptProcesses, points: list[Point], tmp_path: Path) -> None:
+    """Several calls of a kind fail in a row; then the same process goes on."""
     chosen = random.Random(SEED)
     for number, call in enumerate(("pwrite64", "pwrite64", "fsync", "fdatasync", "openat")):
         point = chosen.choice([point for point in points if point.call == call])
-        inject(nursery, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO"]), chosen.randint(2, 12))
+        inject(scripts, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO"]), chosen.randint(2, 12))
 
 
-def test_a_directory_that_is_read_only_for_a_while(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
+def test_a_directory_that_is_read_only_for_a_while(
+    scripts: ScriptProcesses, points: list[Point], tmp_path: Path
+) -> None:
     chosen = random.Random(SEED)
     for number, call in enumerate(("openat", "mkdir", "rename")):
         point = chosen.choice([point for point in points if point.call == call])
-        inject(nursery, tmp_path / str(number), point, "EROFS", 3)
+        inject(scripts, tmp_path / str(number), point, "EROFS", 3)
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("error", ["ENOSPC", "EIO"])
-def test_every_write_point(nursery: Nursery, points: list[Point], tmp_path: Path, error: str) -> None:
+def test_every_write_point(scripts: ScriptProcesses, points: list[Point], tmp_path: Path, error: str) -> None:
     failures = []
     for number, point in enumerate(points):
         try:
-            inject(nursery, tmp_path / str(number), point, error)
+            inject(scripts, tmp_path / str(number), point, error)
         except AssertionError as failure:
             failures.append(str(failure))
     assert not failures, f"{len(failures)} of {len(points)}:\n" + "\n".join(failures)
@@ -168,11 +174,11 @@ def test_every_write_point(nursery: Nursery, points: list[Point], tmp_path: Path
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_every_window_of_refusals(nursery: Nursery, points: list[Point], tmp_path: Path) -> None:
+def test_every_window_of_refusals(scripts: ScriptProcesses, points: list[Point], tmp_path: Path) -> None:
     failures, chosen = [], random.Random(SEED)
     for number, point in enumerate(points):
         try:
-            inject(nursery, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO", "EROFS"]), 1 + number % 40)
+            inject(scripts, tmp_path / str(number), point, chosen.choice(["ENOSPC", "EIO", "EROFS"]), 1 + number % 40)
         except AssertionError as failure:
             failures.append(str(failure))
     assert not failures, f"{len(failures)} of {len(points)}:\n" + "\n".join(failures)
@@ -180,12 +186,12 @@ def test_every_window_of_refusals(nursery: Nursery, points: list[Point], tmp_pat
 
 @pytest.mark.soak
 @pytest.mark.timeout(7200)
-def test_the_index_at_its_write_points(nursery: Nursery, tmp_path: Path) -> None:
+def test_the_index_at_its_write_points(scripts: ScriptProcesses, tmp_path: Path) -> None:
     failures = []
-    chosen = [point for point in write_points(nursery, indexed=True) if point.call not in ("pwrite64", "mmap")]
+    chosen = [point for point in write_points(scripts, indexed=True) if point.call not in ("pwrite64", "mmap")]
     for number, point in enumerate(chosen):
         try:
-            inject(nursery, tmp_path / str(number), point, ("ENOSPC", "EIO")[number % 2], indexed=True)
+            inject(scripts, tmp_path / str(number), point, ("ENOSPC", "EIO")[number % 2], indexed=True)
         except AssertionError as failure:
             failures.append(str(failure))
     assert not failures, f"{len(failures)} of {len(chosen)}:\n" + "\n".join(failures)

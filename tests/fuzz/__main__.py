@@ -14,7 +14,7 @@ import httpx
 
 from tests.fuzz import api, http, images, streams
 from tests.fuzz.encoder import SMALL, install_small_encoder
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.originals import originals
 from tests.fuzz.sending import MAP
 from tests.service.server import ROOT, Server
 
@@ -24,7 +24,7 @@ WARM = 5000
 
 @contextmanager
 def service(url: str | None, **settings: object) -> Iterator[tuple[str, Server | None]]:
-    """The URL of a service: the one named, or a server of our own with a small encoder, ended afterwards."""
+    """The URL of a service: the given one, or a new server with a small encoder, which is stopped afterwards."""
     if url is not None:
         yield url, None
         return
@@ -80,7 +80,7 @@ def fuzz_api(options: argparse.Namespace) -> int:
 
 
 def fuzz_http(options: argparse.Namespace) -> int:
-    """Bytes that are no HTTP; 1 if some were answered by a 5xx, or neither answered nor hung up on."""
+    """Bytes that are no HTTP; 1 if some were answered by a 5xx, or the connection stayed open."""
     with service(options.url) as (url, _):
         port = int(url.rpartition(":")[2].strip("/"))
         sent = [*http.MALFORMED.values(), *http.mangled(options.seed, options.count)]

@@ -1,4 +1,4 @@
-"""The smallest encoder that is one: what is fuzzed are the ways to it, and its own work would take most of the time."""
+"""The smallest possible encoder, because its work would take most of the time and is not what is fuzzed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What schemathesis has to be told of the service: what a picture is, and the names of what exists.
+"""Tells schemathesis what a picture is, and the names of what exists in the service.
 
-A name that is drawn leads to nothing, so a request that is right in its path is given one that leads somewhere.
-Whatever such a request deletes is put back, outside of runs through links, which make what they need.
+A random name leads to nothing, so a request whose path is meant to be valid is given one that exists.  Whatever such a
+request deletes is put back, except in runs through links, which make what they need.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from schemathesis import Case, HookContext, Response
 from schemathesis.core.parameters import ParameterLocation
 from schemathesis.generation.meta import TestPhase
 
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.originals import originals
 from tests.service.scenes import jpeg
 
 MAP, OTHER_MAP, CAMERA, SEQUENCE, PLACES = "quay", "shed", "front", "monday", 3
@@ -26,7 +26,7 @@ for _name in ("jpeg", "png", "webp"):
     schemathesis.openapi.media_type(f"image/{_name}", st.sampled_from(_files))
 
 
-class Furniture:
+class Fixtures:
     """What exists in a service, and how to put it back."""
 
     def __init__(self, url: str) -> None:
@@ -51,21 +51,21 @@ class Furniture:
             self.job = self._client.post(f"/v1/maps/{OTHER_MAP}/prune", json={"dry_run": True}).json().get("id", "")
 
     def names(self) -> dict[str, str]:
-        """Path parameter -> a name that leads somewhere."""
+        """Path parameter -> a name that exists."""
         known = {"map": MAP, "place": "p1", "camera": CAMERA, "sequence": SEQUENCE, "session": self.session}
         return {name: value for name, value in (known | {"job": self.job}).items() if value}
 
 
-_furniture: dict[str, Furniture] = {}
+_fixtures: dict[str, Fixtures] = {}
 _DELETES = ("delete_map", "forget_place", "delete_sequence", "forget_camera", "delete_session", "prune_map")
 
 
-def _of(case: Case[Any]) -> Furniture:
+def _of(case: Case[Any]) -> Fixtures:
     url = str(case.operation.base_url)
-    if url not in _furniture:
-        _furniture[url] = Furniture(url)
-        _furniture[url].put_back()
-    return _furniture[url]
+    if url not in _fixtures:
+        _fixtures[url] = Fixtures(url)
+        _fixtures[url].put_back()
+    return _fixtures[url]
 
 
 def _through_links(case: Case[Any]) -> bool:
@@ -74,7 +74,7 @@ def _through_links(case: Case[Any]) -> bool:
 
 @schemathesis.hook
 def before_call(context: HookContext, case: Case[Any], kwargs: dict[str, Any]) -> None:
-    """Lead a request somewhere whose path is meant to be right."""
+    """Give a request whose path is meant to be valid names that exist."""
     if case.meta is None or _through_links(case) or not case.path_parameters:
         return
     path = case.meta.components.get(ParameterLocation.PATH)

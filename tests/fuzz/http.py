@@ -1,4 +1,4 @@
-"""Bytes on a connection that are no proper HTTP: refused or hung up on, at once, and nobody else is hurt."""
+"""Sends bytes that are no proper HTTP: they must be refused or the connection closed, and other clients unharmed."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ MALFORMED: dict[str, bytes] = {
 
 
 def spoken(port: int, sent: bytes, half_close: bool = True) -> tuple[list[int], bool]:
-    """The statuses that come back on a connection of its own, and whether it was ended by the other side in time.
+    """Send bytes on a new connection; the statuses that come back, and whether the server closed it in time.
 
     Args:
-        half_close: say that nothing more will come.
+        half_close: close the sending side afterwards.
     """
     received = b""
     with socket.create_connection(("127.0.0.1", port), PATIENCE) as connection:
@@ -69,7 +69,7 @@ def spoken(port: int, sent: bytes, half_close: bool = True) -> tuple[list[int], 
             if half_close:
                 connection.shutdown(socket.SHUT_WR)
         except OSError:
-            pass  # it hung up before it had heard all
+            pass  # the server closed the connection before it had read everything
         until = time.monotonic() + PATIENCE
         ended = False
         while not ended and time.monotonic() < until:
@@ -85,7 +85,7 @@ def spoken(port: int, sent: bytes, half_close: bool = True) -> tuple[list[int], 
 
 
 def mangled(seed: int, count: int) -> Iterator[bytes]:
-    """Requests that are sound but for some bytes."""
+    """Sound requests with a few bytes changed."""
     chance = random.Random(seed)
     sound = [
         b"GET /livez HTTP/1.1\r\n" + HOST + b"Connection: close\r\n\r\n",
@@ -108,7 +108,7 @@ def mangled(seed: int, count: int) -> Iterator[bytes]:
 
 
 def complaint(port: int, sent: bytes) -> str:
-    """What is wrong with how bytes were taken; nothing if they were answered by less than 500, or hung up on."""
+    """What was wrong with the answer to some bytes; empty if it was below 500 or the connection was closed."""
     statuses, ended = spoken(port, sent)
     if any(status >= 500 for status in statuses):
         return f"answered with {statuses}: {sent[:200]!r}"

@@ -1,4 +1,4 @@
-"""A damaged picture on its way to the service: which operation, in which form, and what may come back."""
+"""Sends a damaged picture to one of the operations, in one of the forms, and judges the answer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 
-from tests.fuzz.mutations import Mutant
+from tests.fuzz.pictures.mutations import Mutant
 
 MAP = "fuzzed"
 TYPES = {"jpeg": "image/jpeg", "png": "image/png", "webp": "image/webp"}
@@ -26,7 +26,7 @@ OVERLOADED = frozenset({503, 507})
 
 @dataclass(frozen=True)
 class Sent:
-    """One picture, where it went and what came back; ``wrong`` says what should not be, or nothing."""
+    """One picture, the operation that it was sent to, and the answer; ``wrong`` is empty or says what is wrong."""
 
     index: int
     operation: str
@@ -42,7 +42,7 @@ class Sender:
 
     Args:
         url: of the service.
-        sound: a picture that is answered with 200, beside which damaged ones go where two or more are asked for.
+        sound: a picture that is answered with 200, sent beside a damaged one where an operation takes several.
     """
 
     def __init__(self, url: str, sound: bytes) -> None:

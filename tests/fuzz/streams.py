@@ -1,4 +1,4 @@
-"""Nonsense over the WebSocket of a session: each message is answered, or the connection is closed for a reason."""
+"""Sends nonsense over the WebSocket of a session: each message is answered, or the connection closed with a reason."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import httpx
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import connect
 
-from tests.fuzz.mutations import mutant
-from tests.fuzz.originals import Original
+from tests.fuzz.pictures.mutations import mutant
+from tests.fuzz.pictures.originals import Original
 
 PATIENCE = 30.0
 VALUES: tuple[object, ...] = (0, -1, 1e308, "x", None, True, [], {}, "2026-11-20T10:00:00Z", 2**63, 0.5)
@@ -20,7 +20,7 @@ TEXTS = ("", "{", "null", "[]", '"x"', "\ud7ff\0", '{"a":' * 3000, "NaN", "{" + 
 
 
 def message(chance: random.Random, seed: int, index: int, originals: Sequence[Original]) -> str | bytes:
-    """Something that could be sent: damaged pictures, parameters that are none, sound ones among them."""
+    """A message at random: a damaged or sound picture, or parameters with wrong names or values."""
     kind = chance.random()
     if kind < 0.4:
         return mutant(seed, index, originals).data

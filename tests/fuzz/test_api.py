@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from service.access.roles import OPERATIONS
 from service.http.openapi import LINKS
 from tests.fuzz import api
@@ -12,11 +14,12 @@ from tests.service.server import Server
 FEW = ("--max-examples", "2", "--generation-deterministic", "--no-shrink")
 
 
-def test_every_operation_keeps_to_its_description(fuzzed: Server) -> None:
-    done = api.run(str(fuzzed.client.base_url), seed=1, phases="examples,fuzzing", more=FEW)
+@pytest.mark.parametrize(("phase", "operations"), [("examples", 35), ("fuzzing", 45)])
+def test_every_operation_keeps_to_its_description(fuzzed: Server, phase: str, operations: int) -> None:
+    done = api.run(str(fuzzed.client.base_url), seed=1, phases=phase, more=FEW)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
     found = re.search(r"Tested: (\d+)", done.stdout)
-    assert found is not None and int(found[1]) > 40, done.stdout[-3000:]
+    assert found is not None and int(found[1]) >= operations, done.stdout[-3000:]
 
 
 def test_links_lead_to_operations() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from tests.fuzz import images, streams
 from tests.fuzz.http import MALFORMED, complaint, mangled, spoken
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.originals import originals
 from tests.fuzz.sending import MAP
 from tests.service.server import Server
 

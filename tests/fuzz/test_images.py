@@ -1,4 +1,4 @@
-"""Damaged pictures: a short run of what scripts/fuzz does for hours."""
+"""Damaged pictures: a short run of what ``scripts/fuzz images`` does for hours."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections import Counter
 import pytest
 
 from core.errors import InvalidImage
-from core.frames.exif import read_whereabouts
+from core.frames.exif import read_pose_and_time
 from core.frames.images import Limits, decode
 from tests.fuzz import images
-from tests.fuzz.mutations import KINDS, mutant
-from tests.fuzz.originals import originals
+from tests.fuzz.pictures.mutations import KINDS, mutant
+from tests.fuzz.pictures.originals import originals
 from tests.service.server import Server
 
 ORIGINALS = originals()
@@ -36,7 +36,7 @@ def test_damaged_pictures_are_decoded_or_refused() -> None:
     for index in range(1500):
         made = mutant(11, index, ORIGINALS)
         kinds.add(made.kind)
-        read_whereabouts(made.data)
+        read_pose_and_time(made.data)
         try:
             decode(made.data, Limits(max_pixels=1_000_000))
             ends["decoded"] += 1

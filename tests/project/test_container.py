@@ -1,4 +1,4 @@
-"""The image and its compose file: what must hold of them without an engine to try it."""
+"""The image and its compose files, checked without a container engine."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def seconds(text: str) -> float:
     return float(text.removesuffix("s"))
 
 
-def test_no_more_is_let_in_from_elsewhere_than_keys_let_in() -> None:
+def test_other_machines_need_a_key() -> None:
     assert service()["environment"]["PLACEREC_ALLOW_ANONYMOUS"] == "true"
     open_to_others = compose_tls()["services"]["placerec"]["environment"]
     assert open_to_others["PLACEREC_ALLOW_ANONYMOUS"] == "false"
@@ -112,7 +112,7 @@ def test_no_more_is_let_in_from_elsewhere_than_keys_let_in() -> None:
         Settings(host="0.0.0.0", allow_anonymous=False).check_exposure(has_keys=False)
 
 
-def test_only_the_proxy_is_believed() -> None:
+def test_only_the_proxy_may_say_where_a_request_comes_from() -> None:
     services = compose_tls()["services"]
     address = services["tls"]["networks"]["front"]["ipv4_address"]
     (network,) = compose_tls()["networks"]["front"]["ipam"]["config"]
@@ -128,7 +128,7 @@ def test_the_proxy_is_confined() -> None:
     assert "no-new-privileges:true" in tls["security_opt"] and "mem_limit" in tls
 
 
-def test_stopping_gets_the_time_that_it_takes() -> None:
+def test_the_grace_period_suffices_to_stop() -> None:
     given = {name.removeprefix("PLACEREC_").lower(): value for name, value in service()["environment"].items()}
     needed = sum(
         float(given.get(name, Settings.model_fields[name].default)) for name in ("drain_seconds", "shutdown_timeout")

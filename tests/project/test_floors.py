@@ -1,4 +1,4 @@
-"""The locked versions against the floors that SECURITY.md names."""
+"""The locked versions are not below the floors in SECURITY.md."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tests.project.test_lock import locked, version
 ROOT = Path(__file__).parents[2]
 FLOORS = dict(re.findall(r"^\| ([a-z0-9-]+) \| ([0-9.]+) \| ", (ROOT / "SECURITY.md").read_text(), re.MULTILINE))
 
-MEETS_STRANGERS = {
+READS_INPUT = {
     *("opencv-python-headless", "starlette", "fastapi", "python-multipart", "uvicorn", "h11", "httptools"),
     *("websockets", "pydantic", "torch", "numpy", "pillow"),
 }
-"""Packages that see bytes from outside: there must be a floor for each."""
+"""Packages that parse bytes from users; each must have a floor."""
 
 
 def versions() -> dict[str, Version]:
@@ -26,8 +26,8 @@ def versions() -> dict[str, Version]:
     return {**found, "torch": Version(torch)}
 
 
-def test_every_package_that_meets_strangers_has_a_floor() -> None:
-    assert set(FLOORS) >= MEETS_STRANGERS
+def test_every_package_that_reads_input_has_a_floor() -> None:
+    assert set(FLOORS) >= READS_INPUT
 
 
 @pytest.mark.parametrize("package", sorted(FLOORS))

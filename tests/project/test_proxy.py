@@ -1,4 +1,4 @@
-"""docker/tls.conf as nginx runs it: keys, a query and a WebSocket through TLS, and what its log does not say."""
+"""docker/tls.conf in a real nginx: keys, a query and a WebSocket through TLS, and what the log leaves out."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Proxied:
 
 
 def certify(folder: Path) -> None:
-    """An authority of our own, and a certificate of it for this machine."""
+    """Make a certificate authority, and a certificate of it for localhost."""
     curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "2"]
     own = ["-subj", "/CN=authority", "-keyout", f"{folder}/authority.key", "-out", f"{folder}/authority.pem"]
     host = ["-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-addext", "basicConstraints=CA:FALSE"]
@@ -115,7 +115,7 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
         assert enrolled.status_code == 201, enrolled.text
         answer = operator.post("/v1/maps/lab/query", content=jpeg(1), headers=kind).json()
         assert answer["matches"][0]["place"]["id"] == "p1"
-        # Longer than nginx would take by itself, as long as the service does; it is the service that refuses.
+        # Longer than nginx accepts by default but not than the service does, so the service refuses it.
         refused = operator.get(f"/v1/maps/lab/places?cursor={'x' * 60_000}")
         assert refused.headers["content-type"] == "application/problem+json"
 
@@ -127,12 +127,12 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
         stream.send(jpeg(1))
         assert json.loads(stream.recv(timeout=30))["single"]["matches"][0]["place"]["id"] == "p1"
 
-    # What a caller says of its own address is not believed; what nginx says of it is.
+    # The address in a client's own header is not believed; the one from nginx is.
     transport = httpx.HTTPTransport(verify=proxied.trust, local_address="127.0.0.9")
     forged = {"Authorization": headers["Authorization"], "X-Forwarded-For": "6.6.6.6"}
-    with httpx.Client(transport=transport, base_url=f"https://localhost:{proxied.port}", headers=forged) as elsewhere:
-        assert elsewhere.delete("/v1/maps/lab/places/p1").status_code == 204
-    until = time.monotonic() + 10  # the line is written when the answer is on its way
+    with httpx.Client(transport=transport, base_url=f"https://localhost:{proxied.port}", headers=forged) as robot:
+        assert robot.delete("/v1/maps/lab/places/p1").status_code == 204
+    until = time.monotonic() + 10  # the line is written after the answer
     while not (trail := proxied.server.lines(logger="placerec.audit", operation="forget_place")):
         assert time.monotonic() < until
         time.sleep(0.02)

@@ -13,10 +13,10 @@ ROOT = Path(__file__).parents[2]
 RUNNABLE = [
     ".ci/run",
     "docker/entrypoint",
-    *(f"scripts/{name}" for name in ("fuzz", "lint", "lock", "openapi", "serve", "soak", "test")),
+    *(f"scripts/{name}" for name in ("fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")),
 ]
 
-# Stands for Python: a venv is a copy of this script, an installation a line in a log; all else is real.
+# Replaces Python: a venv is a copy of this script, an installation a line in a log; everything else is real.
 STUB = """#!/bin/bash
 case "$1 $2" in
     "-m venv") mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python" && echo venv >>"$LOG" ;;
@@ -36,7 +36,7 @@ def test_script_can_be_run(name: str) -> None:
 
 
 class Checkout:
-    """A folder with the real scripts/environment and an interpreter that only notes what it was asked for."""
+    """A folder with the real scripts/environment and an interpreter that only logs what it should install."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.log = folder, folder / "log"
@@ -61,7 +61,7 @@ class Checkout:
         )
 
     def prepare(self, profile: str) -> list[str]:
-        """Run ``environment PROFILE``; what was installed for it, in order."""
+        """Run ``environment PROFILE``; what it installed, in order."""
         self.log.write_text("")
         out, error = self.start(profile).communicate(timeout=30)
         assert out == "ready\n", error
@@ -95,7 +95,7 @@ def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
     assert checkout.log.read_text().split().count("requirements/torch.lock") == 1
 
 
-def test_a_broken_off_installation_is_taken_up_again(checkout: Checkout) -> None:
+def test_an_interrupted_installation_is_repeated(checkout: Checkout) -> None:
     checkout.prepare("service")
     (checkout.folder / "requirements/service.lock").write_text("newer\n")
     full = Path(f"{checkout.log}.full")
@@ -106,7 +106,7 @@ def test_a_broken_off_installation_is_taken_up_again(checkout: Checkout) -> None
     assert checkout.prepare("service")
 
 
-def test_an_old_python_is_refused_in_words(checkout: Checkout) -> None:
+def test_an_old_python_is_refused_with_a_message(checkout: Checkout) -> None:
     run = checkout.start("service", python="/bin/false")
     out, error = run.communicate(timeout=30)
     assert (out, run.returncode) == ("", 1)

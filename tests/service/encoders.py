@@ -10,9 +10,9 @@ from core.judgement.verdict import Calibration
 from core.method.agreement import AgreementDefinition
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue, save_encoder
 from core.method.encoder import Encoder, EncoderDefinition
+from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.projection import Projection, fit_projection
-from core.method.regions import unit_length
 from core.method.vocabulary import train_vocabulary
 from core.networks.backbone import Backbone
 from core.networks.network import load_network

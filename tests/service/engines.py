@@ -12,6 +12,7 @@ import numpy as np
 
 from core.places import PlaceFields, Pose
 from core.storage import Enrolment
+from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.records import Job
 from service.settings import Settings
@@ -21,17 +22,17 @@ ENCODER = "some@" + "0" * 64
 
 
 @contextmanager
-def engine_at(folder: Path) -> Iterator[Engine]:
+def runtime_at(folder: Path) -> Iterator[Runtime]:
     """The real thing, but for its event loop: a merge encodes nothing."""
-    engine = Engine(Settings(data_dir=folder / "data"), Metrics())
-    engine.jobs.start()
+    runtime = Runtime(Settings(data_dir=folder / "data"), Metrics())
+    runtime.jobs.start()
     try:
-        yield engine
+        yield runtime
     finally:
-        engine.jobs.close(10)
-        engine.upkeep.close()
-        engine.inference.close()
-        engine.atlas.close()
+        runtime.jobs.close(10)
+        runtime.statistics.close()
+        runtime.sessions.close()
+        runtime.engine.close()
 
 
 def enrolments(first: int, count: int, name: str, sequence: str) -> list[Enrolment]:
@@ -53,14 +54,14 @@ def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
     rows = np.array([place.row for place in outline], np.int64)
     descriptors = snapshot.descriptors_at(rows)
     return [
-        (map_.place(place.id), place.ordinal, map_.transfer.picture(place.id), descriptor.tobytes())
+        (map_.place(place.id), place.ordinal, map_.picture(place.id), descriptor.tobytes())
         for place, descriptor in zip(outline, descriptors, strict=True)
     ]
 
 
-def end_of(engine: Engine, job: Job) -> Job:
+def end_of(runtime: Runtime, job: Job) -> Job:
     until = time.monotonic() + 30
-    while not (found := engine.jobs.get(job.id)).ended:
+    while not (found := runtime.jobs.get(job.id)).ended:
         assert time.monotonic() < until, found
         time.sleep(0.01)
     return found

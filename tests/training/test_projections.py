@@ -1,4 +1,4 @@
-"""Projections fitted to crops, and the contrast on top of them."""
+"""Projections fitted to crops, and refined by contrastive learning."""
 
 from __future__ import annotations
 
@@ -12,23 +12,19 @@ import torch
 from core.method.agreement import AgreementDefinition
 from core.method.projection import Projection
 from core.networks.network import ShallowNetwork
-from training.contrast import CellDescriptor, Pairs, contrastive_loss, neighbours, refine
-from training.curve import draw
-from training.projection import fit_projections, paired_cells
+from training.loss_curve import draw_loss_curve
+from training.projections import (
+    CellDescriptor,
+    PairedCells,
+    contrastive_loss,
+    fit_projections,
+    neighbours,
+    paired_cells,
+    refine,
+)
 from training.student import student_definition
 
 STAGE = AgreementDefinition(layers=("a",), values=4, weights=(1.0,), reach=(1, 1), candidates=3, share=0.5)
-
-
-@pytest.fixture
-def photographs(tmp_path: Path) -> Path:
-    generator = np.random.default_rng(0)
-    for n in range(30):
-        path = tmp_path / "roads" / f"{n:03}.png"
-        path.parent.mkdir(exist_ok=True)
-        coarse = generator.integers(0, 256, (9, 12, 3), np.uint8)
-        cv2.imwrite(str(path), cv2.resize(coarse, (96, 72), interpolation=cv2.INTER_CUBIC))
-    return tmp_path
 
 
 def network(*layers: str) -> ShallowNetwork:
@@ -40,14 +36,14 @@ def test_projections_are_fitted_layer_by_layer_and_repeatably(photographs: Path)
     made, again = (fit_projections(network("pool2", "conv3"), {"pool2": 5, "conv3": 7}, photographs, 6) for _ in "ab")
     assert {layer: one.matrix.shape for layer, one in made.items()} == {"pool2": (256, 5), "conv3": (384, 7)}
     for layer, one in made.items():
-        np.testing.assert_array_equal(one.matrix, again[layer].matrix)
+        np.testing.assert_allclose(one.matrix, again[layer].matrix, rtol=1e-3, atol=1e-5)
 
 
-def test_the_contrast_finds_the_direction_that_conditions_leave_alone(photographs: Path) -> None:
+def test_refining_finds_the_directions_that_conditions_leave_alone(photographs: Path) -> None:
     generator = np.random.default_rng(3)
     spot = generator.standard_normal((20, 16, 4))
     sides = [np.concatenate([spot, generator.standard_normal((20, 16, 4))], axis=2) + 3 for _ in "ab"]
-    pairs = Pairs({"a": sides[0].astype(np.float32)}, {"a": sides[1].astype(np.float32)}, columns=4)
+    pairs = PairedCells({"a": sides[0].astype(np.float32)}, {"a": sides[1].astype(np.float32)}, columns=4)
     matrix = generator.standard_normal((8, 4)).astype(np.float32)
     start = {"a": Projection(np.full(8, 0.3, np.float32), matrix)}
     refined, losses = refine(start, STAGE, pairs, steps=150)
@@ -59,28 +55,28 @@ def test_the_contrast_finds_the_direction_that_conditions_leave_alone(photograph
     assert share(refined["a"]) > share(start["a"])
 
 
-def test_neighbours_are_no_negatives() -> None:
+def test_neighbouring_cells_are_no_negatives() -> None:
     touching = neighbours(9, 3)
     assert touching[4].sum() == 8
     assert touching[0].sum() == 3
     assert not touching.diagonal().any()
-    clear = torch.nn.functional.normalize(torch.randn(1, 9, 5, generator=torch.Generator().manual_seed(0)), dim=2)
+    clean = torch.nn.functional.normalize(torch.randn(1, 9, 5, generator=torch.Generator().manual_seed(0)), dim=2)
     # In a 3 x 3 frame the middle touches all others: nothing is left to tell it apart from.
-    alone = contrastive_loss(clear, clear, ~torch.eye(9, dtype=torch.bool))
+    alone = contrastive_loss(clean, clean, ~torch.eye(9, dtype=torch.bool))
     assert float(alone) == pytest.approx(0, abs=1e-6)
-    assert float(contrastive_loss(clear, clear, touching)) > 0
+    assert float(contrastive_loss(clean, clean, touching)) > 0
 
 
-def test_cells_for_the_contrast_describe_as_the_second_stage_does(photographs: Path) -> None:
+def test_cells_are_described_as_in_the_second_stage(photographs: Path) -> None:
     pairs = paired_cells(network("conv3"), photographs, crops=3)
-    assert pairs.clear["conv3"].shape == pairs.changed["conv3"].shape == (3, 169, 384)
+    assert pairs.clean["conv3"].shape == pairs.augmented["conv3"].shape == (3, 169, 384)
     assert pairs.columns == 13
     generator = np.random.default_rng(0)
     projection = Projection(
         (generator.random(384) / 384).astype(np.float32), generator.standard_normal((384, 4)).astype(np.float32)
     )
     stage = STAGE.model_copy(update={"layers": ("conv3",)})
-    cells = pairs.clear["conv3"][0].astype(np.float32)
+    cells = pairs.clean["conv3"][0].astype(np.float32)
     with torch.no_grad():
         made = CellDescriptor({"conv3": projection}, stage)([torch.from_numpy(cells)]).numpy()
     np.testing.assert_allclose(made, projection(cells, 4), atol=1e-3)
@@ -89,9 +85,9 @@ def test_cells_for_the_contrast_describe_as_the_second_stage_does(photographs: P
 def test_the_curve_is_drawn_from_the_log(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("crops,rate,loss,held_out_loss,seconds\n16000,0.1,1.2,1.1,9\n32000,0.1,1.1,1.0,18\n")
-    draw(log, tmp_path / "curve.png")
+    draw_loss_curve(log, tmp_path / "curve.png")
     drawn = cv2.imread(str(tmp_path / "curve.png"))
     assert drawn is not None and drawn.std() > 5
     log.write_text("crops,rate,loss,held_out_loss,seconds\n")
     with pytest.raises(ValueError, match="no row"):
-        draw(log, tmp_path / "curve.png")
+        draw_loss_curve(log, tmp_path / "curve.png")

@@ -1,1 +1,1 @@
-"""What systems are evaluated on: data sets, pairs of traverses and their truth, disturbances."""
+"""The data of an evaluation: data sets, pairs of traverses and their truth, disturbances."""

@@ -20,7 +20,7 @@ from core.frames.traverses import Truth, find_images, read_ground_truth, toleran
 TRUTH_FILE = "ground_truth.csv"
 
 Rule = Callable[[Sequence[Path], Sequence[Path]], Truth]
-"""Truth from the pictures of queries and references, in that order."""
+"""Truth from the images of queries and references, in that order."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Dataset:
 
     references, queries: names that the folder of a traverse goes by; the first that is there is taken.
     rule: what is true where no ``ground_truth.csv`` lies beside the traverses; None where one must.
-    truth: the rule in words.
+    truth: the rule, in words.
     sizes: those of the thesis; None where it has none.
     """
 

@@ -1,6 +1,6 @@
-"""Ways to make a picture harder to recognize, in steps: the camera stands aside, it is dark, a truck is in the way.
+"""Disturbances that make a frame harder to recognize, in steps: the camera moved, it is dark, a truck is in the way.
 
-Each takes a picture (H x W x 3 uint8 BGR), a level and a generator, and returns a picture of the same
+Each takes a frame (H x W x 3 uint8 BGR), a level and a generator, and returns a frame of the same
 size; level 0 of each changes nothing.  One generator seed gives one disturbance: noise at a higher
 level is the same noise, stronger.
 """
@@ -18,7 +18,7 @@ from core.frames.preprocessing import Pixels
 Apply = Callable[[Pixels, float, np.random.Generator], Pixels]
 
 GREY = 128
-"""What an occluding box is filled with."""
+"""Grey value of an occluding box."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class Disturbance:
     apply: Apply
 
     def changed(self, pixels: Pixels, level: float, seed: int, number: int) -> Pixels:
-        """The picture at a level.
+        """The frame at a level.
 
         Args:
             seed: of the run.
-            number: of the picture in its traverse; each has its own noise and its own box.
+            number: of the frame in its traverse; each has its own noise and its own box.
         """
         if level == self.levels[0]:
             return pixels
@@ -55,7 +55,7 @@ def lateral_shift(pixels: Pixels, level: float, _: np.random.Generator) -> Pixel
 
 
 def scale(pixels: Pixels, level: float, _: np.random.Generator) -> Pixels:
-    """The scene comes nearer: the middle of the picture, ``level`` times enlarged."""
+    """The scene comes nearer: the middle of the frame, ``level`` times enlarged."""
     height, width = pixels.shape[:2]
     move = np.array([[level, 0, (1 - level) * (width - 1) / 2], [0, level, (1 - level) * (height - 1) / 2]], np.float32)
     return np.asarray(cv2.warpAffine(pixels, move, (width, height), flags=cv2.INTER_LINEAR), np.uint8)
@@ -78,7 +78,7 @@ def blur(pixels: Pixels, level: float, _: np.random.Generator) -> Pixels:
 
 
 def occlusion(pixels: Pixels, level: float, generator: np.random.Generator) -> Pixels:
-    """A grey box of the picture's shape covers ``level`` percent of its area, somewhere."""
+    """A grey box of the frame's shape covers ``level`` percent of its area, somewhere."""
     height, width = pixels.shape[:2]
     side = np.sqrt(level / 100)
     tall, wide = round(height * side), round(width * side)

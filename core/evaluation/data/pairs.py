@@ -1,4 +1,4 @@
-"""Two traverses of the same places, and what is true of them: what systems are compared on."""
+"""Two traverses of the same places and their ground truth."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from core.frames.traverses import Truth
 
 @dataclass(frozen=True)
 class TraversePair:
-    """A known traverse and one to recognize.
+    """A known traverse and a traverse to recognize.
 
     name: of the data set.
     references, queries: the full traverses, in order.
     truth: of each query, indices into ``references``, kept or not.
     kept: int64 [R'], ascending, indices of the references to match against.
-    notes: sentences about the data that a reader of its figures must know.
+    notes: sentences about the data that a reader of the figures must know.
     """
 
     name: str
@@ -32,7 +32,7 @@ class TraversePair:
 
     @property
     def kept_references(self) -> list[Path]:
-        """The pictures to match against."""
+        """The images to match against."""
         return [self.references[index] for index in self.kept]
 
     def negatives(self) -> int:
@@ -41,7 +41,7 @@ class TraversePair:
 
 
 def all_references(references: list[Path]) -> NDArray[np.int64]:
-    """What is kept where no reference is left out; int64 [R]."""
+    """The indices of all references, int64 [R]."""
     return np.arange(len(references), dtype=np.int64)
 
 

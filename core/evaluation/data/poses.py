@@ -1,4 +1,4 @@
-"""What is true by where the frames were taken: their poses, and a distance in metres and degrees."""
+"""Ground truth by poses: which references were taken within a distance of a query, in metres and degrees."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from core.places import Pose
 FILE_NAME = "places.csv"
 COLUMNS = ("x", "y", "z", "heading", "latitude", "longitude")
 UTM_FIELDS = 15
-"""Pieces between the @ of a file name that tells its position, as the collections of street views write it:
+"""Number of fields between the @ of a file name that holds its position, as street view collections write it:
 easting, northing, zone number and letter, latitude, longitude, ids, heading, pitch, …"""
 
 
@@ -46,7 +46,7 @@ def read_poses(images: Sequence[Path]) -> list[Pose]:
 
 
 def within_truth(queries: Sequence[Pose], references: Sequence[Pose], metres: float, degrees: float | None) -> Truth:
-    """Query i shows what the references within ``metres`` show, those that look elsewhere left out.
+    """Query i shows what the references within ``metres`` show, without those that face another way.
 
     Args:
         degrees: how far two headings may differ; None takes every heading.
@@ -140,9 +140,9 @@ def _named(path: Path) -> Pose | None:
 
 
 def _embedded(path: Path) -> Pose | None:
-    from core.frames.exif import read_whereabouts
+    from core.frames.exif import read_pose_and_time
 
     try:
-        return read_whereabouts(path.read_bytes())[0]
+        return read_pose_and_time(path.read_bytes())[0]
     except OSError as error:
         raise InvalidGroundTruth(f"{path} cannot be read: {error.strerror}.") from error

@@ -1,4 +1,4 @@
-"""What an evaluation finds out, and hands to whoever shows it: the command line, the report."""
+"""The results of an evaluation, as the command line and the report show them."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from core.evaluation.protocol.outcomes import Outcome
 from core.frames.traverses import Truth
 
 if TYPE_CHECKING:
+    from core.baselines.encoders import Box
     from core.baselines.system import About
-
-Box = tuple[float, float, float, float]
-"""A region of a picture: left, top, right, bottom, as fractions of its width and height."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,8 @@ class Comparison:
     kept: int64 [R'], ascending, indices of the references that were matched against.
     truth: of each query, indices into ``references``, kept or not.
     runs: best AUC-PR first.
-    regions: the regions of interest of a picture, of the best run whose system has some; None without one.
-    regions_of: identity of that run; its matches alone are shown with regions.
+    regions: gives the regions of interest of an image, by the best run whose system has some; None without one.
+    regions_of: identity of that run; only its matches are shown with regions.
     notes: sentences about the data that a reader must know, such as how references were chosen.
     """
 

@@ -10,12 +10,19 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, Field
 
-from core.evaluation.protocol.outcomes import Outcome, answerable
+from core.evaluation.protocol.outcomes import (
+    Outcome,
+    answerable,
+    best_matched,
+    best_scores,
+    has_true_reference,
+)
 from core.evaluation.protocol.thresholds import Thresholding, best_wrong_score, thresholdings
 from core.evaluation.protocol.trust import Trust
+from core.judgement.curves import auc_pr, auc_roc
 
 STAGES = ("forward", "regions", "vlad", "match")
 DEPTHS = (1, 5, 10)
@@ -31,13 +38,15 @@ NO_POSITIVES = "no query has a kept true reference."
 class Evaluation(BaseModel):
     """The figures of one encoder on one pair of traverses.
 
-    Null is what the data cannot tell: AUC-ROC without negatives or without positives, recall
+    A figure is null where it is not defined: AUC-ROC without negatives or without positives, recall
     without a query that has a true reference, the time of a stage that the encoder lacks.
     """
 
     encoder: str
     auc_pr: float
-    one_class: OneClass | None = Field(description="In words, where AUC-PR tells nothing: one class of matches only.")
+    one_class: OneClass | None = Field(
+        description="Set where AUC-PR is meaningless because all matches are of one class."
+    )
     auc_roc: float | None
     recall_at: dict[str, float | None]
     recall_at_full_precision: float | None
@@ -50,7 +59,7 @@ class Evaluation(BaseModel):
     bytes_per_place: int | None = None
     milliseconds: dict[str, float | None] = Field(description="Medians per query.")
     describe_milliseconds: float | None = Field(
-        default=None, description="Median per query, all stages before matching, without decoding the picture."
+        default=None, description="Median per query, all stages before matching, without decoding the image."
     )
     trained_on: str | None = None
     ece: float | None = Field(default=None, description="Expected calibration error of the probabilities in `trust`.")
@@ -59,57 +68,20 @@ class Evaluation(BaseModel):
         default=None, description="That of always stating the share of right ones."
     )
     trust: Trust | None = Field(default=None, description="Whether the system knows when it is right.")
-    notes: dict[str, str] = Field(description="Why a figure cannot be told, by its name.")
-
-
-def auc_pr(scores: ArrayLike, matched: ArrayLike) -> float:
-    """Area under the precision-recall curve of the best matches, by the trapezoid rule.
-
-    Recall is over right matches only.  The curve starts at recall 0 with precision 1 and has one
-    point for each different score: what scores alike is accepted together.  This is
-    ``sklearn.metrics.auc`` of ``precision_recall_curve``, as the thesis's authors compute it, and
-    not average precision.  Without a right match the area is 0, where that curve is undefined.
-
-    Args:
-        scores: [Q], of each query's best match.
-        matched: bool [Q], whether it is right.
-    """
-    from sklearn.metrics import auc, precision_recall_curve  # takes a second; only evaluation needs it
-
-    if not np.any(matched):
-        return 0.0
-    precision, recall, _ = precision_recall_curve(matched, scores)
-    return float(auc(recall, precision))
+    notes: dict[str, str] = Field(description="By the name of a figure, why it is null or meaningless.")
 
 
 def one_class(matched: ArrayLike) -> OneClass | None:
-    """The word for matches that are all right, or all wrong: their AUC-PR tells nothing."""
+    """Which class matches have if they have only one, so that AUC-PR is meaningless; else None."""
     if np.all(matched):
         return "all right"
     return None if np.any(matched) else "none right"
 
 
-def auc_roc(scores: ArrayLike, positive: ArrayLike) -> float | None:
-    """The chance that a query with a true reference outscores one without; equal scores count half.
-
-    Args:
-        scores: [Q], of each query's best match, right or not.
-        positive: bool [Q], whether the query has a kept true reference.
-
-    Returns:
-        None where all queries are positive, or none is.
-    """
-    from sklearn.metrics import roc_auc_score
-
-    if np.all(positive) or not np.any(positive):
-        return None
-    return float(roc_auc_score(positive, scores))
-
-
-def recall_at(outcomes: Sequence[Outcome], depth: int) -> float | None:
-    """Share of the queries with a true reference that have one among their ``depth`` best matches."""
+def recall_at_k(outcomes: Sequence[Outcome], k: int) -> float | None:
+    """Share of the queries with a true reference that have one among their ``k`` best matches."""
     ranks = [outcome.rank for outcome in outcomes if outcome.rank is not None]
-    return sum(rank <= depth for rank in ranks) / len(ranks) if ranks else None
+    return sum(rank <= k for rank in ranks) / len(ranks) if ranks else None
 
 
 def recall_at_full_precision(outcomes: Sequence[Outcome]) -> float | None:
@@ -152,20 +124,18 @@ def summarize(
     trained_on: str | None = None,
 ) -> Evaluation:
     """All figures of a run over ``references`` kept references; stages without a time are added as None."""
-    scores = [outcome.score for outcome in outcomes]
-    matched = [outcome.matched for outcome in outcomes]
-    positive = [outcome.rank is not None for outcome in outcomes]
+    scores, matched, positive = best_scores(outcomes), best_matched(outcomes), has_true_reference(outcomes)
     return Evaluation(
         encoder=encoder,
         auc_pr=auc_pr(scores, matched),
         one_class=one_class(matched),
         auc_roc=auc_roc(scores, positive),
-        recall_at={str(depth): recall_at(outcomes, depth) for depth in DEPTHS},
+        recall_at={str(depth): recall_at_k(outcomes, depth) for depth in DEPTHS},
         recall_at_full_precision=recall_at_full_precision(outcomes),
         extended_precision=extended_precision(outcomes),
-        right=sum(matched),
+        right=int(matched.sum()),
         queries=len(outcomes),
-        negatives=positive.count(False),
+        negatives=int((~positive).sum()),
         references=references,
         thresholds=thresholdings(outcomes),
         bytes_per_place=bytes_per_place,
@@ -176,13 +146,13 @@ def summarize(
     )
 
 
-def _notes(one: OneClass | None, positive: Sequence[bool]) -> dict[str, str]:
+def _notes(one: OneClass | None, positive: NDArray[np.bool_]) -> dict[str, str]:
     notes = {}
     if one is not None:
         notes["auc_pr"] = ALL_RIGHT if one == "all right" else NONE_RIGHT
-    if not any(positive):
+    if not positive.any():
         unknown = ("auc_roc", "recall_at", "recall_at_full_precision", "extended_precision")
         notes.update(dict.fromkeys(unknown, NO_POSITIVES))
-    elif all(positive):
+    elif positive.all():
         notes["auc_roc"] = NO_NEGATIVES
     return notes

@@ -1,4 +1,4 @@
-"""What became of each query: its best match, whether that is right, where the first right one stands."""
+"""The outcome of each query: its best match, whether that is right, and the rank of the first right one."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from core.frames.traverses import Truth
 
 Scores = NDArray[np.floating[Any]]
-"""float32 as systems give them, or float64 as others have saved them."""
+"""float32 from systems, or float64 from saved files."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one query.
+    """The outcome of one query.
 
     retrieved: index of its best match, in the full list of references.
-    rank: place of its best true reference in the ranking, from 1; None for a true negative.
+    rank: rank of its best true reference, from 1; None for a true negative.
     """
 
     retrieved: int
@@ -61,6 +61,21 @@ def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth) -> list[Outcome
         truth: of each query.
     """
     return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
+
+
+def best_scores(outcomes: Sequence[Outcome]) -> NDArray[np.float64]:
+    """The score of each query's best match, float64 [Q]."""
+    return np.array([outcome.score for outcome in outcomes], np.float64)
+
+
+def best_matched(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
+    """Whether each query's best match is right, bool [Q]."""
+    return np.array([outcome.matched for outcome in outcomes], np.bool_)
+
+
+def has_true_reference(outcomes: Sequence[Outcome]) -> NDArray[np.bool_]:
+    """Whether each query has a kept true reference, bool [Q]; the others are true negatives."""
+    return np.array([outcome.rank is not None for outcome in outcomes], np.bool_)
 
 
 def answerable(outcomes: Sequence[Outcome]) -> list[Outcome]:

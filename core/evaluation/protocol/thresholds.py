@@ -1,4 +1,4 @@
-"""Rejecting matches that score too low: what a threshold does to right and wrong answers (thesis, 3.4.3)."""
+"""Thresholds that reject matches of low score, and the counts of right and wrong answers (thesis, 3.4.3)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Rule = Literal["mean_of_negatives", "full_precision"]
 
 
 class Counts(BaseModel):
-    """Queries by what became of them."""
+    """Numbers of queries by outcome."""
 
     true_positives: int = Field(description="Accepted, and the match is right.")
     false_positives: int = Field(description="Accepted, and the match is wrong.")
@@ -23,10 +23,10 @@ class Counts(BaseModel):
 
 
 class Thresholding(BaseModel):
-    """What one threshold does; a match is accepted when it scores above it.
+    """The effect of one threshold; a match is accepted when it scores above it.
 
     ``before`` is the left column of the thesis's Fig. 3.17: no match is rejected yet, and the queries
-    without a true reference stand apart as the true negatives that a perfect threshold would make.
+    without a true reference are counted as the true negatives that a perfect threshold would make.
     """
 
     rule: Rule
@@ -62,7 +62,7 @@ def count_after(outcomes: Sequence[Outcome], threshold: float) -> Counts:
 def mean_of_negatives(outcomes: Sequence[Outcome]) -> float | None:
     """The thesis's threshold: the mean score of the known true negatives; None without any.
 
-    The thesis averages over several data sets, this is the mean of the one at hand.
+    The thesis averages over several data sets; this is the mean of one.
     """
     scores = [outcome.score for outcome in outcomes if outcome.rank is None]
     return float(np.mean(scores)) if scores else None
@@ -74,7 +74,7 @@ def best_wrong_score(outcomes: Sequence[Outcome]) -> float | None:
 
 
 def thresholdings(outcomes: Sequence[Outcome]) -> list[Thresholding]:
-    """What the thresholds that these outcomes define would do to them."""
+    """The effects of the two thresholds that these outcomes define."""
     chosen: list[tuple[Rule, float | None]] = [
         ("mean_of_negatives", mean_of_negatives(outcomes)),
         ("full_precision", best_wrong_score(outcomes)),

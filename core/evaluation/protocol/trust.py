@@ -1,8 +1,8 @@
-"""Whether a system knows when it is right: probabilities of its best matches, and what became of them.
+"""Whether a system knows when it is right: the probabilities of its best matches against their outcomes.
 
 The decision value of a query is that of the verdicts (``core.judgement.verdict``): √(best score · lead over the best
-other places), or the best score alone where scores fall below zero.  A curve makes it a probability; it is fitted on
-other blocks of queries than those that it is asked of.
+other places), or the best score alone where scores fall below zero.  A curve turns it into a probability; each
+block of queries is judged by a curve that was fitted on the other blocks.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from core.evaluation.protocol.outcomes import Outcome
-from core.judgement.map_calibration import FEWEST_OUTCOMES, blocks_of
+from core.judgement.calibration import FEWEST_OUTCOMES, blocks_of
+from core.judgement.curves import auc_roc
 from core.judgement.probability import fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
-from core.judgement.trials import area_under_roc
 from core.judgement.verdict import TOP_PLACES
 
 SAME_PLACE = 3
-"""References so many frames from the best match are no rivals of it, as maps have it by default."""
+"""References at most so many frames from the best match are no rivals of it; the default of maps."""
 
 BELIEVED = 0.95
 """Probability from which on an answer counts as believed."""
@@ -32,7 +32,7 @@ NO_ORDER = "right matches do not have higher scores than wrong ones in every par
 
 
 class Trust(BaseModel):
-    """Probabilities of the best matches, cross-validated over blocks of queries, and what they are worth."""
+    """Figures of the probabilities of the best matches, cross-validated over blocks of queries."""
 
     auc_roc_right: float = Field(description="The chance that a right best match has a higher decision value.")
     reliability: Reliability
@@ -81,7 +81,7 @@ def trust(
     believed = probabilities >= BELIEVED
     hits, known = int((believed & right).sum()), sum(outcome.rank is not None for outcome in outcomes)
     return Trust(
-        auc_roc_right=area_under_roc(values, right) or 0.0,
+        auc_roc_right=auc_roc(values, right) or 0.0,
         reliability=reliability(probabilities, right),
         believed_precision=wilson(hits, int(believed.sum())),
         believed_recall=wilson(hits, known),

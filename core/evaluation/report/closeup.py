@@ -10,10 +10,10 @@ from core.evaluation.report.drawing import Plot
 from core.evaluation.report.fates import plot_fates
 from core.evaluation.report.gallery import gallery
 from core.evaluation.report.matrix import Layers, describe_matrix, heat_file, layers, matrix_file, png, true_cells
-from core.evaluation.report.pictures import Pictures, data_uri
 from core.evaluation.report.table import swatch
 from core.evaluation.report.text import counted, escape, number
 from core.evaluation.report.theme import Mark
+from core.evaluation.report.thumbnails import Thumbnails, data_uri
 
 if TYPE_CHECKING:
     from core.evaluation.protocol.comparison import Comparison, Run
@@ -33,7 +33,7 @@ class Closeup:
     files: dict[str, bytes]
 
 
-def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, pictures: Pictures) -> Closeup:
+def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, thumbnails: Thumbnails) -> Closeup:
     """Everything about one run.
 
     Args:
@@ -53,7 +53,7 @@ def closeup(comparison: Comparison, run: Run, mark: Mark, stem: str, pictures: P
     cases = gallery(
         comparison,
         run,
-        pictures,
+        thumbnails,
         comparison.regions if own else None,
         most=min(12, max(4, 36 // len(comparison.runs) * 2)),
     )
@@ -99,7 +99,7 @@ def _constant(value: object) -> str:
 
 
 def _matrix(drawn: Layers, alt: str, run: Run) -> str:
-    """Three pictures one over the other; the switches hide the upper two, without a script."""
+    """Three drawings one over the other; the switches hide the upper two, without a script."""
     height, width = drawn.heat.shape
     layered = [
         f'<img src="{data_uri(*heat_file(drawn))}" alt="{escape(alt)}" width="{width}" height="{height}">',

@@ -6,42 +6,18 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from core.evaluation.protocol.figures import recall_at_k
+from core.evaluation.protocol.outcomes import answerable, best_matched, best_scores, has_true_reference
 from core.evaluation.report.drawing import EndLabel, Margins, Plot, Sheet, label_ends, render, shares
 from core.evaluation.report.text import enumerate_words, number
 from core.evaluation.report.theme import Cast, Mark, Theme
+from core.judgement.curves import Curve, pr_curve, roc_curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from core.evaluation import Outcome
     from core.evaluation.protocol.comparison import Run
-
-Curve = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""x and y of a curve's points, each float64 [P], by rising x."""
-
-
-def pr_curve(outcomes: Sequence[Outcome]) -> Curve | None:
-    """Recall and precision, as ``core.evaluation.auc_pr`` sums them up; None without a right match."""
-    from sklearn.metrics import precision_recall_curve
-
-    matched = [outcome.matched for outcome in outcomes]
-    if not any(matched):
-        return None
-    precision, recall, _ = precision_recall_curve(matched, [outcome.score for outcome in outcomes])
-    return recall[::-1], precision[::-1]
-
-
-def roc_curve(outcomes: Sequence[Outcome]) -> Curve | None:
-    """False and true positive rate, as ``core.evaluation.auc_roc`` sums them up; None unless there are both kinds."""
-    from sklearn.metrics import roc_curve as curve
-
-    positive = [outcome.rank is not None for outcome in outcomes]
-    if all(positive) or not any(positive):
-        return None
-    false, true, _ = curve(positive, [outcome.score for outcome in outcomes])
-    return false, true
 
 
 def plot_pr(runs: Sequence[Run], cast: Cast) -> Plot | None:
@@ -49,7 +25,7 @@ def plot_pr(runs: Sequence[Run], cast: Cast) -> Plot | None:
     drawn = [
         (mark, curve, run.evaluation.auc_pr)
         for run, mark in zip(runs, cast.runs, strict=True)
-        if (curve := pr_curve(run.outcomes)) is not None
+        if (curve := pr_curve(best_scores(run.outcomes), best_matched(run.outcomes))) is not None
     ]
     if not drawn:
         return None
@@ -71,7 +47,7 @@ def plot_roc(runs: Sequence[Run], cast: Cast) -> Plot | None:
     drawn = [
         (mark, curve, run.evaluation.auc_roc)
         for run, mark in zip(runs, cast.runs, strict=True)
-        if (curve := roc_curve(run.outcomes)) is not None
+        if (curve := roc_curve(best_scores(run.outcomes), has_true_reference(run.outcomes))) is not None
     ]
     if not drawn:
         return None
@@ -91,21 +67,13 @@ def plot_roc(runs: Sequence[Run], cast: Cast) -> Plot | None:
     return render("roc", f"ROC curves. Area under each: {enumerate_words(areas)}.", sheet, paint)
 
 
-def recall_curve(outcomes: Sequence[Outcome], depths: int) -> NDArray[np.float64] | None:
-    """Recall@1 to recall@``depths``, float64 [depths]; None without a query that has a true reference."""
-    ranks = np.array([outcome.rank for outcome in outcomes if outcome.rank is not None])
-    if len(ranks) == 0:
-        return None
-    return np.mean(ranks[:, None] <= np.arange(1, depths + 1), axis=0)
-
-
 def plot_recall(runs: Sequence[Run], cast: Cast) -> Plot | None:
     """Recall over how many best matches are looked at; None unless there is a choice of two."""
     depths = min(25, runs[0].scores.shape[1])
     drawn = [
-        (mark, curve)
+        (mark, np.array([recall_at_k(run.outcomes, k) for k in range(1, depths + 1)], np.float64))
         for run, mark in zip(runs, cast.runs, strict=True)
-        if (curve := recall_curve(run.outcomes, depths)) is not None
+        if answerable(run.outcomes)
     ]
     if not drawn or depths < 2:
         return None

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image  # Matplotlib brings it, and writes its own pictures with it
+from PIL import Image  # Matplotlib brings it, and writes its own images with it
 
 from core.evaluation.report.theme import DARK, LIGHT, Mark, Theme, rgb, short
 

@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.evaluation.report.pictures import Pictures, show
 from core.evaluation.report.text import escape, number
+from core.evaluation.report.thumbnails import Thumbnails, show
 
 if TYPE_CHECKING:
+    from core.baselines.encoders import Box
     from core.evaluation import Outcome
-    from core.evaluation.protocol.comparison import Box, Comparison, Run
+    from core.evaluation.protocol.comparison import Comparison, Run
 
 Regions = Callable[[Path], "Sequence[Box] | None"]
 
 MOST_BOXES = 24
-"""Regions drawn on a picture: more would hide it."""
+"""Regions drawn on an image: more would hide it."""
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,16 @@ def case(comparison: Comparison, run: Run, query: int) -> Case:
     return Case(query, outcome, shown, float(run.scores[query, column]) if is_kept else None)
 
 
-def gallery(comparison: Comparison, run: Run, pictures: Pictures, regions: Regions | None, most: int) -> str:
-    """Up to ``most`` wrong matches and half as many right ones, as HTML; fewer when ``pictures`` is full."""
+def gallery(comparison: Comparison, run: Run, thumbnails: Thumbnails, regions: Regions | None, most: int) -> str:
+    """Up to ``most`` wrong matches and half as many right ones, as HTML; fewer when ``thumbnails`` is full."""
     chosen = wrong_first(run.outcomes, most, max(1, most // 2))
     total = len(run.outcomes)
     hits = sum(outcome.matched for outcome in run.outcomes)
     parts: dict[bool, list[str]] = {False: [], True: []}
     for query in chosen:
-        if not pictures.full:
+        if not thumbnails.full:
             found = case(comparison, run, query)
-            parts[found.outcome.matched].append(_article(comparison, found, pictures, regions))
+            parts[found.outcome.matched].append(_article(comparison, found, thumbnails, regions))
     drawn = any('class="regions"' in part for part in parts[False] + parts[True])
     return "".join(
         [
@@ -105,20 +106,20 @@ def _group(title: str, order: str, kind: str, articles: Sequence[str], total: in
     )
 
 
-def _article(comparison: Comparison, found: Case, pictures: Pictures, regions: Regions | None) -> str:
-    """Three pictures and what they are."""
+def _article(comparison: Comparison, found: Case, thumbnails: Thumbnails, regions: Regions | None) -> str:
+    """Three images and what they are."""
     outcome = found.outcome
     verdict = "right" if outcome.matched else "wrong"
     references, score = comparison.references, f"score {number(outcome.score)}"
     word = f'<span class="verdict">{verdict}</span>'
     panels = [
-        _panel(Panel("Query", found.query), comparison.queries, pictures, regions),
-        _panel(Panel("Best match", outcome.retrieved, score, word, "found"), references, pictures, regions),
+        _panel(Panel("Query", found.query), comparison.queries, thumbnails, regions),
+        _panel(Panel("Best match", outcome.retrieved, score, word, "found"), references, thumbnails, regions),
     ]
     if found.truth is None:
         panels.append('<figure><div class="absent">none</div><figcaption><b>True reference</b></figcaption></figure>')
     else:
-        panels.append(_panel(Panel("Truth", found.truth, _standing(found)), references, pictures, regions))
+        panels.append(_panel(Panel("Truth", found.truth, _standing(found)), references, thumbnails, regions))
     return f'<article class="case {verdict}">{"".join(panels)}</article>'
 
 
@@ -133,7 +134,7 @@ def _standing(found: Case) -> str:
 
 @dataclass(frozen=True)
 class Panel:
-    """One of the three pictures of a case: what it is, its number, what is said of it."""
+    """One of the three images of a case: what it is, its number, what is said of it."""
 
     what: str
     index: int
@@ -142,15 +143,15 @@ class Panel:
     style: str = ""
 
 
-def _panel(panel: Panel, paths: Sequence[Path], pictures: Pictures, regions: Regions | None) -> str:
-    """One picture and its caption; where there is no picture, the caption alone."""
+def _panel(panel: Panel, paths: Sequence[Path], thumbnails: Thumbnails, regions: Regions | None) -> str:
+    """One image and its caption; where there is no image, the caption alone."""
     path = paths[panel.index] if panel.index < len(paths) else None
-    thumbnail = None if path is None else pictures.add(path)
+    thumbnail = None if path is None else thumbnails.add(path)
     if path is None or thumbnail is None:
-        shown = '<div class="absent">no picture</div>'
+        shown = '<div class="absent">no image</div>'
     else:
         boxes = list(dict.fromkeys((regions(path) or ()) if regions else ()))[:MOST_BOXES]
-        shown = show(thumbnail, f"{panel.what}: picture {panel.index}, {path.name}", boxes)
+        shown = show(thumbnail, f"{panel.what}: image {panel.index}, {path.name}", boxes)
     remark = f'<span class="score">{escape(panel.remark)}</span>' if panel.remark else ""
     name = "" if path is None else f'<span class="file">{escape(path.name)}</span>'
     return (

@@ -1,4 +1,4 @@
-"""The similarity of every query to every reference as a picture, and what is true over it."""
+"""The similarity of every query to every reference as a drawing, and what is true over it."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
     from core.evaluation import Outcome
 
-Picture = NDArray[np.uint8]
+Drawing = NDArray[np.uint8]
 TRUTH, RIGHT, WRONG = "#F5C400", "#35B6FF", "#FF6A3D"
 """On greys: outline of the true references; the best matches that are right, and wrong."""
 
 
 @dataclass(frozen=True)
 class Layers:
-    """One picture of a matrix: rows are queries from the top, columns kept references from the left.
+    """One drawing of a matrix: rows are queries from the top, columns kept references from the left.
 
     heat: uint8 [H, W], the brighter the more alike.
     truth: uint8 [H, W, 4] RGBA, the outline of the true references, transparent elsewhere.
@@ -35,9 +35,9 @@ class Layers:
     shrunk: a pixel is less than a cell.
     """
 
-    heat: Picture
-    truth: Picture
-    matches: Picture
+    heat: Drawing
+    truth: Drawing
+    matches: Drawing
     shrunk: bool
 
 
@@ -53,14 +53,14 @@ def layers(
     outcomes: Sequence[Outcome],
     longest: int = 640,
 ) -> Layers:
-    """The picture of a similarity matrix; a large one is shrunk, a small one has several pixels a cell.
+    """The drawing of a similarity matrix; a large one is shrunk, a small one has several pixels a cell.
 
     Args:
         scores: float32 [Q, R'].
         true: bool [Q, R'].
         kept: int64 [R'], index of each column in the full list of references, ascending.
         outcomes: Q of them.
-        longest: pixels of the picture's longer side, at most.
+        longest: pixels of the drawing's longer side, at most.
     """
     height, width = scores.shape
     factor = longest / max(height, width)
@@ -69,7 +69,7 @@ def layers(
     return Layers(_heat(scores, size), _outline(true, size), _matches(kept, outcomes, size, factor), shrunk=factor < 1)
 
 
-def _heat(scores: NDArray[np.float32], size: tuple[int, int]) -> Picture:
+def _heat(scores: NDArray[np.float32], size: tuple[int, int]) -> Drawing:
     """Greys from the 1st to the 99.8th percentile, so that one odd score does not take all the contrast."""
     shrinks = size[0] < scores.shape[1]
     values = cv2.resize(scores, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_NEAREST)
@@ -78,7 +78,7 @@ def _heat(scores: NDArray[np.float32], size: tuple[int, int]) -> Picture:
     return np.asarray(np.clip((values - low) / span, 0, 1) * 255, np.uint8)
 
 
-def _outline(true: NDArray[np.bool_], size: tuple[int, int]) -> Picture:
+def _outline(true: NDArray[np.bool_], size: tuple[int, int]) -> Drawing:
     """The edge, one or two pixels wide, of the cells that are true; no true cell is lost in shrinking."""
     width, height = size
     mask = np.zeros((height, width), np.uint8)
@@ -93,7 +93,7 @@ def _outline(true: NDArray[np.bool_], size: tuple[int, int]) -> Picture:
     return drawn
 
 
-def _matches(kept: NDArray[np.int64], outcomes: Sequence[Outcome], size: tuple[int, int], factor: float) -> Picture:
+def _matches(kept: NDArray[np.int64], outcomes: Sequence[Outcome], size: tuple[int, int], factor: float) -> Drawing:
     """A square for each best match, within its cell where that is large enough; the wrong ones over the right ones."""
     drawn = np.zeros((size[1], size[0], 4), np.uint8)
     for wanted, color in ((True, RIGHT), (False, WRONG)):
@@ -113,11 +113,11 @@ def _cell(place: int, factor: float) -> slice:
     return slice(max(0, middle - 1), middle + 2)
 
 
-def png(picture: Picture) -> bytes:
-    """A grey or RGBA picture as a PNG file."""
-    shown = cv2.cvtColor(picture, cv2.COLOR_RGBA2BGRA) if picture.ndim == 3 else picture
+def png(drawing: Drawing) -> bytes:
+    """A grey or RGBA drawing as a PNG file."""
+    shown = cv2.cvtColor(drawing, cv2.COLOR_RGBA2BGRA) if drawing.ndim == 3 else drawing
     done, encoded = cv2.imencode(".png", shown, [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    assert done, "any uint8 picture can be written as PNG"
+    assert done, "any uint8 drawing can be written as PNG"
     return encoded.tobytes()
 
 
@@ -126,12 +126,12 @@ def heat_file(drawn: Layers) -> tuple[bytes, str]:
     if not drawn.shrunk:
         return png(drawn.heat), "image/png"
     done, encoded = cv2.imencode(".jpg", drawn.heat, [cv2.IMWRITE_JPEG_QUALITY, 82])
-    assert done, "any uint8 picture of this size can be written as JPEG"
+    assert done, "any uint8 drawing of this size can be written as JPEG"
     return encoded.tobytes(), "image/jpeg"
 
 
 def describe_matrix(system: str, shape: tuple[int, int]) -> str:
-    """What the picture shows, for who cannot see it."""
+    """What the drawing shows, for who cannot see it."""
     return (
         f"Similarity matrix of {system}, {counted(shape[0], 'query')} by {counted(shape[1], 'reference')}, "
         "with the true references outlined and the best matches as squares."

@@ -1,22 +1,25 @@
-"""The page: what it says first, its sections in order, and the files beside it."""
+"""The page: what it says first, its sections in order, how it looks, and the files beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import errno
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from core.errors import StorageFailure, StorageFull
 from core.evaluation.report.closeup import closeup, embed
 from core.evaluation.report.curves import plot_pr, plot_recall, plot_roc
 from core.evaluation.report.drawing import Plot
-from core.evaluation.report.folder import write_files
-from core.evaluation.report.pictures import Pictures
+from core.evaluation.report.matrix import RIGHT, TRUTH, WRONG
 from core.evaluation.report.reliability import plot_reliability, trust_table
-from core.evaluation.report.style import script, stylesheet
 from core.evaluation.report.table import figures_table, swatch
 from core.evaluation.report.text import counted, enumerate_words, escape, file_stems, number
-from core.evaluation.report.theme import DARK, LIGHT, Cast
+from core.evaluation.report.theme import DARK, LIGHT, Cast, Theme
+from core.evaluation.report.thumbnails import Thumbnails
 from core.evaluation.report.trends import plot_cost, plot_scalability, plot_severity
 
 if TYPE_CHECKING:
@@ -32,7 +35,7 @@ class Report:
 
     comparison: Comparison
     cast: Cast
-    pictures: Pictures = field(default_factory=Pictures)
+    thumbnails: Thumbnails = field(default_factory=Thumbnails)
     files: dict[str, bytes] = field(default_factory=dict)
 
     def embed(self, plots: Sequence[Plot | None], remarks: Sequence[str] = ()) -> str:
@@ -84,7 +87,7 @@ def _document(report: Report) -> str:
         f'<meta name="theme-color" media="(prefers-color-scheme: dark)" content="{DARK.paper}">'
         f'<title>{title}</title><link rel="icon" href="data:,"><style>{stylesheet()}</style></head>\n'
         f'<body><header>{_opening(report)}<nav class="contents" aria-label="Sections">{contents}</nav></header>\n'
-        f"<main>{body}</main>\n{report.pictures.definitions()}<script>{script()}</script></body></html>\n"
+        f"<main>{body}</main>\n{report.thumbnails.definitions()}<script>{script()}</script></body></html>\n"
     )
 
 
@@ -189,7 +192,7 @@ def _closeups(report: Report) -> str:
     nav = f'<nav class="chips" aria-label="Systems">{chips}</nav>' if len(marks) > 1 else ""
     parts = []
     for run, mark, stem in zip(comparison.runs, marks, stems, strict=True):
-        made = closeup(comparison, run, mark, stem, report.pictures)
+        made = closeup(comparison, run, mark, stem, report.thumbnails)
         report.files |= made.files
         parts.append(made.html)
     return nav + "".join(parts)
@@ -226,3 +229,63 @@ SECTIONS: tuple[Section, ...] = (
     Section("terms", "What the figures mean", _terms),
 )
 """The page from top to bottom; a new part is one line here."""
+
+
+# How the page looks, and what its one script does
+
+
+def stylesheet() -> str:
+    """The rules of the page, its colours taken from the themes of the plots."""
+    dark = f"@media (prefers-color-scheme: dark) {{ :root {{ {_variables(DARK)} }} }}"
+    keys = f":root {{ --truth: {TRUTH}; --match-right: {RIGHT}; --match-wrong: {WRONG}; }}"
+    hues = "".join(f".hue-{index} {{ stroke: var(--hue-{index}); }}" for index in range(len(LIGHT.hues)))
+    return f":root {{ color-scheme: light dark; {_variables(LIGHT)} }}{dark}{keys}{hues}{_read('page.css')}"
+
+
+def script() -> str:
+    """What sorts the table, and shows one system at a time; without it all are shown."""
+    return _read("page.js")
+
+
+def _read(name: str) -> str:
+    return (Path(__file__).parent / name).read_text("utf-8")
+
+
+def _variables(theme: Theme) -> str:
+    names = ("paper", "ink", "muted", "rule", "tp", "fp", "tn", "fn")
+    tint = f"--tint: color-mix(in srgb, {theme.hues[0]} 16%, transparent);"
+    hues = (f"--hue-{index}: {color};" for index, color in enumerate(theme.hues))
+    return " ".join([*(f"--{name}: {getattr(theme, name)};" for name in names), tint, *hues])
+
+
+# Its files
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write all files under temporary names, then give them theirs, in their order.
+
+    The folder is made where it is missing; files of other names in it stay.  The last file should
+    be the one that refers to the others.
+
+    Raises:
+        StorageFull: the disk is full; no file was changed.
+        StorageFailure: the folder cannot be made or written to; unless it fails while files are
+            renamed, no file was changed.
+    """
+    written: dict[Path, Path] = {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            partial = folder / f".{name}.{os.getpid()}.tmp"
+            written[partial] = folder / name
+            partial.write_bytes(data)
+        for partial, final in written.items():
+            os.replace(partial, final)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise StorageFull(f"The disk is full: the report in {folder} was not written.") from error
+        raise StorageFailure(f"The report cannot be written to {folder}: {error.strerror}.") from error
+    finally:
+        for partial in written:
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)

@@ -40,7 +40,7 @@ class Line:
 
 
 def time_per_query(run: Run) -> float | None:
-    """Milliseconds of all stages of one query, the picture's decoding left out; None where none was measured."""
+    """Milliseconds of all stages of one query, the image's decoding left out; None where none was measured."""
     stages = {stage: time for stage, time in run.milliseconds.items() if time is not None}
     describing = run.evaluation.describe_milliseconds
     if describing is not None:

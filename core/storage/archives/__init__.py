@@ -1,6 +1,6 @@
-"""A whole map as one portable file: written from a moment of the map, read with nothing of it believed.
+"""Exporting a map as one portable file, and importing such a file, of which everything is checked.
 
-manifest → tape          what the file holds, and where in it each part lies
-capture → playback       a moment of a map, kept; the bytes of the file, from any position on
-reading → building       a file that somebody brings, checked to the last bit; the folder of a new map
+manifest, tar_layout, lines     what the file holds, and where each part lies in it
+exporter, virtual_archive       keeping a moment of a map; the bytes of its file, from any position on
+reading, building               reading and checking a file; making the folder of a new map from it
 """

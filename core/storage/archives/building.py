@@ -1,7 +1,7 @@
-"""The folder of a new map out of an export file.
+"""Making the folder of a new map from an export file.
 
-The file's tables are lines of text, never a database that somebody else made: every value is checked and written by
-our own statements into a fresh database, every descriptor sealed anew.  So nothing but values can come along.
+The file holds lines of text and never a database: every value is checked and written by our own statements into a new
+database, and every descriptor gets new checksums.  So an export file can bring nothing but values.
 """
 
 from __future__ import annotations
@@ -14,63 +14,62 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from core.disk.files import Damage, sync_file, sync_folder
+from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
 from core.storage.cameras import MOST_CAMERAS
-from core.storage.database import ledger
-from core.storage.database import row_checksums as seals
+from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE, connect
-from core.storage.database.ledger import moment_text
+from core.storage.database.ledger import moment_text, segment_entries
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.database.segment_table import named_segments
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import Damage, sync_file, sync_folder
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder
 from core.storage.records import MapRecord
-from core.storage.writing import name_appended
+from core.storage.writing import record_appended
 
 CHUNK_BYTES = 16 << 20
-"""Of descriptors that are written, synced and committed together."""
+"""Bytes of descriptors that are written, synced and committed together."""
 
 TEXT_BYTES = 2 << 20
-"""Of the lines of their places: read, they take many times the room of their text."""
+"""Bytes of lines that are committed together; parsed, they take many times as much memory."""
 
 MOST_PLACE_BYTES = 1 << 30
-"""Of one descriptor with its local descriptors, in full precision."""
+"""Most bytes of one descriptor with its local descriptors, in full precision."""
 
 LINES_BETWEEN = 1024
-"""After so many lines of sequences the caller is heard: it may break the work off."""
+"""After so many lines of sequences ``advance`` is called, which may end the work."""
 
 Advance = Callable[[int, int], None]
-"""Is told how many places of how many are there; may raise to break the work off."""
+"""Is called with the number of places done and of all; what it raises ends the work."""
 
 CheckPicture = Callable[[bytes], None]
-"""Raises InvalidImage for bytes that nobody should be shown as a picture."""
+"""Raises InvalidImage for bytes that must not be shown as a picture."""
 
 
 def layout_of(manifest: Manifest, rows_per_segment: int = ROWS_PER_SEGMENT) -> Layout:
-    """How the descriptors of a file are kept.
+    """The layout of the descriptors in an export file.
 
     Raises:
-        InvalidArchive: in a way that cannot be.
+        InvalidArchive: it is impossible.
     """
     record = manifest.map
-    if 4 * record.dimension + record.local_cells * record.local_values > MOST_PLACE_BYTES:  # numpy cannot count them
-        raise InvalidArchive(f"The manifest says what cannot be: a place has more than {MOST_PLACE_BYTES} bytes.")
+    if 4 * record.dimension + record.local_cells * record.local_values > MOST_PLACE_BYTES:  # too large for numpy
+        raise InvalidArchive(f"The manifest is impossible: a place has more than {MOST_PLACE_BYTES} bytes.")
     try:
         layout = Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
-        _ = layout.record, layout.frame  # where numpy has its say
+        _ = layout.record, layout.frame  # numpy raises ValueError for impossible types
         return layout
     except ValueError as error:
-        raise InvalidArchive(f"The manifest says what cannot be: {error}.") from None
+        raise InvalidArchive(f"The manifest is impossible: {error}.") from None
 
 
 def check_sizes(manifest: Manifest) -> None:
-    """See that the parts of descriptors are as long as their places need.
+    """Check that the parts of descriptors have the size that their places need.
 
     Raises:
         InvalidArchive.
@@ -79,7 +78,7 @@ def check_sizes(manifest: Manifest) -> None:
     for number in range(manifest.groups):
         part = manifest.group(number)[1]
         if part.bytes != part.rows * width:
-            raise InvalidArchive(f"{part.name} is to have {part.bytes} bytes for {part.rows} places of {width} bytes.")
+            raise InvalidArchive(f"{part.name} has {part.bytes} bytes, not {part.rows} times {width} bytes.")
 
 
 def build(
@@ -91,13 +90,14 @@ def build(
     check_picture: CheckPicture = lambda _content: None,
     most_picture_bytes: int = MOST_PICTURE_BYTES,
 ) -> None:
-    """Make ``folder`` and in it the map of a file, under another id if need be, synced but for the folder's own name.
+    """Make ``folder`` with the map of an export file in it, durable except for the folder's own name.
 
     Args:
-        most_picture_bytes: of one picture; a larger one is refused before it is read.
+        map_id: of the new map; it may differ from that in the file.
+        most_picture_bytes: a larger picture is refused before it is read.
 
     Raises:
-        InvalidArchive: the file is damaged, or holds what no map may hold.  What is in ``folder`` is then of no use.
+        InvalidArchive: the file is damaged, or its content is not valid for a map; ``folder`` is then of no use.
         OSError, sqlite3.Error: the disk refuses.
     """
     manifest = archive.manifest
@@ -112,7 +112,7 @@ def build(
     except sqlite3.IntegrityError as error:
         raise InvalidArchive(f"The places of the file cannot be those of one map: {error}.") from None
     finally:
-        connection.close()  # the log goes into the file and is removed
+        connection.close()  # SQLite moves its log into the file and deletes it
     sync_file(folder / FILE)
     sync_folder(folder)
 
@@ -132,15 +132,14 @@ class _Building:
         self.layout, self.advance, self.check_picture = layout, advance, check_picture
         self.most_picture_bytes = most_picture_bytes
         self.latest: tuple[str | None, int] = (None, NO_SEQUENCE)
-        """The sequence that was met last, and its code."""
+        """The last sequence of a place, and its code."""
         self.rows = 0
 
     def run(self) -> None:
         manifest = self.archive.manifest
-        self.connection.execute("BEGIN IMMEDIATE")
-        self._sequences(manifest.parts[0])
-        self._cameras(manifest.parts[1])
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            self._sequences(manifest.parts[0])
+            self._cameras(manifest.parts[1])
         for number in range(manifest.groups):
             self._group(*manifest.group(number))
         self._check()
@@ -169,7 +168,7 @@ class _Building:
             mask = None if line.mask is None else line.mask.model_dump_json()
             values = (line.name, mask, moment_text(line.updated_at))
             self.connection.execute("INSERT INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)", values)
-        seals.seal(self.connection, "cameras")
+        row_checksums.write_checksums(self.connection, "cameras")
         reader.finish()
 
     def _group(self, places: Part, frames: Part, pictures: Part) -> None:
@@ -189,20 +188,19 @@ class _Building:
         images.finish()
 
     def _commit(self, chunk: list[PlaceLine], rows: PartReader, images: PartReader) -> None:
-        """Places with all that belongs to them, in one COMMIT behind their descriptors."""
+        """Append the descriptors of places, then store the places with their pictures in one COMMIT."""
         if not chunk:
             return
         kept = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
         self._check_descriptors(kept, chunk, rows.name)
-        records = self.layout.sealed(kept, self.rows)
+        records = self.layout.records_of(kept, self.rows)
         descriptors.append(self.folder, self.layout, self.rows, records)
         checksums: list[int] = records["checksum"].tolist()
-        self.connection.execute("BEGIN IMMEDIATE")
-        for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
-            self._insert(line, row, checksum, images)
-        seals.seal(self.connection, "places", "row >= ?", self.rows)
-        name_appended(self.connection, self.layout, self.rows, checksums)
-        self.connection.execute("COMMIT")
+        with transaction(self.connection):
+            for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
+                self._insert(line, row, checksum, images)
+            row_checksums.write_checksums(self.connection, "places", "row >= ?", self.rows)
+            record_appended(self.connection, self.layout, self.rows, checksums)
         self.rows += len(chunk)
         self.advance(self.rows, self.archive.manifest.places)
 
@@ -211,8 +209,8 @@ class _Building:
             vectors = self.layout.descriptors_of(kept)
             largest = np.abs(vectors).max(axis=1)
         for line, value in zip(chunk, largest.tolist(), strict=True):
-            if not 0 < value <= LARGEST_HALF:  # not so of what is no number, either
-                raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} is none that can be compared.")
+            if not 0 < value <= LARGEST_HALF:  # this is also false for NaN
+                raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} cannot be compared.")
 
     def _insert(self, line: PlaceLine, row: int, checksum: int, images: PartReader) -> None:
         code = self._code(line)
@@ -252,7 +250,7 @@ class _Building:
             )
 
     def _code(self, line: PlaceLine) -> int:
-        """Of its sequence, by which the tables know it."""
+        """The code of a place's sequence in the tables."""
         if line.sequence is None:
             return NO_SEQUENCE
         if line.sequence != self.latest[0]:
@@ -264,7 +262,7 @@ class _Building:
         return self.latest[1]
 
     def _check(self) -> None:
-        """Is the whole one map?  What a place needs was checked with it."""
+        """Check what concerns several places; each place was checked by itself."""
         query = (
             "SELECT s.name FROM sequences s LEFT JOIN places p ON p.sequence = s.code GROUP BY s.code"
             " HAVING coalesce(max(p.ordinal), -1) >= s.next_ordinal OR (s.name IS NOT NULL AND count(p.number) = 0)"
@@ -274,12 +272,12 @@ class _Building:
         for (line,) in self.connection.execute("PRAGMA quick_check").fetchall():
             if line != "ok":
                 raise Damage(f"{FILE}: {line}")
-        if sum(segment.rows for segment in named_segments(self.connection, self.layout)) != self.rows:
-            raise Damage(f"{FILE} does not name the rows that were written")
+        if sum(segment.rows for segment in segment_entries(self.connection, self.layout)) != self.rows:
+            raise Damage(f"{FILE} does not record the rows that were written")
 
 
 def _lines(reader: PartReader, part: Part, kind: type[Kind]) -> Iterator[tuple[Kind, int]]:
-    """The lines of a part and the length of their texts, as many as the manifest says."""
+    """The lines of a part, as many as the manifest says, each with the length of its text."""
     seen = 0
     for text in reader.lines():
         seen += 1

@@ -1,4 +1,4 @@
-"""The lines of an export file: a sequence, a camera, a place each, from the tables and back, every value checked."""
+"""The lines of an export file, each for a sequence, a camera or a place: writing, reading and checking them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from core.errors import InvalidArchive
 from core.frames.masks import Mask
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
-from core.storage.patches import complaint
+from core.storage.records import validation_message
 
 MOST_METADATA_BYTES = 1 << 20
-"""Of one place, as compact JSON; no service can be set to take more."""
+"""Of one place, as compact JSON; no service can be set to accept more."""
 
 MOST_LINE_BYTES = MOST_METADATA_BYTES + (64 << 10)
 
 MOST_PICTURE_BYTES = 1_000_000_000
-"""What SQLite takes as one value."""
+"""The largest value that SQLite accepts."""
 
 LARGEST = 2**62
-"""What SQLite can hold, with room to count on."""
+"""The largest number in a line; SQLite can hold larger ones, so counting further is possible."""
 
 Number = Annotated[int, Field(ge=0, le=LARGEST, strict=True)]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -50,7 +50,7 @@ class CameraLine(_Line):
 
 
 class Picture(_Line):
-    """What is kept of a place's frame: so many bytes of the pictures of its group."""
+    """The picture kept of a place's frame: its bytes are the next ones in the pictures of its group."""
 
     kind: Literal["thumbnail", "image"]
     bytes: Annotated[int, Field(ge=0, le=MOST_PICTURE_BYTES, strict=True)]
@@ -58,7 +58,7 @@ class Picture(_Line):
 
 
 class PlaceLine(_Line):
-    """A place.  digest: SHA-256 of the image that it was enrolled with, and of what was masked in it."""
+    """A place.  digest: SHA-256 of the image with which it was enrolled and of its camera's mask."""
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
     pose: Pose | None
@@ -74,7 +74,7 @@ class PlaceLine(_Line):
     updated_at: Timestamp
 
     def fields(self) -> PlaceFields:
-        """What its owner said of it."""
+        """The fields that the owner of the map gave the place."""
         return PlaceFields(
             pose=self.pose,
             timestamp=self.timestamp,
@@ -93,7 +93,7 @@ def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
     """One line of a part.
 
     Raises:
-        InvalidArchive: it is not what ``kind`` describes.
+        InvalidArchive: it is not a valid line of this kind.
     """
     value = strict_json(text, where)
     expect_names(value, kind, where)
@@ -103,12 +103,12 @@ def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
         made = kind.model_validate(value)
         if len(text) > MOST_METADATA_BYTES and _size(value.get("metadata")) > MOST_METADATA_BYTES:
             raise InvalidArchive(f"{where}: the metadata has more than {MOST_METADATA_BYTES} bytes.")
-        if b"\\u" in text:  # half a character, which only an escape can say, is no text of SQLite's
+        if b"\\u" in text:  # only an escape can hold a lone surrogate, which SQLite cannot store
             json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
         raise InvalidArchive(f"{where} holds half a character (a lone surrogate).") from None
     except (ValidationError, RecursionError) as error:
-        why = complaint(error) if isinstance(error, ValueError) else "nested too deeply"
+        why = validation_message(error) if isinstance(error, ValueError) else "nested too deeply"
         raise InvalidArchive(f"{where}: {why[:400]}.") from None
     return made
 
@@ -122,13 +122,13 @@ def _line(value: dict[str, Any]) -> bytes:
 
 
 def sequence_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
-    """By name, that of no sequence first."""
+    """The lines of sequences by name; places without a sequence come first."""
     for name, following in connection.execute("SELECT name, next_ordinal FROM sequences ORDER BY name"):
         yield _line({"name": name, "next_ordinal": following})
 
 
 def camera_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
-    """By name."""
+    """The lines of cameras by name."""
     for name, mask, updated_at in connection.execute("SELECT name, mask, updated_at FROM cameras ORDER BY name"):
         yield _line({"name": name, "mask": None if mask is None else json.loads(mask), "updated_at": updated_at})
 
@@ -144,9 +144,11 @@ _PLACES = (
 
 
 class StoredLine:
-    """A place's line, and where the rest of it is: its picture, its descriptor.
+    """The line of a place, and where its picture and descriptor are.
 
-    picture_bytes: of what is kept of its frame; 0 where nothing is.
+    text: the line.
+    picture_bytes: size of the picture kept of its frame; 0 if none is kept.
+    number, row, checksum: of the place and its descriptor in the database.
     """
 
     __slots__ = ("checksum", "id", "number", "picture_bytes", "row", "text")
@@ -176,6 +178,6 @@ class StoredLine:
 
 
 def place_lines(connection: sqlite3.Connection) -> Iterator[StoredLine]:
-    """All places in the order of their enrolment."""
+    """The lines of all places in the order of their enrolment."""
     for values in connection.execute(_PLACES):
         yield StoredLine(values)

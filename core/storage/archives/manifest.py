@@ -1,18 +1,18 @@
-"""What an export file holds: its first part, on which everything else is checked.
+"""The manifest of an export file: its first part, by which all others are checked.
 
 The file is a plain tar (ustar).  Its members, in this order, in version 1:
 
-    manifest.json               this: format, version, the map's record, and each part's bytes and SHA-256
+    manifest.json               format, version, the map's record, and size and SHA-256 of each part
     manifest.sha256             its SHA-256, as sha256sum writes it
-    sequences.jsonl             one line a sequence: its name and the ordinal that its next place gets
-    cameras.jsonl               one line a camera, with its mask
-    places-000001.jsonl         one line a place, in the order of enrolment
-    descriptors-000001.bin      of the same places: descriptor and local descriptors as the map keeps them, one
-                                behind the other, nothing between them
-    pictures-000001.bin         of the same places: what is kept of their frames, one behind the other
+    sequences.jsonl             a line per sequence: its name and the ordinal that its next place gets
+    cameras.jsonl               a line per camera, with its mask
+    places-000001.jsonl         a line per place, in the order of enrolment
+    descriptors-000001.bin      of the same places: descriptor and local descriptors as the map stores them,
+                                without anything between them
+    pictures-000001.bin         of the same places: the pictures kept of their frames
     places-000002.jsonl …       and so on
 
-The bytes of a file follow from its manifest and its parts alone, so the SHA-256 of the manifest names all of them.
+The bytes of a file follow from its manifest and its parts, so the SHA-256 of the manifest identifies the whole file.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
-from core.storage.patches import complaint
-from core.storage.records import MapRecord
+from core.storage.records import MapRecord, validation_message
 
 FORMAT = "placerec map"
 VERSION = 1
@@ -38,16 +37,16 @@ SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
 GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"))
 
 MOST_MANIFEST_BYTES = 8 << 20
-"""A part takes some 165 bytes: room for 17 million places, or for 4 TB of pictures."""
+"""A part takes some 165 bytes, so this is enough for 17 million places or 4 TB of pictures."""
 
 MOST_PART_BYTES = 8 << 30
-"""What the header of a tar can say, less one."""
+"""The size of a part is less than this, so that a tar header can hold it."""
 
 Count = Annotated[int, Field(ge=0, strict=True)]
 
 
 class Part(BaseModel):
-    """One part of the file.  rows: lines, or places whose descriptors or pictures it holds."""
+    """One part of the file.  rows: how many lines it has, or of how many places it holds descriptors or pictures."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -58,7 +57,7 @@ class Part(BaseModel):
 
 
 class ArchivedRecord(MapRecord):
-    """A map's record as it travels; what is unknown is refused."""
+    """A map's record in an export file; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -70,7 +69,7 @@ class ArchivedRecord(MapRecord):
 
 
 class Manifest(BaseModel):
-    """The first part."""
+    """The content of the manifest."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -82,7 +81,7 @@ class Manifest(BaseModel):
 
     @property
     def groups(self) -> int:
-        """How many times places, descriptors and pictures follow each other."""
+        """How many groups of places, descriptors and pictures there are."""
         return (len(self.parts) - 2) // len(GROUP_KINDS)
 
     def group(self, number: int) -> Sequence[Part]:
@@ -97,33 +96,33 @@ def group_names(number: int) -> list[str]:
 
 
 def written(manifest: Manifest) -> bytes:
-    """The manifest as it stands in the file; the same manifest is always the same bytes."""
+    """The manifest as bytes; equal manifests are always the same bytes."""
     return (json.dumps(manifest.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def tag_of(text: bytes) -> str:
-    """What names a file, by the bytes of its manifest: their SHA-256 in hexadecimal."""
+    """The tag of a file: the SHA-256 of its manifest's bytes in hexadecimal."""
     return hashlib.sha256(text).hexdigest()
 
 
 def seal_of(text: bytes) -> bytes:
-    """What stands behind the manifest, by its bytes."""
+    """The content of manifest.sha256, which follows the manifest."""
     return f"{tag_of(text)}  {MANIFEST}\n".encode()
 
 
 def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number of JSON")
+    raise ValueError(f"{name} is not a number of JSON")
 
 
 def _no_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     made = dict(pairs)
     if len(made) != len(pairs):
-        raise ValueError("a name stands twice in an object")
+        raise ValueError("an object has the same name twice")
     return made
 
 
 def strict_json(text: bytes, what: str) -> Any:
-    """The value of a JSON text without anything that JSON cannot say, or says twice.
+    """Parse JSON strictly: no NaN or infinity, and no name twice in an object.
 
     Raises:
         InvalidArchive.
@@ -137,10 +136,10 @@ def strict_json(text: bytes, what: str) -> Any:
 
 
 def expect_names(value: Any, kind: type[BaseModel], what: str) -> None:
-    """See that an object has no field that ``kind`` has not: each would cost an error of its own.
+    """Refuse an object with a field that ``kind`` does not have, before pydantic makes an error of each.
 
     Raises:
-        InvalidArchive: it has; the text names one.
+        InvalidArchive: it has one; the text names it.
     """
     if isinstance(value, dict):
         for name in value:
@@ -149,17 +148,17 @@ def expect_names(value: Any, kind: type[BaseModel], what: str) -> None:
 
 
 def _expect_few(text: bytes) -> None:
-    """Read, a value takes many times the room of its text: there are to be no more than parts have, and some."""
+    """Refuse a text with more values than a manifest can have; parsed, each takes many times the memory of its text."""
     if sum(map(text.count, (b"{", b"[", b","))) > 8192 + len(text) // 16:
         raise InvalidArchive(f"{MANIFEST} lists more than the parts of a map.")
 
 
 def read_manifest(text: bytes) -> Manifest:
-    """The manifest of a file, of whatever version that is known.
+    """Read the manifest of a file of any known version.
 
     Raises:
         ArchiveTooNew: a later version of placerec wrote the file.
-        InvalidArchive: it is none of ours, or says what cannot be.
+        InvalidArchive: it is not a manifest of placerec, or its content is invalid.
     """
     _expect_few(text)
     value = strict_json(text, MANIFEST)
@@ -187,7 +186,7 @@ def _read_first(value: dict[str, Any]) -> Manifest:
     try:
         manifest = Manifest.model_validate(value)
     except (ValidationError, RecursionError) as error:
-        why = complaint(error) if isinstance(error, ValueError) else "it is nested too deeply"
+        why = validation_message(error) if isinstance(error, ValueError) else "it is nested too deeply"
         raise InvalidArchive(f"{MANIFEST}: {why[:400]}.") from None
     try:
         check_map_id(manifest.map.id)
@@ -207,4 +206,4 @@ def _read_first(value: dict[str, Any]) -> Manifest:
 
 
 READERS = {1: _read_first}
-"""How each version is read; a version, once written, stays here."""
+"""The reader of each version; versions that were released stay."""

@@ -1,4 +1,4 @@
-"""An export file that somebody brings: nothing in it is believed before it was checked."""
+"""Reading an export file from an untrusted source: everything in it is checked."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from typing import Self
 from core.errors import InvalidArchive
 from core.storage.archives.lines import MOST_LINE_BYTES
 from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
-from core.storage.archives.tar_layout import BLOCK, END_BYTES, Member, Tape, describe, header, manifest_size, padded
+from core.storage.archives.tar_layout import (
+    BLOCK,
+    END_BYTES,
+    Member,
+    TarLayout,
+    describe,
+    header,
+    manifest_size,
+    padded,
+)
 
 CHUNK_BYTES = 1 << 20
 
 
 class Archive:
-    """An export file that is open for reading; close it, or use it in a ``with``.
+    """An export file, open for reading; close it, or use it in a ``with`` statement.
 
     Raises:
-        InvalidArchive: it is none, or not as long as its manifest says.
+        InvalidArchive: it is not an export file, or not as long as its manifest says.
         ArchiveTooNew: a later version of placerec wrote it.
         OSError: the disk refuses.
     """
@@ -49,15 +58,15 @@ class Archive:
         self.close()
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         os.close(self._file)
 
     def part(self, part: Part) -> PartReader:
-        """A part, to be read from its beginning to its end."""
+        """A reader of a part, from its beginning to its end."""
         return PartReader(self._read_at, self._members[part.name], part)
 
     def check_end(self) -> None:
-        """Raise InvalidArchive unless the file ends as a tar does."""
+        """Raise InvalidArchive unless the file ends as a tar file must."""
         if any(self._read_at(self.tape.end, END_BYTES)):
             raise InvalidArchive("The end of the file is damaged.")
 
@@ -66,7 +75,7 @@ class Archive:
             raise InvalidArchive(f"The file is cut: it has {self.size} of its {self.tape.size} bytes.")
         if self.size > self.tape.size:
             member = self._read_at(self.tape.end, BLOCK)
-            more = "more members than the manifest names" if any(member) else "bytes behind its end"
+            more = "more members than the manifest names" if any(member) else "bytes after its end"
             raise InvalidArchive(f"The file has {more}: {self.size} bytes instead of {self.tape.size}.")
 
     def _read_at(self, offset: int, size: int) -> bytes:
@@ -77,12 +86,12 @@ class Archive:
         return b"".join(parts)
 
 
-def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Manifest, Tape, str] | None:
-    """What the beginning of a file says of all of it; None if it ends before its manifest does.
+def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Manifest, TarLayout, str] | None:
+    """The manifest, layout and tag of a file, read from its beginning; None if it ends within the manifest.
 
     Args:
         first: the first block of the file.
-        read_at: gives bytes of the file by offset and size, fewer where it ends.
+        read_at: returns bytes of the file by offset and size, fewer at its end.
 
     Raises:
         InvalidArchive, ArchiveTooNew.
@@ -99,14 +108,14 @@ def opening_of(first: bytes, read_at: Callable[[int, int], bytes]) -> tuple[Mani
         return None
     expected = bytes(padded(size) - size) + header(SEAL, len(seal_of(text))) + seal_of(text)
     if following != expected.ljust(rest, b"\0"):
-        raise InvalidArchive(f"{MANIFEST} is damaged: it does not match {SEAL} behind it.")
+        raise InvalidArchive(f"{MANIFEST} is damaged: it does not match {SEAL}.")
     manifest = read_manifest(text)
-    tape = Tape(manifest, size)
+    tape = TarLayout(manifest, size)
     return manifest, tape, tag_of(text)
 
 
 class PartReader:
-    """One part, read in order; what was read counts only when :meth:`finish` has returned."""
+    """Reads one part in order; what was read is trustworthy only when :meth:`finish` has returned."""
 
     def __init__(self, read_at: Callable[[int, int], bytes], member: Member, part: Part) -> None:
         self._read_at, self._member, self._part = read_at, member, part
@@ -118,17 +127,17 @@ class PartReader:
 
     @property
     def name(self) -> str:
-        """Of the part."""
+        """The name of the part."""
         return self._part.name
 
     def read(self, size: int) -> bytes:
         """The next ``size`` bytes.
 
         Raises:
-            InvalidArchive: there are not so many left.
+            InvalidArchive: fewer are left.
         """
         if size > self._member.size - self._position:
-            raise InvalidArchive(f"{self.name} is shorter than what it is to hold.")
+            raise InvalidArchive(f"{self.name} is shorter than its content needs.")
         data = self._read_at(self._member.start + self._position, size)
         if len(data) < size:
             raise InvalidArchive(f"The file is cut within {self.name}.")
@@ -137,10 +146,10 @@ class PartReader:
         return data
 
     def lines(self) -> Iterator[bytes]:
-        """The rest of the part, line by line, without the ends of lines.
+        """The rest of the part, line by line, without line ends.
 
         Raises:
-            InvalidArchive: one is too long, or the last one has no end.
+            InvalidArchive: a line is too long, or the last one has no line end.
         """
         rest = b""
         while left := self._member.size - self._position:
@@ -149,33 +158,33 @@ class PartReader:
                 raise InvalidArchive(f"{self.name} has a line of more than {MOST_LINE_BYTES} bytes.")
             yield from whole
         if rest:
-            raise InvalidArchive(f"{self.name} does not end with the end of a line.")
+            raise InvalidArchive(f"{self.name} does not end with a line end.")
 
     def skip(self) -> None:
-        """Read the rest for its checksum alone."""
+        """Read the rest only for its checksum."""
         while left := self._member.size - self._position:
             self.read(min(left, CHUNK_BYTES))
 
     def finish(self) -> None:
-        """See that all of the part was read, and that it was what the manifest says.
+        """Check that all of the part was read, and that it has the SHA-256 in the manifest.
 
         Raises:
-            InvalidArchive: it is longer, or has another SHA-256.
+            InvalidArchive: it was not, or has not.
         """
         if self._position != self._member.size:
-            raise InvalidArchive(f"{self.name} is longer than what it is to hold.")
+            raise InvalidArchive(f"{self.name} is longer than its content.")
         if self._digest.hexdigest() != self._part.sha256:
             raise InvalidArchive(f"{self.name} is damaged: it does not match its SHA-256.")
         end = self._member.start + self._member.size
         if any(self._read_at(end, self._member.end - end)):
-            raise InvalidArchive(f"{self.name}: there is something between it and the next member.")
+            raise InvalidArchive(f"{self.name}: the padding after it is not zero.")
 
 
 def check(archive: Archive, advance: Callable[[int, int], None] = lambda _done, _all: None) -> None:
-    """Read all of a file and compare it with its checksums; builds nothing.
+    """Read all of a file and compare it with its checksums.
 
     Args:
-        advance: is told how many bytes of how many were read.
+        advance: is called with the number of bytes read and of all.
 
     Raises:
         InvalidArchive: it is damaged; the text names the part.

@@ -43,7 +43,7 @@ class Member:
         return self.start + padded(self.size)
 
 
-class Tape:
+class TarLayout:
     """The members of a file in their order, and its length in bytes."""
 
     def __init__(self, manifest: Manifest, manifest_bytes: int) -> None:

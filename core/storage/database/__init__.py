@@ -1,1 +1,1 @@
-"""A map's SQLite database: its tables, its statements, its log."""
+"""A map's SQLite database: its connections, tables, statements and log."""

@@ -1,4 +1,4 @@
-"""All places of a map from SQLite as columns: a million of them in seconds."""
+"""Reading all places of a map from SQLite as NumPy columns: a million of them in seconds."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Whereabouts
-from core.places import EARTH_RADIUS, Pose
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
 
 _AT_ONCE = 65_536
 _NUMBERS = "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading"
@@ -19,10 +18,10 @@ _NUMBERS = "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, head
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The living places of a map, in any order.
+    """The places of a map, in any order.
 
-    rows: int64 [n].
-    checksums: uint32 [n], what SQLite names of each.
+    rows: int64 [n], of their descriptors.
+    checksums: uint32 [n], of these rows.
     """
 
     rows: NDArray[np.int64]
@@ -31,14 +30,14 @@ class Columns:
 
 
 def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
-    """Row, checksum and spot of every place.
+    """Row, checksum and whereabouts of every place.
 
     Args:
-        rows: that there are.
+        rows: how many descriptor rows the map has.
 
     Raises:
-        Damage: a place has a row that no segment has.
-        ValueError: a pose that makes no sense.
+        Damage: a place has a row that is in no segment.
+        ValueError: a pose is invalid.
     """
     cursor = connection.execute(f"SELECT {_NUMBERS}, substr(timestamp, 1, 26) FROM places")
     numbers, moments = [np.empty((0, 10))], [np.empty(0, "datetime64[us]")]
@@ -66,7 +65,7 @@ def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
 def _positions(
     coordinates: NDArray[np.float64], heading: NDArray[np.float64]
 ) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
-    """Kind and position (``Pose.position``) of x, y, z, latitude, longitude, where NaN is nothing."""
+    """Kind and position (``Pose.position``) of columns x, y, z, latitude, longitude; NaN is a missing value."""
     there = ~np.isnan(coordinates)
     metric, geographic = there[:, 0] & there[:, 1], there[:, 3] & there[:, 4]
     whole = (metric & ~there[:, 3:].any(axis=1)) | (geographic & ~there[:, :3].any(axis=1))
@@ -74,7 +73,7 @@ def _positions(
     for odd in np.flatnonzero(~(whole | nothing))[:1].tolist():
         names = (*("x", "y", "z", "latitude", "longitude"), "heading")
         values: list[Any] = [*coordinates[odd].tolist(), float(heading[odd])]
-        Pose(**{name: value for name, value in zip(names, values, strict=True) if value == value})  # says what is wrong
+        Pose(**{name: value for name, value in zip(names, values, strict=True) if value == value})  # raises ValueError
     kind = np.where(metric, METRIC, np.where(geographic, GEOGRAPHIC, NO_POSE)).astype(np.int8)
     phi, theta = np.radians(coordinates[:, 3]), np.radians(coordinates[:, 4])
     sphere = EARTH_RADIUS * np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=1)

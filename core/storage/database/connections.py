@@ -1,7 +1,7 @@
-"""SQLite under many threads: one connection that writes, and as many as needed that read.
+"""The connections to a map's database: one that writes, and as many as needed that read.
 
-In WAL mode readers see the last commit and never wait for the writer.  With ``synchronous=FULL``
-a COMMIT returns when the log is synced; SQLite also syncs the folder when it makes the log.
+In WAL mode readers see the last commit and never wait for the writer.  With ``synchronous=FULL`` a COMMIT returns when
+the log is synced; SQLite also syncs the folder when it creates the log.
 """
 
 from __future__ import annotations
@@ -9,49 +9,41 @@ from __future__ import annotations
 import sqlite3
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-from core.storage.database import row_checksums as seals
+from core.disk import sqlite_file
+from core.disk.files import sync_file
+from core.disk.sqlite_file import DURABLE
+from core.storage.database import row_checksums
 from core.storage.database.schema import check_schema, migrate
-from core.storage.files.disk import sync_file
 
 FILE = "map.sqlite"
 
 _IDLE_READERS = 8
-_LOG_BYTES = 64 << 20  # to which a log that a large batch made longer is cut again
+_LOG_BYTES = 64 << 20  # a log that a large batch made longer is cut to this size
 
 
 class DatabaseClosed(Exception):
-    """The database was closed, for good, before this use of it."""
+    """The database was closed before this use of it."""
+
+
+_SETTINGS = {**DURABLE, "foreign_keys": "ON", "temp_store": "MEMORY", "journal_size_limit": _LOG_BYTES}
 
 
 def connect(path: Path, create: bool = False) -> sqlite3.Connection:
-    """A connection with our settings and no implicit transactions; any thread may use it, one at a time.
+    """A connection with the settings of a map and no implicit transactions; any thread may use it, one at a time.
 
     Raises:
-        sqlite3.Error: there is no such file (unless ``create``), or it cannot be read.
+        sqlite3.Error: the file is missing (unless ``create``) or cannot be read.
     """
-    mode = "rwc" if create else "rw"
-    connection = sqlite3.connect(
-        f"{path.absolute().as_uri()}?mode={mode}", uri=True, timeout=30, isolation_level=None, check_same_thread=False
-    )
-    try:
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA temp_store = MEMORY")
-        connection.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
-        seals.teach(connection)
-    except BaseException:
-        connection.close()
-        raise
+    connection = sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
+    row_checksums.register(connection)
     return connection
 
 
-def connect_aside(path: Path) -> sqlite3.Connection:
-    """A connection that reads the file as if there were no log beside it, and changes neither.
+def connect_without_log(path: Path) -> sqlite3.Connection:
+    """A connection that reads the file as if it had no log, and changes neither of them.
 
     Raises:
         sqlite3.Error: it cannot be read.
@@ -60,19 +52,19 @@ def connect_aside(path: Path) -> sqlite3.Connection:
         f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, isolation_level=None, check_same_thread=False
     )
     connection.execute("PRAGMA trusted_schema = OFF")
-    seals.teach(connection)
+    row_checksums.register(connection)
     return connection
 
 
 class Database:
-    """``map.sqlite`` in use.  The caller sees to it that one thread writes at a time."""
+    """``map.sqlite`` of an open map.  Any thread may read; the caller ensures that only one writes at a time."""
 
     def __init__(self, path: Path) -> None:
-        """Open and, where it is older, migrate.
+        """Open the file, and migrate it if it is older.
 
         Raises:
             DataDirectoryTooNew: a later version wrote it.
-            Damage: it is not one of ours.
+            Damage: it is not the database of a map.
             sqlite3.Error: it cannot be read.
         """
         self._path = path
@@ -80,8 +72,7 @@ class Database:
         try:
             migrate(self._writer)
             check_schema(self._writer)
-            # SQLite opens a file for reading alone where writing is refused, and it would stay so when that has passed.
-            self._writer.execute("UPDATE map SET only = only WHERE false")
+            sqlite_file.expect_writable(self._writer)
         except BaseException:
             self._writer.close()
             raise
@@ -90,14 +81,14 @@ class Database:
         self._reading = 0
         self._closed = False
         self.state = object()
-        """Another one after every transaction: whoever finds the same again knows that nothing was written."""
+        """A new object after every transaction; as long as it is the same object, nothing was written."""
 
     @contextmanager
     def reading(self) -> Iterator[sqlite3.Connection]:
-        """A connection for this thread alone.
+        """A connection for the calling thread alone.
 
         Raises:
-            DatabaseClosed: too late.
+            DatabaseClosed: the database was closed.
         """
         with self._condition:
             if self._closed:
@@ -111,7 +102,7 @@ class Database:
         finally:
             with self._condition:
                 self._reading -= 1
-                # One left in the middle of a transaction would see that moment for ever.
+                # A connection within a transaction would see the moment of its beginning for ever.
                 if connection is not None and not connection.in_transaction and len(self._idle) < _IDLE_READERS:
                     self._idle.append(connection)
                     connection = None
@@ -121,30 +112,24 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """All of the block's statements or none; synced when it is left without an error.
+        """Execute all statements of the block or none; they are synced when it ends without an error.
 
         Raises:
-            DatabaseClosed: too late.
+            DatabaseClosed: the database was closed.
         """
         if self._closed:
             raise DatabaseClosed
-        self._writer.execute("BEGIN IMMEDIATE")
         try:
-            yield self._writer
-            self._writer.execute("COMMIT")
-        except BaseException:
-            with suppress(sqlite3.Error):  # the first error is the one to tell
-                if self._writer.in_transaction:
-                    self._writer.execute("ROLLBACK")
-            raise
+            with sqlite_file.transaction(self._writer):
+                yield self._writer
         finally:
             self.state = object()
 
-    def settle(self) -> None:
-        """Empty the log after a COMMIT that failed while it was being synced.
+    def empty_log(self) -> None:
+        """Empty the log after a COMMIT that failed while the log was being synced.
 
-        Such a commit is taken back in memory, but its frames may have reached the disk, where a
-        crash would bring them to life again.
+        Such a commit is undone in memory, but its frames may have reached the disk, from where SQLite would replay them
+        after a crash.
 
         Raises:
             OSError, sqlite3.Error: the log could not be emptied.
@@ -152,13 +137,13 @@ class Database:
         (busy, _, _) = self._writer.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         if busy:
             raise sqlite3.OperationalError("readers keep the log from being emptied")
-        sync_file(self._path.with_name(f"{self._path.name}-wal"))  # or a power cut could bring back what was in it
+        sync_file(self._path.with_name(f"{self._path.name}-wal"))  # or a power cut could restore its former content
 
     def close(self) -> None:
-        """Let the reads under way end, refuse further ones, and close.
+        """Wait for reads under way, refuse further ones, and close all connections.
 
-        No connection may outlive its file's name: SQLite removes the log by its path when the last
-        one closes, and that path may belong to a new map by then.
+        No connection may be open when the file gets another name: SQLite deletes the log by its path when the last
+        connection closes, and that path may belong to a new map by then.
         """
         with self._condition:
             self._closed = True

@@ -1,7 +1,7 @@
-"""The statements that read and write a map's places, sequences, pictures and record.
+"""The statements that read and write a map's places, sequences, pictures, segments and record.
 
-Every function takes the connection that its caller holds: a reader's, or that of the transaction
-of which it becomes a part.
+Every function takes a connection of its caller: one that reads, or that of the transaction to which the statements
+shall belong.
 """
 
 from __future__ import annotations
@@ -13,20 +13,21 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from core.errors import InvalidField, UnknownPlace
+from core.disk.files import Damage
+from core.errors import InvalidField, StorageFailure, UnknownPlace
 from core.places import Place, PlaceFields, Pose
-from core.storage.database import row_checksums as seals
-from core.storage.database.row_checksums import SEALED
+from core.storage.database import row_checksums
+from core.storage.database.row_checksums import CHECKED
 from core.storage.database.schema import NO_SEQUENCE
-from core.storage.files.disk import Damage
+from core.storage.files.segment_files import Layout
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 
 DEEPEST_METADATA = 64
-"""Levels of nesting; what is deeper could be stored but not be sent."""
+"""Most levels of nesting; deeper metadata could be stored but not sent."""
 
 _POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 
-_COLUMNS = SEALED["places"]
+_COLUMNS = CHECKED["places"]
 _PLACE = (
     f"SELECT {', '.join(f'p.{name}' for name in _COLUMNS)}, p.seal, s.name"
     " FROM places p JOIN sequences s ON s.code = p.sequence "
@@ -35,7 +36,14 @@ _PLACE = (
 
 @dataclass(frozen=True)
 class StoredPlace:
-    """A place and where its descriptor is."""
+    """A place as it is stored.
+
+    number: grows in the order of enrolment.
+    row: of its descriptor.
+    digest: SHA-256 of its image, 32 bytes.
+    sequence: code of its sequence, NO_SEQUENCE without one.
+    ordinal: its position in its sequence.
+    """
 
     number: int
     row: int
@@ -45,10 +53,25 @@ class StoredPlace:
     place: Place
 
 
+@dataclass(frozen=True)
+class SegmentEntry:
+    """What SQLite records of a segment file.
+
+    number: counted from 0.
+    checksum: of the checksums of its rows (:func:`core.storage.files.segment_files.segment_checksum`).
+    removed: no row belongs to a place any more, and the file may be missing.
+    """
+
+    number: int
+    rows: int
+    checksum: int
+    removed: bool = False
+
+
 def _stored(values: tuple[Any, ...]) -> StoredPlace:
     *sealed, seal, sequence = values
     columns = dict(zip(_COLUMNS, sealed, strict=True))
-    if not seals.is_sound(sealed, seal):
+    if not row_checksums.is_sound(sealed, seal):
         raise Damage(f"map.sqlite: place {columns['id']!r} does not match its checksum")
     pose = {name: columns[name] for name in _POSE if columns[name] is not None}
     try:
@@ -65,14 +88,14 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
             updated_at=columns["updated_at"],
         )
     except ValueError as error:
-        raise Damage(f"map.sqlite: place {columns['id']!r} makes no sense") from error
+        raise Damage(f"map.sqlite: place {columns['id']!r} is invalid") from error
     return StoredPlace(
         columns["number"], columns["row"], columns["digest"], columns["sequence"], columns["ordinal"], place
     )
 
 
 def moment_text(moment: datetime) -> str:
-    """An instant in UTC as text that sorts by time."""
+    """A moment in UTC as text, which sorts by time."""
     return moment.isoformat(timespec="microseconds")
 
 
@@ -89,10 +112,10 @@ def _is_deep(value: Any) -> bool:
 
 
 def metadata_text(metadata: dict[str, Any]) -> str:
-    """Metadata as canonical JSON: the same content is always the same text.
+    """Metadata as canonical JSON: equal metadata is always the same text.
 
     Raises:
-        InvalidField: JSON cannot say it (not-a-number, infinity, other types), or it is nested too deeply.
+        InvalidField: it has values that JSON cannot represent (NaN, infinity, other types), or is nested too deeply.
     """
     if _is_deep(metadata):
         raise InvalidField(f"The metadata is nested more than {DEEPEST_METADATA} levels deep.")
@@ -103,7 +126,7 @@ def metadata_text(metadata: dict[str, Any]) -> str:
 
 
 def field_columns(fields: PlaceFields) -> dict[str, Any]:
-    """The columns of ``places`` that hold a place's fields, its sequence left out.
+    """The columns of ``places`` that hold a place's fields, except for its sequence.
 
     Raises:
         InvalidField: the metadata cannot be written as JSON.
@@ -116,7 +139,7 @@ def field_columns(fields: PlaceFields) -> dict[str, Any]:
 
 
 def same_fields(a: PlaceFields, b: PlaceFields) -> bool:
-    """Whether two sets of fields are stored alike (unlike Python, JSON tells 1 from true)."""
+    """Whether two sets of fields are stored in the same way (unlike Python, JSON distinguishes 1 from true)."""
     return a.sequence == b.sequence and field_columns(a) == field_columns(b)
 
 
@@ -124,7 +147,7 @@ def same_fields(a: PlaceFields, b: PlaceFields) -> bool:
 
 
 def find(connection: sqlite3.Connection, place_id: str) -> StoredPlace | None:
-    """The place of this id."""
+    """The place of this id; None if there is none."""
     values = connection.execute(_PLACE + "WHERE p.id = ?", (place_id,)).fetchone()
     return None if values is None else _stored(values)
 
@@ -156,7 +179,7 @@ def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int,
 
 
 def rows_of_places(connection: sqlite3.Connection, place_ids: list[str]) -> dict[str, int]:
-    """The descriptor rows of those of the places that there are."""
+    """The descriptor rows of places by id; ids that do not exist are left out."""
     query = "SELECT id, row FROM places WHERE id IN (SELECT value FROM json_each(?))"
     return dict(connection.execute(query, (json.dumps(place_ids),)).fetchall())
 
@@ -179,10 +202,22 @@ def rows_of_sequence(connection: sqlite3.Connection, name: str) -> list[int]:
     return [row for (row,) in connection.execute(query, (name,)).fetchall()]
 
 
-def picture(connection: sqlite3.Connection, number: int) -> tuple[bytes, bytes] | None:
-    """What is kept of a place's frame, and its SHA-256."""
+def picture(connection: sqlite3.Connection, number: int, place_id: str) -> bytes | None:
+    """The picture kept of a place's frame; None if none is kept.
+
+    Args:
+        number, place_id: of the place.
+
+    Raises:
+        StorageFailure: the picture does not match its SHA-256.
+    """
     found = connection.execute("SELECT bytes, digest FROM pictures WHERE place = ?", (number,)).fetchone()
-    return None if found is None else (found[0], found[1])
+    if found is None:
+        return None
+    content: bytes = found[0]
+    if hashlib.sha256(content).digest() != found[1]:
+        raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
+    return content
 
 
 # Writing
@@ -223,7 +258,7 @@ def _picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
 
 
 def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | None) -> None:
-    """Of a place that has none."""
+    """Store the picture of a place that has none."""
     if content is not None:
         digest = hashlib.sha256(content).digest()
         connection.execute("INSERT INTO pictures VALUES (?, ?, ?)", (number, digest, content))
@@ -232,7 +267,7 @@ def _put_picture(connection: sqlite3.Connection, number: int, content: bytes | N
 def insert(
     connection: sqlite3.Connection, item: Enrolment, row: int, checksum: int, keep: Keep, now: datetime
 ) -> StoredPlace:
-    """A new place, at the end of its sequence."""
+    """Insert a new place at the end of its sequence."""
     code = _sequence_code(connection, item.fields.sequence)
     picture, content = _picture_of(item, keep)
     columns = {
@@ -252,14 +287,14 @@ def insert(
     cursor = connection.execute(f"INSERT INTO places ({names}) VALUES ({marks})", tuple(columns.values()))
     assert cursor.lastrowid is not None
     _put_picture(connection, cursor.lastrowid, content)
-    seals.seal(connection, "places", "number = ?", cursor.lastrowid)
+    row_checksums.write_checksums(connection, "places", "number = ?", cursor.lastrowid)
     return expect(connection, item.id)
 
 
 def _set(connection: sqlite3.Connection, number: int, **columns: Any) -> None:
     assignments = ", ".join(f"{name} = ?" for name in columns)
     connection.execute(f"UPDATE places SET {assignments} WHERE number = ?", (*columns.values(), number))
-    seals.seal(connection, "places", "number = ?", number)
+    row_checksums.write_checksums(connection, "places", "number = ?", number)
 
 
 def replace_descriptor(
@@ -270,7 +305,7 @@ def replace_descriptor(
     checksum: int,
     keep: Keep,
 ) -> None:
-    """Another frame for a place: its descriptor is in another row from now on."""
+    """Give a place another frame, whose descriptor is in another row."""
     picture, content = _picture_of(item, keep)
     connection.execute("DELETE FROM pictures WHERE place = ?", (stored.number,))
     _put_picture(connection, stored.number, content)
@@ -286,7 +321,7 @@ def replace_descriptor(
 
 
 def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: PlaceFields, now: datetime) -> StoredPlace:
-    """Other fields for a place.  It keeps its place in its sequence unless that is another one."""
+    """Change the fields of a place.  Its position in its sequence changes only with the sequence."""
     columns = field_columns(fields)
     if fields.sequence != stored.place.sequence:
         columns["sequence"] = _sequence_code(connection, fields.sequence)
@@ -298,7 +333,7 @@ def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: Plac
 
 
 def set_history(connection: sqlite3.Connection, place_id: str, history: History) -> StoredPlace:
-    """When a place was made and changed, and its order in its sequence, as they were elsewhere."""
+    """Set when a place was made and changed, and its position in its sequence, as in the map that it comes from."""
     stored = expect(connection, place_id)
     moments = {"created_at": moment_text(history.created_at), "updated_at": moment_text(history.updated_at)}
     ordinal = stored.ordinal if history.ordinal is None else history.ordinal
@@ -310,20 +345,41 @@ def set_history(connection: sqlite3.Connection, place_id: str, history: History)
 
 
 def delete(connection: sqlite3.Connection, stored: StoredPlace) -> None:
-    """Forget a place, its picture too."""
+    """Delete a place and its picture."""
     connection.execute("DELETE FROM places WHERE number = ?", (stored.number,))
     _drop_if_empty(connection, stored.sequence)
 
 
 def delete_sequence(connection: sqlite3.Connection, name: str) -> None:
-    """Forget the places of a sequence, and it."""
+    """Delete a sequence and its places."""
     (code,) = connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
     connection.execute("DELETE FROM places WHERE sequence = ?", (code,))
     _drop_if_empty(connection, int(code))
 
 
-def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
-    """Say that a segment file holds so many rows, whose checksums have this checksum."""
+# Segment files
+
+
+def segment_entries(connection: sqlite3.Connection, layout: Layout) -> list[SegmentEntry]:
+    """The segments in their order.
+
+    Raises:
+        Damage: a segment is missing, or one before the last is not full.
+    """
+    query = "SELECT number, rows, checksum, removed FROM segments ORDER BY number"
+    rows = connection.execute(query).fetchall()
+    found = [SegmentEntry(number, count, checksum, bool(removed)) for number, count, checksum, removed in rows]
+    for position, segment in enumerate(found):
+        if not all(isinstance(value, int) for value in (segment.number, segment.rows, segment.checksum)):
+            raise Damage(f"map.sqlite: its entry of segment {position + 1} is invalid")
+        full, last = segment.rows == layout.rows_per_segment, position == len(found) - 1
+        if segment.number != position or segment.rows > layout.rows_per_segment or not (full or last):
+            raise Damage(f"map.sqlite: segment {position + 1} is not as long as it must be")
+    return found
+
+
+def put_segment_entry(connection: sqlite3.Connection, segment: int, rows: int, checksum: int) -> None:
+    """Record that a segment file holds ``rows`` rows, and the checksum of their checksums."""
     statement = "INSERT OR REPLACE INTO segments (number, rows, checksum) VALUES (?, ?, ?)"
     connection.execute(statement, (segment, rows, checksum))
 
@@ -332,19 +388,19 @@ def name_rows(connection: sqlite3.Connection, segment: int, rows: int, checksum:
 
 
 def insert_record(connection: sqlite3.Connection, record: MapRecord, rows_per_segment: int) -> None:
-    """The one row of a new map."""
+    """Insert the record of a new map."""
     columns = {"only": 1, "rows_per_segment": rows_per_segment, **_record_columns(record)}
     names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
     connection.execute(f"INSERT INTO map ({names}) VALUES ({marks})", tuple(columns.values()))
-    seals.seal(connection, "map")
+    row_checksums.write_checksums(connection, "map")
 
 
 def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
-    """Put ``record`` in the place of the map's own."""
+    """Replace the map's record."""
     columns = _record_columns(record)
     assignments = ", ".join(f'"{name}" = ?' for name in columns)
     connection.execute(f"UPDATE map SET {assignments}", tuple(columns.values()))
-    seals.seal(connection, "map")
+    row_checksums.write_checksums(connection, "map")
 
 
 def _record_columns(record: MapRecord) -> dict[str, Any]:
@@ -356,17 +412,17 @@ def _record_columns(record: MapRecord) -> dict[str, Any]:
 
 
 def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
-    """The map's record and the rows of each of its full segments.
+    """The map's record, and how many rows a full segment has.
 
     Raises:
-        ValueError: the row is missing or makes no sense.
+        ValueError: the record is missing or invalid.
     """
     cursor = connection.execute("SELECT * FROM map")
     values = cursor.fetchone()
     if values is None:
         raise ValueError("the map's own record is missing")
     columns = {description[0]: value for description, value in zip(cursor.description, values, strict=True)}
-    if not seals.is_sound([columns[name] for name in SEALED["map"]], columns.pop("seal")):
+    if not row_checksums.is_sound([columns[name] for name in CHECKED["map"]], columns.pop("seal")):
         raise ValueError("it does not match its checksum")
     rows_per_segment = columns.pop("rows_per_segment")
     if not isinstance(rows_per_segment, int):

@@ -1,7 +1,7 @@
-"""The tables of ``map.sqlite`` and how older files become newer ones.
+"""The tables of ``map.sqlite``, and the migrations that bring older files to the newest tables.
 
-A file carries our application id and, as ``user_version``, the number of migrations it has had.
-Every migration is a list of statements; all that a file lacks are applied in one transaction.
+A file's ``user_version`` is the number of migrations that it has had.  A migration is a list of statements; all that a
+file lacks are applied in one transaction.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ import sqlite3
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+from core.disk.files import Damage
+from core.disk.sqlite_file import NotOurs, Schema, TooNew, transaction
 from core.errors import DataDirectoryTooNew
-from core.storage.database import row_checksums as seals
-from core.storage.files.disk import Damage
+from core.storage.database import row_checksums
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
 
@@ -39,14 +40,14 @@ _FIRST: Migration = (
         created_at TEXT NOT NULL,
         updated_at TEXT NOT NULL
     ) STRICT""",
-    # Codes are never used again, so that an old snapshot cannot confuse two sequences.
+    # A code is never used twice, so that an old snapshot cannot confuse two sequences.
     """CREATE TABLE sequences (
         code INTEGER PRIMARY KEY AUTOINCREMENT,
         name TEXT UNIQUE,
         next_ordinal INTEGER NOT NULL
     ) STRICT""",
     f"INSERT INTO sequences VALUES ({NO_SEQUENCE}, NULL, 0)",
-    # What is named of each segment file: so many rows, whose checksums have this checksum.
+    # Of each segment file: how many rows it has, and the checksum of their checksums.
     """CREATE TABLE segments (
         number INTEGER PRIMARY KEY,
         rows INTEGER NOT NULL CHECK (rows > 0),
@@ -69,7 +70,7 @@ _FIRST: Migration = (
         updated_at TEXT NOT NULL
     ) STRICT""",
     "CREATE INDEX places_of_sequence ON places (sequence, number)",
-    # Apart from the places, so that a listing does not read past the pictures.
+    # Apart from the places, so that a listing need not read the pictures.
     """CREATE TABLE pictures (
         place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
         digest BLOB NOT NULL CHECK (length(digest) = 32),
@@ -77,13 +78,13 @@ _FIRST: Migration = (
     ) STRICT""",
 )
 
-# Shape of the local descriptors behind each descriptor; none in the maps that were there before.
+# Shape of the local descriptors; maps that were made before have none.
 _LOCAL: Migration = (
     "ALTER TABLE map ADD COLUMN local_cells INTEGER NOT NULL DEFAULT 0 CHECK (local_cells >= 0)",
     "ALTER TABLE map ADD COLUMN local_values INTEGER NOT NULL DEFAULT 0 CHECK (local_values >= 0)",
 )
 
-# Which camera took a frame, and what is ignored in the frames of each.
+# Which camera took a frame, and what is ignored in its frames.
 _CAMERAS: Migration = (
     """CREATE TABLE cameras (
         name TEXT PRIMARY KEY,
@@ -94,7 +95,7 @@ _CAMERAS: Migration = (
 )
 
 LONGEST_INDEXED = 512
-"""Characters of a text in a place's metadata by which places can be found; longer ones are kept all the same."""
+"""Most characters of a text in a place's metadata by which the place can be found; longer texts are only stored."""
 
 
 def _values_of(place: str) -> str:
@@ -113,9 +114,9 @@ _FILL_VALUES = (
 _INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(source='')}"
 _DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
 
-# By which metadata places are found.  Triggers keep it in step, whatever writes a place.
+# The index by which places are found by their metadata.  Triggers update it with every change of a place.
 _VALUES: Migration = (
-    # The kind tells true from 1; as ANY, 1 and 1.0 are equal.
+    # The kind distinguishes true from 1; with the type ANY, 1 and 1.0 are equal.
     """CREATE TABLE place_values (
         key TEXT NOT NULL,
         kind TEXT NOT NULL,
@@ -132,23 +133,23 @@ _VALUES: Migration = (
     "CREATE INDEX places_in_order ON places (sequence, ordinal)",
 )
 
-# How the map is searched, and how its descriptors are kept; "full" in the maps that were there before.
+# How the map is searched, and how its descriptors are stored; "full" in maps that were made before.
 _TIERS: Migration = (
     "ALTER TABLE map ADD COLUMN \"index\" TEXT NOT NULL DEFAULT 'auto'",
     "ALTER TABLE map ADD COLUMN precision TEXT NOT NULL DEFAULT 'full'",
 )
 
-# A checksum in each row that nothing else vouches for.
-_SEALS: Migration = seals.statements()
+# A checksum in each row of the record, the places and the cameras.
+_SEALS: Migration = row_checksums.statements()
 
-# Segments of which no place is left, and whose files are gone (:mod:`core.storage.reclaiming`).
+# Segments without a place, whose files are deleted (:mod:`core.storage.removed_segments`).
 _REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
 
 MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
-    """The columns of each of the file's own tables."""
+    """The columns of each table."""
     tables = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
     return {
         name: {column for (column,) in connection.execute("SELECT name FROM pragma_table_info(?)", (name,))}
@@ -157,64 +158,57 @@ def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
 
 
 def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS, create: bool = False) -> int:
-    """Bring a file, an empty one only with ``create``, to the last of ``migrations``; all at once or not at all.
+    """Apply the ``migrations`` that a file lacks, all of them or none; to an empty file only with ``create``.
 
     Returns:
         How many were applied.
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the file.
-        Damage: it is a database, but not one of ours; or it has the tables of today and another version.
+        Damage: it is not the database of a map, or it has the newest tables and yet a later version.
         sqlite3.Error: a statement failed; the file is as it was.
     """
-    version: int = connection.execute("PRAGMA user_version").fetchone()[0]
-    (owner,) = connection.execute("PRAGMA application_id").fetchone()
-    is_empty = (version, owner) == (0, 0) and not _columns(connection)
-    if not (is_empty if create else version > 0 and owner == APPLICATION_ID):
-        raise Damage("map.sqlite is not one of placerec's databases")
-    if version > len(migrations):
+    row_checksums.register(connection)
+    try:
+        return _schema(migrations).migrate(connection, create)
+    except NotOurs as error:
+        raise Damage("map.sqlite is not one of placerec's databases") from error
+    except TooNew as error:
         if _statements(connection) == _expected(migrations, _statements):
-            raise Damage(f"map.sqlite says that it is of schema {version}, but its tables are of {len(migrations)}")
+            claimed = f"map.sqlite says that it is of schema {error.version}"
+            raise Damage(f"{claimed}, but its tables are of {len(migrations)}") from error
         raise DataDirectoryTooNew(
-            f"A map was written by a later version of placerec (schema {version}, this one knows {len(migrations)})."
-        )
-    if version < len(migrations):
-        seals.teach(connection)
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            for migration in migrations[version:]:
-                for statement in migration:
-                    connection.execute(statement)
-            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {len(migrations)}")
-            connection.execute("COMMIT")
-        except BaseException:
-            if connection.in_transaction:
-                connection.execute("ROLLBACK")
-            raise
-    return len(migrations) - version
+            f"A map was written by a later version of placerec (schema {error.version}, this one knows"
+            f" {len(migrations)})."
+        ) from error
+
+
+def _schema(migrations: Sequence[Migration]) -> Schema:
+    """The schema whose versions are the migrations; a new file gets all of them, too."""
+    every = [statement for migration in migrations for statement in migration]
+    return Schema(APPLICATION_ID, len(migrations), every, dict(enumerate(migrations)))
 
 
 def _statements(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
-    """All that the file was made of: its tables, indexes and triggers, each with the statement that makes it."""
+    """The tables, indexes and triggers of a file, each with its SQL statement."""
     return set(connection.execute("SELECT type, name, sql FROM sqlite_schema WHERE name NOT LIKE 'sqlite_%'"))
 
 
-def _expected(migrations: Sequence[Migration], told: Callable[[sqlite3.Connection], T]) -> T:
-    """What is told of a file as ``migrations`` make it."""
+def _expected(migrations: Sequence[Migration], read: Callable[[sqlite3.Connection], T]) -> T:
+    """What ``read`` returns for a file that ``migrations`` have made."""
     wanted = sqlite3.connect(":memory:", isolation_level=None)
     try:
         migrate(wanted, migrations, create=True)
-        return told(wanted)
+        return read(wanted)
     finally:
         wanted.close()
 
 
 def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS) -> None:
-    """Compare a file's tables and columns with those that ``migrations`` make.
+    """Check that a file has the tables and columns that ``migrations`` make.
 
     Raises:
-        Damage: something is missing.
+        Damage: one is missing.
     """
     found = _columns(connection)
     for table, columns in _expected(migrations, _columns).items():
@@ -223,40 +217,34 @@ def check_schema(connection: sqlite3.Connection, migrations: Sequence[Migration]
 
 
 def contradictions(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
-    """Where the tables do not follow from the places: the values by which they are found, the ends of sequences."""
-    return misfiled(connection, limit) + cut_sequences(connection, limit)
+    """Where the index of metadata and the ends of sequences contradict the places, at most ``limit`` of each kind."""
+    return stale_metadata_index(connection, limit) + wrong_sequence_ends(connection, limit)
 
 
-def misfiled(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
-    """Where the values by which places are found do not follow from their metadata; :func:`refile` mends it."""
-    told = []
+def stale_metadata_index(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """Where the index of metadata does not match the places; :func:`rebuild_metadata_index` repairs it."""
+    problems = []
     found, due = "SELECT key, kind, value, row FROM place_values", _values_of("p").format(source="places p, ")
     for some, others in ((found, due), (due, found)):
         query = f"SELECT row, key FROM ({some} EXCEPT {others}) LIMIT {limit}"
         for row, key in connection.execute(query).fetchall():
-            told.append(f"row {row} is not found by its metadata {key!r} as it must be")
-    return told
+            problems.append(f"row {row} is not indexed correctly by its metadata {key!r}")
+    return problems
 
 
-def refile(connection: sqlite3.Connection) -> None:
-    """Make the values by which places are found anew, in one transaction.
+def rebuild_metadata_index(connection: sqlite3.Connection) -> None:
+    """Rebuild the index of metadata in one transaction.
 
     Raises:
         sqlite3.Error: the disk refuses; all is as it was.
     """
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with transaction(connection):
         connection.execute("DELETE FROM place_values")
         connection.execute(_FILL_VALUES)
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-        raise
 
 
-def cut_sequences(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
-    """The sequences whose next place would not come behind their last."""
+def wrong_sequence_ends(connection: sqlite3.Connection, limit: int = 10) -> list[str]:
+    """The sequences whose next place would not come after their last."""
     query = (
         "SELECT s.name FROM sequences s JOIN places p ON p.sequence = s.code WHERE s.name IS NOT NULL GROUP BY s.code"
         f" HAVING s.next_ordinal <= max(p.ordinal) LIMIT {limit}"

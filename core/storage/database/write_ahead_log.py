@@ -1,13 +1,13 @@
-"""SQLite's write-ahead log of a map, looked through before SQLite opens it: is what was committed still in it?
+"""Checking SQLite's write-ahead log of a map, before SQLite opens it, for committed transactions that are damaged.
 
-SQLite takes a log up to the first frame that fails its checksum and forgets the rest, for that is what a crash leaves
-behind.  A crash can only touch the last transaction, since each is synced before the next begins.  Where more follow
-the first frame that fails, the log was damaged later, and writes that were acknowledged would vanish without a word.
+SQLite reads a log up to the first frame that fails its checksum and ignores the rest, because that is what a crash
+leaves.  A crash can only affect the last transaction, since each is synced before the next begins.  If further
+transactions follow the first damaged frame, the log was damaged later, and acknowledged writes would be lost silently.
 
-Behind the last transaction there may be frames of one that was taken back: too large for memory, so that it was
-written before its end, or refused in its sync.  They look like those of the log, but each frame's checksum goes on
-from that of the frame before it, and theirs does not go on from the last transaction: where this chain breaks, what
-comes is not known to have been committed after what was before.
+After the last transaction there may be frames of one that was rolled back: it was too large for memory and was written
+before its end, or its sync failed.  They look like other frames, but each frame's checksum continues that of the frame
+before it, and theirs do not continue the last transaction's.  After such a break, frames are not known to have been
+committed after what precedes them.
 
 The log is a header of 32 bytes and frames of 24 bytes and a page: https://www.sqlite.org/fileformat2.html#walformat
 """
@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from core.storage.files.disk import Damage
+from core.disk.files import Damage
 
 _HEADER = struct.Struct(">8I")
 _FRAME = struct.Struct(">6I")
-_MAGIC = 0x377F0682  # the lowest bit says whether checksums are made of big-endian words
+_MAGIC = 0x377F0682  # the lowest bit is set if checksums are computed of big-endian words
 _WORD = 0xFFFFFFFF
 
 Sums = tuple[int, int]
@@ -47,7 +47,7 @@ class _Log:
 
 
 def _header(file: BinaryIO, name: str) -> _Log | None:
-    """What the header says; None for a log in which nothing was ever committed."""
+    """The header of a log; None for a log in which nothing was ever committed."""
     head = file.read(_HEADER.size)
     if len(head) < _HEADER.size:
         return None
@@ -67,7 +67,7 @@ def _frames(file: BinaryIO, log: _Log) -> Iterator[tuple[bytes, bytes]]:
 
 
 def check_log(path: Path) -> None:
-    """Look through the log of a database that nobody has open; nothing happens if there is none.
+    """Check the log of a database that is not open; nothing happens if there is none.
 
     Raises:
         Damage: transactions that were committed and synced cannot be read any more.
@@ -81,8 +81,8 @@ def check_log(path: Path) -> None:
         log = _header(file, path.name)
         if log is None:
             return
-        broken, commits = 0, 0  # the first frame that fails, and the ends of transactions from there on
-        before = {log.sums}  # what the next frame's checksum may go on from
+        broken, commits = 0, 0  # the first damaged frame, and how many transactions end from there on
+        before = {log.sums}  # checksums that the next frame's may continue
         for number, (head, page) in enumerate(_frames(file, log), start=1):
             _, size, *salts, first, second = _FRAME.unpack(head)
             is_ours = (salts[0], salts[1]) == log.salts

@@ -1,1 +1,1 @@
-"""A map's files on disk: written so that power may fail, checked when they are read."""
+"""The files of a map besides its database: descriptors and index files, checked when they are read."""

@@ -1,8 +1,9 @@
-"""Files of arrays that can always be made again: codes, what they have in common, lists.
+"""Files of arrays that can be made again from the descriptors: codes, their coder, lists.
 
-Little-endian: magic, length of a description (uint32), the description as JSON, the arrays one after the other, CRC-32
-of all before it.  The description names the kind of file, of which descriptors it was made, and type and shape of every
-array.  A file that is missing, cut, damaged or of something else is stale: it is made again, never believed.
+A file is little-endian: magic, length of a description (uint32), the description as JSON, the arrays one after the
+other, CRC-32 of all before it.  The description names the kind of file, the descriptors from which it was made, and the
+type and shape of every array.  A file that is missing, incomplete, damaged or made from something else is stale, and is
+made again.
 """
 
 from __future__ import annotations
@@ -14,14 +15,13 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.files.disk import TEMPORARY, sync_folder
+from core.disk.files import replacing
 
 log = logging.getLogger(__name__)
 
@@ -39,19 +39,18 @@ class StaleArrays(Exception):
 
 
 def write_arrays(path: Path, kind: str, made_of: str, arrays: Arrays) -> bool:
-    """Put arrays at ``path``, whole or not at all, synced; a failure is logged, for nothing depends on the file.
+    """Write arrays to ``path``, whole or not at all, durably.  A failure is only logged: nothing depends on the file.
 
     Args:
-        kind, made_of: must be said again to read it.
+        kind, made_of: must be the same when the file is read.
 
     Returns:
-        Whether it is there now.
+        Whether the file was written.
     """
-    temporary = path.with_name(path.name + TEMPORARY)
     listed = [[name, array.dtype.newbyteorder("<").str, list(array.shape)] for name, array in arrays.items()]
     described = json.dumps({"kind": kind, "made_of": made_of, "arrays": listed}).encode()
     try:
-        with temporary.open("wb") as file:
+        with replacing(path) as temporary, temporary.open("wb") as file:
             running = 0
             for piece in (_MAGIC, _LENGTH.pack(len(described)), described):
                 running = _written(file, piece, running)
@@ -59,14 +58,8 @@ def write_arrays(path: Path, kind: str, made_of: str, arrays: Arrays) -> bool:
                 content = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
                 running = _written(file, content.reshape(-1).view(np.uint8).data, running)
             file.write(_CRC.pack(running))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_folder(path.parent)
     except OSError as error:
         log.warning("The file %s could not be written and will be made again: %s", path.name, error)
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
         return False
     return True
 
@@ -77,7 +70,7 @@ def _written(file: BinaryIO, piece: bytes | memoryview, running: int) -> int:
 
 
 def read_arrays(path: Path, kind: str, made_of: str) -> dict[str, NDArray[Any]]:
-    """The arrays of a file that is whole, of this kind, and made of what is said.
+    """The arrays of a file that is complete, of this kind, and made from ``made_of``.
 
     Raises:
         StaleArrays: it is not.
@@ -86,16 +79,16 @@ def read_arrays(path: Path, kind: str, made_of: str) -> dict[str, NDArray[Any]]:
 
 
 def check_arrays(path: Path, kind: str, made_of: str) -> int:
-    """Read a file through; its size in bytes.
+    """Read and check a file; returns its size in bytes.
 
     Raises:
-        StaleArrays: as :func:`read_arrays`.
+        StaleArrays: as for :func:`read_arrays`.
     """
     return _read_file(path, kind, made_of)[1]
 
 
 def _read_file(path: Path, kind: str, made_of: str) -> tuple[dict[str, NDArray[Any]], int]:
-    """The arrays and the size of a file, which may be removed at any moment."""
+    """The arrays and the size of a file, which may be deleted at any moment."""
     try:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size

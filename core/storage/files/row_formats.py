@@ -1,13 +1,13 @@
-"""How descriptors are kept on disk, and how they come back.
+"""The formats in which descriptors are stored on disk.
 
-full        float32 and int8, as they are: maps of the first two versions of segment files
-half        descriptors in half precision, local descriptors as they are
-compressed  descriptors in six bits a value and a scale a block of 128 values, local descriptors in four bits a
-            value and a step a cell: 29 KB instead of 98 for the default encoder
+full        float32 and int8 without change: maps of the first two versions of segment files
+half        descriptors in half precision, local descriptors without change
+compressed  descriptors in six bits per value with a scale per block of 128 values, local descriptors in four bits per
+            value with a step per cell: 29 KB instead of 98 KB with the default encoder
 
 Intra-normalised VLADs and unit vectors have values within [-1, 1], most of them near 1 / 128 (D = 16 384), which half
-precision keeps to 11 bits.  What is searched, shown and compared is what is stored, brought back to float32 and int8.
-``python -m benchmarks.precision`` measures what each costs.
+precision represents with 11 bits.  Searches and comparisons use what is stored, converted back to float32 and int8.
+``python -m benchmarks.precision`` measures the cost of each format.
 """
 
 from __future__ import annotations
@@ -26,20 +26,22 @@ Local = NDArray[np.int8]
 
 Precision = Literal["full", "half", "compressed"]
 NewPrecision = Literal["half", "compressed"]
-"""Those that a map can be made with."""
+"""The formats that a new map can have."""
 
 FULL: Precision = "full"
 HALF: Precision = "half"
 COMPRESSED: Precision = "compressed"
 
 LARGEST_HALF = 65504.0
-"""What half precision can say."""
+"""The largest number in half precision."""
 
 BLOCK = 128
-"""Values of a compressed descriptor that share a scale: the part of one word of the default encoder."""
+"""Values of a compressed descriptor that share a scale: those of one visual word of the default encoder."""
 
-_HIGHEST = 31  # six bits say -31 to 31, kept as 1 to 63: the upper four bits of two a byte, the lower two of four
-_HIGHEST_LOCAL = 7  # four bits say -7 to 7, kept as 1 to 15, two a byte
+_HIGHEST = (
+    31  # six bits hold -31 to 31 as 1 to 63; a byte holds the upper four bits of two values or the lower two of four
+)
+_HIGHEST_LOCAL = 7  # four bits hold -7 to 7 as 1 to 15; a byte holds two values
 
 _BYTES = np.arange(256)
 _HALVES = np.stack([_BYTES % 16, _BYTES // 16], axis=1)
@@ -48,14 +50,14 @@ _UPPER = (4 * _HALVES - 32).astype(np.float32)
 _LOWER = _QUARTERS.astype(np.float32)
 _LOCAL = (_HALVES - 8).astype(np.int8)
 
-_FEW_QUERIES = 4  # for more it is quicker to unpack once
+_FEW_QUERIES = 4  # for more queries it is faster to unpack the rows once
 
 Field = tuple[str, tuple[int, ...]]
 """Type and shape of a field of a record."""
 
 
 def resting_types(precision: Precision, dimension: int, local_shape: tuple[int, int]) -> tuple[Field, Field]:
-    """How a descriptor of D values and local descriptors of shape (C, L) are kept."""
+    """The fields that hold a descriptor of D values and local descriptors of shape (C, L)."""
     if precision == COMPRESSED:
         cells, values = local_shape
         blocks = -(-dimension // BLOCK)
@@ -64,7 +66,7 @@ def resting_types(precision: Precision, dimension: int, local_shape: tuple[int, 
 
 
 def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> NDArray[Any]:
-    """float32 [n, D] as it is kept, [n, …]; halves are rounded to the nearest, ties to even."""
+    """Convert descriptors, float32 [n, D], to their stored form, [n, …]; halves are rounded to nearest, ties even."""
     if precision == FULL:
         return descriptors
     if precision == HALF:
@@ -72,7 +74,7 @@ def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> 
     n, dimension = descriptors.shape
     count = -(-dimension // BLOCK)
     blocks = _whole_blocks(descriptors).reshape(n, count, BLOCK)
-    # Upwards, so that no value lies outside; a block of zeros has any scale.
+    # The scale is rounded up, so that no value exceeds it; that of a block of zeros does not matter.
     scales = np.nextafter((np.abs(blocks).max(axis=2) / _HIGHEST).astype("<f2"), np.float16(np.inf)).astype("<f2")
     values = np.rint(blocks / scales[:, :, np.newaxis].astype(np.float32)).reshape(n, count * BLOCK)
     codes = (np.clip(values, -_HIGHEST, _HIGHEST) + 32).astype(np.uint8)
@@ -82,18 +84,18 @@ def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> 
 
 
 def _whole_blocks(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """float32 [n, D] with zeros up to the next whole block; the vectors themselves where none are missing."""
+    """Pad vectors, float32 [n, D], with zeros to a whole number of blocks; without need they are not copied."""
     missing = -vectors.shape[1] % BLOCK
     return np.pad(vectors, ((0, 0), (0, missing))) if missing else vectors
 
 
 def _paired(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Numbers under 16, an even number of them in the last axis, two a byte."""
+    """Pack numbers below 16 two per byte; the length of the last axis is even."""
     return np.asarray(codes[..., ::2] | codes[..., 1::2] << 4)
 
 
 def unpack_descriptors(kept: NDArray[Any], precision: Precision, dimension: int) -> NDArray[np.float32]:
-    """float32 [n, D] of what :func:`pack_descriptors` gave."""
+    """Convert descriptors back from the form that :func:`pack_descriptors` gave: float32 [n, D]."""
     if precision != COMPRESSED:
         return np.ascontiguousarray(kept, dtype=np.float32)
     n, count = len(kept), -(-dimension // BLOCK)
@@ -106,14 +108,14 @@ def unpack_descriptors(kept: NDArray[Any], precision: Precision, dimension: int)
 
 
 def _parts_of(kept: NDArray[Any], dimension: int) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Scales float32 [n, blocks], upper four bits of values two a byte, lower two bits four a byte."""
+    """The scales, float32 [n, blocks], the upper four bits of values (two a byte) and the lower two (four a byte)."""
     count = -(-dimension // BLOCK)
     scales = np.ascontiguousarray(kept[:, : 2 * count]).view("<f2").astype(np.float32)
     return scales, kept[:, 2 * count : (2 + BLOCK // 2) * count], kept[:, (2 + BLOCK // 2) * count :]
 
 
 def pack_local(local: Local, precision: Precision) -> NDArray[Any]:
-    """int8 [n, C, L] as it is kept, [n, …].  Compressed: in whole steps, of each cell as small as its values allow."""
+    """Convert local descriptors, int8 [n, C, L], to their stored form, [n, …]; each cell gets its smallest step."""
     if precision != COMPRESSED:
         return local
     n = len(local)
@@ -126,7 +128,7 @@ def pack_local(local: Local, precision: Precision) -> NDArray[Any]:
 
 
 def unpack_local(kept: NDArray[Any], precision: Precision, local_shape: tuple[int, int]) -> Local:
-    """int8 [n, C, L] of what :func:`pack_local` gave."""
+    """Convert local descriptors back from the form that :func:`pack_local` gave: int8 [n, C, L]."""
     if precision != COMPRESSED:
         return np.ascontiguousarray(kept)
     n, (cells, values) = len(kept), local_shape
@@ -138,9 +140,9 @@ def unpack_local(kept: NDArray[Any], precision: Precision, local_shape: tuple[in
 
 
 def inner_products(queries: NDArray[np.float32], kept: NDArray[Any], precision: Precision) -> NDArray[np.float32]:
-    """Of queries, float32 [B, D], with kept descriptors, [k, …]: float32 [B, k].
+    """Inner products of queries, float32 [B, D], with descriptors in their stored form, [k, …]: float32 [B, k].
 
-    Halves are brought back to float32 register by register; every product is summed in float32.
+    Every product is summed in float32.
     """
     rows, dimension = len(kept), queries.shape[1]
     if precision == COMPRESSED:

@@ -1,8 +1,8 @@
-"""Rows read from the segment files when they are wanted, each checked as it is read.
+"""Reading single rows of segment files, each of which is checked.
 
-A map whose codes are in memory keeps its descriptors here only.  They are read by position and not through memory maps,
-although only the pages that are touched are read either way: a file that was cut under us is then damage with a name,
-not the end of the process, and what the system keeps of the files counts as its cache, not as our memory.
+A large map has only codes in memory and reads its descriptors from here.  They are read by position and not through
+memory maps: if a file is too short, that is reported as damage and does not end the process by a signal, and what the
+system caches of the files does not count as memory of the process.
 """
 
 from __future__ import annotations
@@ -16,36 +16,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from core.storage.files.disk import Damage, missing
+from core.disk.files import Damage, missing
 from core.storage.files.row_formats import FULL, Local, inner_products
 from core.storage.files.segment_files import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
 
 Rows = NDArray[np.int64]
 Checksums = NDArray[np.uint32]
-"""Of rows, as SQLite names them; 0 for rows that no place names."""
+"""Checksums of rows as SQLite has them; 0 for rows without a place."""
 
 
-class Shelf:
-    """The records of a map.  Any thread may read; rows behind those that are acknowledged are the caller's to avoid.
+class RowReader:
+    """Reads rows of one map's segment files.  Any thread may use it; callers ask only for rows that were written.
 
-    Every method that reads may raise Damage (a file is missing, short, or a row fails its checksum or is not the one
-    named) and OSError (the disk refuses).
+    Every method that reads may raise Damage (a file is missing or too short, or a row does not match its checksum or
+    that in SQLite) and OSError (the disk refuses).
     """
 
     def __init__(self, folder: Path, layout: Layout) -> None:
-        """Of the map in ``folder``; no file is opened yet."""
+        """For the map in ``folder``; no file is opened yet."""
         self._folder, self._path = folder, os.path.join(folder, "")
         self._layout = layout
         record = layout.record
         assert record.fields is not None
         offsets = {name: described[1] for name, described in record.fields.items()}
-        # In version 3 descriptor, sums and local descriptors follow one another, and each end is read with the sums.
+        # A record of version 3 holds descriptor, checksums, local descriptors: either end is read with the checksums.
         is_split = layout.precision != FULL
         self._first = self._part(0, offsets["local"]) if is_split else self._part(0, record.itemsize)
         self._last = self._part(offsets["row"] if is_split else 0, record.itemsize)
 
     def _part(self, start: int, stop: int) -> tuple[int, np.dtype[np.void]]:
-        """The fields of a record that lie within bytes start … stop of it."""
+        """The offset ``start`` in a record, and the type of its fields from byte ``start`` to ``stop``."""
         record = self._layout.record
         assert record.fields is not None and record.names is not None
         chosen = [name for name in record.names if start <= record.fields[name][1] < stop]
@@ -58,7 +58,7 @@ class Shelf:
         return start, np.dtype(fields)  # type: ignore[call-overload]
 
     def check(self, number: int, rows: int) -> None:
-        """Is the file of a segment there, with its header, and long enough for so many rows?"""
+        """Raise Damage unless the file of a segment is there, has its header, and is long enough for ``rows`` rows."""
         file = self._open(number)
         try:
             check_header(self._folder / segment_name(number), os.pread(file, HEADER_BYTES, 0), self._layout, number)
@@ -73,7 +73,7 @@ class Shelf:
         return self._layout.descriptors_of(self._first_parts(rows, checksums))
 
     def inner_products(self, queries: NDArray[np.float32], rows: Rows, checksums: Checksums) -> NDArray[np.float32]:
-        """Of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
+        """Inner products of queries, float32 [B, D], with the descriptors of rows: float32 [B, k]."""
         kept = self._first_parts(rows, checksums)["descriptor"]
         return inner_products(queries, kept, self._layout.precision)
 
@@ -89,18 +89,18 @@ class Shelf:
     def _checked(
         self, part: tuple[int, np.dtype[np.void]], rows: Rows, checksums: Checksums, name: str
     ) -> NDArray[np.void]:
-        """Parts of records, each that of its row, whole, and of the frame that SQLite names."""
+        """Read a part of the records of rows and check that each is of its row, sound, and the one that SQLite has."""
         found = self._read(rows, *part)
         whole = self._sound(found, rows, name)
         stated = found["checksum"].tolist()
-        for row, named, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
-            if not sound or (named and named != checksum):
+        for row, expected, checksum, sound in zip(rows.tolist(), checksums.tolist(), stated, whole, strict=True):
+            if not sound or (expected and expected != checksum):
                 where = f"{segment_name(row // self._layout.rows_per_segment)}: row {row}"
                 raise Damage(f"{where} {'is of another frame' if sound else 'does not match its checksum'}")
         return found
 
     def _sound(self, found: NDArray[np.void], rows: Rows, name: str) -> list[bool]:
-        """Whether each is that of its row and passes its checksums, as far as they are of ``name``."""
+        """Whether each record is of its row and matches the checksums that cover the field ``name``."""
         if self._layout.precision == FULL:
             return [self._layout.is_sound(part, row) for part, row in zip(found, rows.tolist(), strict=True)]
         fields = found.dtype.fields
@@ -117,7 +117,7 @@ class Shelf:
         return sound
 
     def _read(self, rows: Rows, start: int, dtype: np.dtype[Any]) -> NDArray[np.void]:
-        """Bytes start … of the records of rows, in the order of the rows."""
+        """The fields ``dtype`` from byte ``start`` on of the records of rows, in the order of the rows."""
         layout, order = self._layout, np.argsort(rows, kind="stable").tolist()
         found = np.empty(len(rows), dtype)
         size, stride = dtype.itemsize, layout.record.itemsize
@@ -128,7 +128,7 @@ class Shelf:
             file = self._open(number)
             try:
                 if len(wanted) > 1:
-                    for _, at in wanted:  # the disk may fetch all of them at once
+                    for _, at in wanted:  # lets the system fetch all of them at once
                         os.posix_fadvise(file, at, size, os.POSIX_FADV_WILLNEED)
                 for to, at in wanted:
                     if os.preadv(file, [content[to : to + size]], at) < size:
@@ -139,7 +139,7 @@ class Shelf:
         return found
 
     def _open(self, number: int) -> int:
-        """The file of a segment; to be closed."""
+        """A file descriptor of a segment, which the caller closes."""
         path = f"{self._path}{segment_name(number)}"
         try:
             return os.open(path, os.O_RDONLY | os.O_CLOEXEC)

@@ -1,23 +1,21 @@
-"""Segment files: the descriptors of a map, append-only, every row with a checksum of its own.
+"""Segment files: the descriptors of a map, append-only, with a checksum for every row.
 
-Little-endian throughout.  A file is a header of 4 096 bytes followed by records (see `Layout.record`):
+A file is little-endian: a header of 4 096 bytes followed by records (see `Layout.record`):
 
-    header   magic, version, how descriptors are kept, dimension, rows of a full segment, first row, length of
-             the encoder identity; from version 2 on the cells and the values a cell of the local descriptors;
-             the identity, zeros, CRC-32 of all before it
+    header   magic, version, format of the descriptors, dimension, rows of a full segment, first row, length of the
+             encoder identity; from version 2 on the cells and the values per cell of the local descriptors; the
+             identity, zeros, CRC-32 of all before it
     record   versions 1, 2: descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
              CRC-32 of descriptors and row (uint32), zeros (uint32)
-             version 3: descriptor at rest, row (uint64), checksum of the record (uint32), CRC-32 of descriptor
-             and row (uint32), CRC-32 of local descriptors and row (uint32), zeros (uint32), local descriptors
-             at rest
+             version 3: stored descriptor, row (uint64), checksum of the record (uint32), CRC-32 of descriptor and
+             row (uint32), CRC-32 of local descriptors and row (uint32), zeros (uint32), stored local descriptors
 
-Maps that were made before there was version 3 go on in theirs: 1 where their encoder has no second stage, which is
-2 without local descriptors.  In version 3 the checksum of a record is the CRC-32 of its two others, so that the
-descriptor can be read and checked without its neighbour, and its neighbour without it; how both are kept is the
-map's precision (:data:`Precision`).
+Maps made before version 3 keep their version: 2, or 1 if their encoder has no second stage.  In version 3 the checksum
+of a record is the CRC-32 of its two other checksums, so that the descriptor and the local descriptors can each be read
+and checked without the other; both are stored in the map's precision (:data:`Precision`).
 
-Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  Only as many
-records count as SQLite names; what stands behind them was never acknowledged and is overwritten.
+Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  SQLite says how many records
+count; any that follow were never acknowledged and are overwritten.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,7 +33,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from core.storage.files.disk import Damage, missing, sync_folder, write_at
+from core.disk.files import Damage, missing, sync_folder, write_at
 from core.storage.files.row_formats import (
     FULL,
     Descriptor,
@@ -66,7 +64,7 @@ _CHUNK_BYTES = 8 << 20
 
 @dataclass(frozen=True)
 class Layout:
-    """What all segment files of a map have in common; ``local_shape`` is (C, L)."""
+    """What all segment files of a map have in common; ``local_shape`` is (C, L), the shape of local descriptors."""
 
     dimension: int
     identity: str
@@ -78,11 +76,11 @@ class Layout:
         if len(self.identity.encode()) > _IDENTITY_BYTES:
             raise ValueError(f"an encoder identity has at most {_IDENTITY_BYTES} bytes")
         if self.local_shape != NO_LOCAL and min(self.local_shape) < 1:
-            raise ValueError(f"local descriptors of {self.local_shape} cells and values make no sense")
+            raise ValueError(f"local descriptors cannot have {self.local_shape} cells and values")
 
     @property
     def version(self) -> int:
-        """Of the segment files."""
+        """The version of the segment files."""
         if self.precision != FULL:
             return _LATEST_VERSION
         return _FIRST_VERSION if self.local_shape == NO_LOCAL else _LOCAL_VERSION
@@ -108,60 +106,48 @@ class Layout:
         content = (fixed + shape + identity).ljust(HEADER_BYTES - 4, b"\x00")
         return content + struct.pack("<I", zlib.crc32(content))
 
-    def packed(self, descriptors: Sequence[Descriptor], local: Sequence[Local], first_row: int) -> NDArray[np.void]:
-        """Frames as records for the rows from ``first_row`` on, checksums included.
-
-        Args:
-            descriptors, local: of the same n frames, float32 [D] and int8 [C, L] each.
-        """
-        frames = list(zip(descriptors, local, strict=True))
-        records = np.zeros(len(frames), dtype=self.record)
-        for i, (descriptor, cells) in enumerate(frames):
-            self.pack(records[i], descriptor, cells, first_row + i)
-        return records
-
     def pack(self, record: np.void, descriptor: Descriptor, local: Local, row: int) -> None:
-        """Make a frame, float32 [D] and int8 [C, L], the content of a record of zeros, checksums included."""
+        """Fill a record of zeros with a frame's descriptors, float32 [D] and int8 [C, L], and their checksums."""
         record["descriptor"] = pack_descriptors(descriptor[np.newaxis], self.precision)[0]
         record["local"] = pack_local(local[np.newaxis], self.precision)[0]
-        self._seal(record, row)
+        self._complete(record, row)
 
     @cached_property
     def frame(self) -> np.dtype[np.void]:
-        """The structured type of a frame at rest without the row and the checksums that a record adds to it."""
+        """The structured type of a frame's stored descriptors, without the row and the checksums of a record."""
         descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
         return np.dtype([("descriptor", *descriptor), ("local", *local)])
 
-    def sealed(self, frames: NDArray[np.void], first_row: int) -> NDArray[np.void]:
-        """Frames at rest (:attr:`frame`) as records for the rows from ``first_row`` on, checksums included."""
+    def records_of(self, frames: NDArray[np.void], first_row: int) -> NDArray[np.void]:
+        """Records with checksums of stored descriptors (:attr:`frame`) for the rows from ``first_row`` on."""
         records = np.zeros(len(frames), dtype=self.record)
         for name in ("descriptor", "local"):
             records[name] = frames[name]
         for row, record in enumerate(records, start=first_row):
-            self._seal(record, row)
+            self._complete(record, row)
         return records
 
-    def _seal(self, record: np.void, row: int) -> None:
+    def _complete(self, record: np.void, row: int) -> None:
         record["row"] = row
         if self.version == _LATEST_VERSION:
             record["of_descriptor"], record["of_local"] = self.part_checksums(record, row)
         record["checksum"] = self.row_checksum(record, row)
 
     def part_checksums(self, record: np.void, row: int) -> tuple[int, int]:
-        """CRC-32 of the descriptor and the row, and of the local descriptors and the row, of what is in ``record``."""
+        """CRC-32 of a record's descriptor with the row, and of its local descriptors with the row."""
         place = struct.pack("<Q", row)
         descriptor, local = (np.ascontiguousarray(record[name]).tobytes() for name in ("descriptor", "local"))
         return zlib.crc32(place, zlib.crc32(descriptor)), zlib.crc32(place, zlib.crc32(local))
 
     def row_checksum(self, record: np.void, row: int) -> int:
-        """The checksum of what ``record`` holds, if it is that of ``row``: in the wrong place it does not pass."""
+        """The checksum that ``record`` has as that of ``row``; a record in the wrong place does not match it."""
         if self.version == _LATEST_VERSION:
             return zlib.crc32(struct.pack("<II", *self.part_checksums(record, row)))
         running = zlib.crc32(record["descriptor"].tobytes())
         return zlib.crc32(struct.pack("<Q", row), zlib.crc32(record["local"].tobytes(), running))
 
     def is_sound(self, record: np.void, row: int) -> bool:
-        """Whether a record is that of ``row`` and passes its checksums."""
+        """Whether a record is of ``row`` and matches its checksums."""
         if record["row"] != row or record["checksum"] != self.row_checksum(record, row):
             return False
         if self.version < _LATEST_VERSION:
@@ -169,11 +155,11 @@ class Layout:
         return (int(record["of_descriptor"]), int(record["of_local"])) == self.part_checksums(record, row)
 
     def descriptors_of(self, records: NDArray[np.void]) -> NDArray[np.float32]:
-        """What is searched: float32 [n, D]."""
+        """The descriptors of records, which are searched: float32 [n, D]."""
         return unpack_descriptors(records["descriptor"], self.precision, self.dimension)
 
     def locals_of(self, records: NDArray[np.void]) -> Local:
-        """What the second stage compares: int8 [n, C, L]."""
+        """The local descriptors of records, which the second stage compares: int8 [n, C, L]."""
         return unpack_local(records["local"], self.precision, self.local_shape)
 
 
@@ -182,13 +168,13 @@ def segment_name(number: int) -> str:
     return f"descriptors-{number + 1:06d}.seg"
 
 
-def chain(checksums: ArrayLike, before: int = 0) -> int:
-    """The checksum of a segment: CRC-32 over those of its rows, continued from ``before``."""
+def segment_checksum(checksums: ArrayLike, before: int = 0) -> int:
+    """The checksum of a segment: CRC-32 of the checksums of its rows, continued from ``before``."""
     return zlib.crc32(np.asarray(checksums, dtype="<u4").tobytes(), before)
 
 
 def check_header(path: Path, found: bytes, layout: Layout, number: int) -> None:
-    """Raise Damage unless the first bytes of a segment file are what they must be."""
+    """Raise Damage unless ``found`` is the header of a segment."""
     if found == layout.header(number):
         return
     if len(found) < HEADER_BYTES:
@@ -199,10 +185,10 @@ def check_header(path: Path, found: bytes, layout: Layout, number: int) -> None:
 
 
 def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterator[NDArray[np.void]]:
-    """The first ``rows`` records of a segment, a few megabytes at a time; not yet checked.
+    """The first ``rows`` records of a segment, a few megabytes at a time, without checking them.
 
     Raises:
-        Damage: the file is missing, too short, or its header is not what it must be.
+        Damage: the file is missing, too short, or its header is wrong.
         OSError: the disk refuses.
     """
     path = folder / segment_name(number)
@@ -227,32 +213,32 @@ def read_records(folder: Path, layout: Layout, number: int, rows: int) -> Iterat
 
 
 def damaged_rows(layout: Layout, records: NDArray[np.void], first_row: int) -> list[int]:
-    """Those of consecutive records, the first of which is ``first_row``, that fail their checksum."""
+    """The rows of consecutive records from ``first_row`` on that do not match their checksum."""
     return [row for row, record in enumerate(records, start=first_row) if not layout.is_sound(record, row)]
 
 
 def read_checked(folder: Path, layout: Layout, number: int, rows: int, checksum: int) -> Iterator[NDArray[np.void]]:
-    """Like :func:`read_records`, every record checked, and the segment as a whole at the end.
+    """Like :func:`read_records`, with every record checked, and the segment as a whole at the end.
 
     Raises:
-        Damage: a row fails its checksum, or all pass but they are not those that were named.
+        Damage: a row does not match its checksum, or all do but they are not those of ``checksum``.
     """
     row, running = number * layout.rows_per_segment, 0
     for records in read_records(folder, layout, number, rows):
         if damaged := damaged_rows(layout, records, row):
             raise Damage(f"{segment_name(number)}: row {damaged[0]} does not match its checksum")
-        running = chain(records["checksum"], running)
+        running = segment_checksum(records["checksum"], running)
         row += len(records)
         yield records
     if running != checksum:
-        raise Damage(f"{segment_name(number)}: the rows are not those that map.sqlite names")
+        raise Damage(f"{segment_name(number)}: the rows are not those that map.sqlite records")
 
 
 def append(folder: Path, layout: Layout, first_row: int, records: NDArray[np.void]) -> None:
-    """Write records (:meth:`Layout.packed`) behind the ``first_row`` rows there are; sync files and folders touched.
+    """Append records to the ``first_row`` rows of a map, and sync the files and the folder.
 
     Raises:
-        OSError: the disk refuses; what it holds behind ``first_row`` is then unknown (:func:`rewind`).
+        OSError: the disk refuses; what the files hold from ``first_row`` on is then unknown (:func:`rewind`).
     """
     done = 0
     while done < len(records):
@@ -276,7 +262,7 @@ def _write(path: Path, layout: Layout, number: int, offset: int, records: NDArra
 
 
 def rewind(folder: Path, layout: Layout, rows: int) -> None:
-    """Leave nothing behind the first ``rows`` rows: cut the last segment, remove those that follow it.
+    """Cut the segment files of a map to its first ``rows`` rows.
 
     Raises:
         OSError: the disk refuses.

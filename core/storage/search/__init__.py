@@ -1,1 +1,1 @@
-"""What of a map is searched: immutable snapshots in memory, and the indexes that large maps are searched by."""
+"""Searching a map: immutable snapshots in memory, and the indexes of large maps, which are built in the background."""

@@ -1,9 +1,9 @@
-"""Codes, what they have in common, and lists, on disk: made again where they are missing, stale or damaged.
+"""The index files of a map, which are made again if they are missing, stale or damaged.
 
-coder.index         what all codes of the map have in common; made once, when the map gets its first codes
-codes-….index       codes of a group of segments, by the rows and checksums that SQLite names of them
+coder.index         the coder of all codes of the map, made when the map gets its first codes
+codes-….index       codes of a group of segments, and the rows and checksums that SQLite has of them
 lists.index         rows by nearest centre
-recall.index        what was measured of them
+recall.index        the recall that was measured
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from pathlib import Path
 import numpy as np
 
 from core.index import Coder, Codes, InvertedLists
-from core.storage.database.segment_table import NamedSegment
+from core.storage.database.ledger import SegmentEntry
 from core.storage.files.arrays import Arrays, StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
 from core.storage.search.tiers import Recall, Tier
 
 GROUP_ROWS = 4096
-"""Rows whose codes are one file, as far as segments divide it: some 9 MB of the default encoder's codes."""
+"""About so many rows have their codes in one file: some 9 MB with the default encoder."""
 
 _CENTRED, _LISTED = "centred", "listed"
 
 
 def segments_per_group(layout: Layout) -> int:
-    """Segments whose codes are one file."""
+    """How many segments have their codes in one file."""
     return max(1, GROUP_ROWS // layout.rows_per_segment)
 
 
@@ -39,7 +39,7 @@ def codes_name(group: int) -> str:
 
 
 def _digest(coder: Coder) -> str:
-    """Tells coders apart."""
+    """CRC-32 of a coder's tensors, which tells coders apart."""
     running = 0
     for name, array in sorted(coder.tensors().items()):
         running = zlib.crc32(
@@ -49,16 +49,16 @@ def _digest(coder: Coder) -> str:
 
 
 class IndexFiles:
-    """Of one map.  Reading raises StaleArrays where there is nothing good; writing that fails is only logged."""
+    """The index files of one map.  Reading raises StaleArrays if a file is of no use; a failed write is only logged."""
 
     def __init__(self, folder: Path, layout: Layout) -> None:
-        """Of the map in ``folder``."""
+        """For the map in ``folder``."""
         self._folder = folder
         self._map = f"{layout.identity} {layout.dimension} {layout.precision}"
         self._rows_per_segment = layout.rows_per_segment
         self.group_size = segments_per_group(layout)
-        """Segments whose codes are one file."""
-        self._coder: tuple[Coder, str] | None = None  # the last one seen, and its digest
+        """How many segments have their codes in one file."""
+        self._coder: tuple[Coder, str] | None = None  # the last coder used, and its digest
 
     def _made_by(self, coder: Coder) -> str:
         if self._coder is None or self._coder[0] is not coder:
@@ -66,49 +66,49 @@ class IndexFiles:
         return f"{self._map} {self._coder[1]}"
 
     def read_coder(self) -> Coder:
-        """What the codes of the map have in common."""
+        """Read the map's coder."""
         try:
             return Coder.of(read_arrays(self._folder / "coder.index", "coder", self._map))
         except ValueError as error:
             raise StaleArrays(f"it holds no coder: {error}") from error
 
     def write_coder(self, coder: Coder) -> bool:
-        """Keep it; whether it is kept."""
+        """Write the map's coder; returns whether it was written."""
         return write_arrays(self._folder / "coder.index", "coder", self._map, coder.tensors())
 
-    def named_group(self, named: Sequence[NamedSegment], group: int) -> Sequence[NamedSegment]:
-        """What SQLite says of the segments of a group; empty behind the last."""
-        return named[group * self.group_size : (group + 1) * self.group_size]
+    def group_entries(self, entries: Sequence[SegmentEntry], group: int) -> Sequence[SegmentEntry]:
+        """The segments of a group; empty after the last group."""
+        return entries[group * self.group_size : (group + 1) * self.group_size]
 
-    def _group_of(self, coder: Coder, named: Sequence[NamedSegment]) -> str:
-        listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in named])
+    def _group_of(self, coder: Coder, entries: Sequence[SegmentEntry]) -> str:
+        listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in entries])
         return f"{self._made_by(coder)} {hashlib.sha256(listed.encode()).hexdigest()}"
 
-    def read_codes(self, coder: Coder, named: Sequence[NamedSegment]) -> Codes:
-        """Of the rows of a group, of which SQLite says ``named``."""
-        path = self._folder / codes_name(named[0].number // self.group_size)
-        arrays = read_arrays(path, "codes", self._group_of(coder, named))
+    def read_codes(self, coder: Coder, entries: Sequence[SegmentEntry]) -> Codes:
+        """Read the codes of the rows of a group, whose segments are ``entries``."""
+        path = self._folder / codes_name(entries[0].number // self.group_size)
+        arrays = read_arrays(path, "codes", self._group_of(coder, entries))
         sketches, bits, scales = coder.shape
-        rows = sum(segment.rows for segment in named)
+        rows = sum(segment.rows for segment in entries)
         wanted = {
             "sketches": ((rows, sketches), np.dtype("<u8")),
             "bits": ((rows, bits), np.dtype("<u8")),
             "scales": ((rows, scales), np.dtype("<f4")),
         }
         if {name: (array.shape, array.dtype) for name, array in arrays.items()} != wanted:
-            raise StaleArrays("it holds other codes than it must")
+            raise StaleArrays("it holds other codes than expected")
         return Codes(arrays["sketches"], arrays["bits"], arrays["scales"])
 
-    def write_codes(self, coder: Coder, named: Sequence[NamedSegment], codes: Codes) -> bool:
-        """Keep the codes of a group; whether they are kept."""
-        path = self._folder / codes_name(named[0].number // self.group_size)
+    def write_codes(self, coder: Coder, entries: Sequence[SegmentEntry], codes: Codes) -> bool:
+        """Write the codes of a group; returns whether they were written."""
+        path = self._folder / codes_name(entries[0].number // self.group_size)
         arrays: Arrays = {"sketches": codes.sketches, "bits": codes.bits, "scales": codes.scales}
-        return write_arrays(path, "codes", self._group_of(coder, named), arrays)
+        return write_arrays(path, "codes", self._group_of(coder, entries), arrays)
 
-    def read_lists(self, coder: Coder, rows: int, named: Sequence[NamedSegment]) -> tuple[InvertedLists, int]:
-        """Of at most the ``rows`` rows that have codes; and how many there were when their centres were found.
+    def read_lists(self, coder: Coder, rows: int, entries: Sequence[SegmentEntry]) -> tuple[InvertedLists, int]:
+        """Read the lists of at most ``rows`` rows, and how many rows there were when their centres were computed.
 
-        They are of these rows: the full segments among them are those that SQLite has ``named``.
+        Lists are stale if the full segments among their rows are not those of ``entries``.
         """
         arrays = read_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
         try:
@@ -117,25 +117,25 @@ class IndexFiles:
         except (ValueError, LookupError) as error:
             raise StaleArrays(f"it holds no lists: {error}") from error
         if lists.rows > rows:
-            raise StaleArrays("it lists rows that there are not")
-        if listed != self._full_within(named, lists.rows):
-            raise StaleArrays("it lists other rows than there are")
+            raise StaleArrays("it lists rows that do not exist")
+        if listed != self._full_within(entries, lists.rows):
+            raise StaleArrays("it lists other rows than those of the map")
         return lists, centred
 
-    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int, named: Sequence[NamedSegment]) -> bool:
-        """Keep them; whether they are kept."""
-        listed = np.frombuffer(self._full_within(named, lists.rows), np.uint8)
+    def write_lists(self, coder: Coder, lists: InvertedLists, centred: int, entries: Sequence[SegmentEntry]) -> bool:
+        """Write the lists; returns whether they were written."""
+        listed = np.frombuffer(self._full_within(entries, lists.rows), np.uint8)
         arrays = {**lists.tensors(), _CENTRED: np.array([centred]), _LISTED: listed}
         return write_arrays(self._folder / "lists.index", "lists", self._made_by(coder), arrays)
 
-    def _full_within(self, named: Sequence[NamedSegment], rows: int) -> bytes:
-        """Tells the full segments among the first ``rows`` rows from any others; full ones never change."""
-        full = named[: rows // self._rows_per_segment]
+    def _full_within(self, entries: Sequence[SegmentEntry], rows: int) -> bytes:
+        """A digest of the full segments among the first ``rows`` rows; full segments never change."""
+        full = entries[: rows // self._rows_per_segment]
         listed = json.dumps([[segment.number, segment.rows, segment.checksum] for segment in full])
         return hashlib.sha256(listed.encode()).digest()
 
     def read_recall(self, coder: Coder, tier: Tier) -> Recall:
-        """What was measured last of this tier."""
+        """Read the last recall that was measured in this tier."""
         arrays = read_arrays(self._folder / "recall.index", "recall", f"{self._made_by(coder)} {tier}")
         try:
             at_1, queries, shortlist, places = arrays["recall"].tolist()
@@ -144,13 +144,13 @@ class IndexFiles:
             raise StaleArrays("it holds no recall") from error
 
     def write_recall(self, coder: Coder, tier: Tier, recall: Recall) -> bool:
-        """Keep it; whether it is kept."""
+        """Write the recall; returns whether it was written."""
         values = np.array([recall.at_1, recall.queries, recall.shortlist, recall.places])
         made_of = f"{self._made_by(coder)} {tier}"
         return write_arrays(self._folder / "recall.index", "recall", made_of, {"recall": values})
 
-    def check(self, named: Sequence[NamedSegment], tier: Tier) -> tuple[int, list[str]]:
-        """Read all files that a map of this tier should have; bytes that are good, and what is stale."""
+    def check(self, entries: Sequence[SegmentEntry], tier: Tier) -> tuple[int, list[str]]:
+        """Read all files that a map of this tier should have; returns the bytes checked, and which files are stale."""
         if tier == "exact":
             return 0, []
         checked, stale = 0, []
@@ -159,10 +159,10 @@ class IndexFiles:
             checked += check_arrays(self._folder / "coder.index", "coder", self._map)
         except StaleArrays as error:
             return 0, [f"coder.index: {error}"]
-        full = [self.named_group(named, group) for group in range(len(named) // self.group_size)]
+        full = [self.group_entries(entries, group) for group in range(len(entries) // self.group_size)]
         for group in full:
             if group[-1].rows < group[0].rows:
-                continue  # it still grows
+                continue  # the group still grows
             path = self._folder / codes_name(group[0].number // self.group_size)
             try:
                 checked += check_arrays(path, "codes", self._group_of(coder, group))
@@ -171,13 +171,13 @@ class IndexFiles:
         if tier == "inverted":
             try:
                 checked += check_arrays(self._folder / "lists.index", "lists", self._made_by(coder))
-                self.read_lists(coder, sum(segment.rows for segment in named), named)
+                self.read_lists(coder, sum(segment.rows for segment in entries), entries)
             except StaleArrays as error:
                 stale.append(f"lists.index: {error}")
         return checked, stale
 
     def remove(self) -> None:
-        """All of them, for a map that is searched exactly.
+        """Delete all index files, because the map is searched exactly.
 
         Raises:
             OSError: the disk refuses.

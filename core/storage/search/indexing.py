@@ -1,9 +1,9 @@
-"""Bringing a map to the tier that it is to have, in the background.
+"""Building the codes and lists of a map in the background, until the map has the tier that it should have.
 
-One thread a map, there only while there is work.  It reads rows and makes codes of them without holding anything up,
-and publishes what it has made as a new snapshot, a few hundred rows at a time: searches go on in what is there, and
-rows without a code are compared exactly.  What it made is kept in files (:mod:`core.storage.search.index_files`), so
-that after a kill it goes on where the last whole file ends.
+Each map has one thread for this, while there is work.  It reads rows and makes codes of them without holding up writes
+or searches, and publishes the codes in a new snapshot, a few hundred rows at a time; rows without a code are compared
+exactly.  Codes are written to files (:mod:`core.storage.search.index_files`), so that after a kill the work continues
+after the last complete file.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, CodeTable, InvertedLists
-from core.storage.database.segment_table import NamedSegment
+from core.storage.database.ledger import SegmentEntry
 from core.storage.files.arrays import StaleArrays
-from core.storage.files.disk import Damage
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.parallel import threads
-from core.storage.search.rebuilding import codes_of, fitted_coder, remade
-from core.storage.search.recall import measured
+from core.storage.search.rebuilding import codes_of, fitted_coder, rebuilt
+from core.storage.search.recall import measure_recall
 from core.storage.search.segment import Held, flat_index, vectors
-from core.storage.search.snapshot import Snapshot
+from core.storage.search.snapshot import Snapshot, threads
 from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, tier_for
 
 log = logging.getLogger(__name__)
@@ -35,61 +34,61 @@ log = logging.getLogger(__name__)
 _ROWS_AT_ONCE = 256
 _NICENESS = 10
 _PATIENCE_SECONDS = 0.1
-_UNLISTED_SHARE = 0.02
-_GROWN = 2  # so many times as many places as when it was measured, the recall is measured again
+_UNLISTED_SHARE = 0.02  # lists are extended when a larger share of the rows is in none
+_GROWN = 2  # when the places have grown by this factor, the recall is measured again
 
 
 class Stopped(Exception):
-    """The map was closed; raised within the thread that builds."""
+    """The map was closed; raised in the thread that builds."""
 
 
 @dataclass(frozen=True)
 class IndexedMap:
-    """What is built for.
+    """What the indexer uses of its map.
 
-    setting: the tier that its owner chose.
-    snapshot: the newest.
-    publish: puts a change of the newest snapshot in its place, no write coming in between; raises Stopped when the
-        map was closed.
-    named: what SQLite says of the segments.
-    quarantine: the map turns out to be damaged.
+    setting: returns the tier that the owner chose.
+    snapshot: returns the newest snapshot.
+    publish: replaces the newest snapshot by a change of it, while no write can happen; raises Stopped if the map was
+        closed.
+    entries: returns the segments as SQLite has them.
+    quarantine: takes the map out of service, because it is damaged.
     """
 
     setting: Callable[[], TierSetting]
     snapshot: Callable[[], Snapshot]
     publish: Callable[[Callable[[Snapshot], Snapshot]], Snapshot]
-    named: Callable[[], Sequence[NamedSegment]]
+    entries: Callable[[], Sequence[SegmentEntry]]
     quarantine: Callable[[Damage], None]
 
 
 def tier_of(snapshot: Snapshot) -> Tier:
-    """How it is searched."""
+    """How a snapshot is searched."""
     if snapshot.table is None:
         return "exact"
     return "compact" if snapshot.lists is None else "inverted"
 
 
 class Indexer:
-    """Builds what one map is searched by.  From any thread."""
+    """Builds the codes and lists of one map.  Any thread may use it."""
 
     def __init__(self, of: IndexedMap, files: IndexFiles) -> None:
         """For an open map."""
         self._map = of
         self._files = files
         self._lock = threading.Lock()
-        self._building = threading.Lock()  # held by the one thread that builds
+        self._building = threading.Lock()  # held by the thread that builds
         self._thread: threading.Thread | None = None
         self.problem: str | None = None
-        """Why the last attempt to build came to no end, if it did not."""
+        """Why the last attempt to build failed, if it did."""
         self._again = False
         self._stopping = threading.Event()
         self._progress = 0.0
         self._recall: tuple[Tier, Recall] | None = None
-        self._written: set[tuple[NamedSegment, ...]] = set()
-        self._centred = 0  # rows when the centres of the lists were found
+        self._written: set[tuple[SegmentEntry, ...]] = set()
+        self._centred = 0  # rows when the centres of the lists were computed
 
     def wake(self) -> None:
-        """See whether there is anything to build, and begin with it."""
+        """Start building in the background, if there is anything to build."""
         with self._lock:
             if self._stopping.is_set():
                 return
@@ -99,10 +98,10 @@ class Indexer:
                 self._thread.start()
 
     def stop(self, wait: bool = True) -> None:
-        """End what is under way; what was published stays.
+        """Stop building; what was published stays.
 
         Args:
-            wait: until it has ended; not from within the map's lock.
+            wait: wait until the thread has ended; not while the map's lock is held.
         """
         with self._lock:
             self._stopping.set()
@@ -111,11 +110,11 @@ class Indexer:
             thread.join()
 
     def status(self, newest: Callable[[], Snapshot | None]) -> IndexStatus | None:
-        """How the map is searched; None where there is no snapshot any more.
+        """How the map is searched; None if it has no snapshot any more.
 
         Args:
-            newest: gives the newest snapshot.  It is taken when it is known whether anything is being built, or what
-                was just built could be said to be ready and not to be there.
+            newest: returns the newest snapshot.  It is called after the state of the building was read; otherwise the
+                index could be reported as ready but missing.
         """
         with self._lock:
             is_building, progress, recall = self._thread is not None, self._progress, self._recall
@@ -138,7 +137,7 @@ class Indexer:
         return tier_for(self._map.setting(), len(snapshot), tier_of(snapshot))
 
     def needs_work(self, snapshot: Snapshot) -> bool:
-        """Whether anything is to be built for a snapshot; cheap."""
+        """Whether anything has to be built for a snapshot; this is cheap."""
         wanted = self._wanted(snapshot)
         if wanted == "exact":
             return snapshot.table is not None or not snapshot.holds
@@ -150,7 +149,7 @@ class Indexer:
         return recall is None or recall[0] != wanted or recall[1].places * _GROWN < len(snapshot)
 
     def _work(self) -> None:
-        threads()  # begun by a thread that is not nice, for those that search with them have to wait for them
+        threads()  # started before this thread lowers its priority, which they would inherit
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
         while True:
@@ -162,9 +161,9 @@ class Indexer:
             try:
                 with self._building:
                     wanted = self._wanted(self._map.snapshot())
-                    self._settle()
+                    self._build()
                 self.problem = None
-                if self._wanted(self._map.snapshot()) != wanted:  # by a write that found nothing built yet
+                if self._wanted(self._map.snapshot()) != wanted:  # a write changed it meanwhile
                     with self._lock:
                         self._again = True
             except (Stopped, UnknownMap, MapQuarantined):
@@ -172,11 +171,11 @@ class Indexer:
             except Damage as damage:
                 self._map.quarantine(damage)
             except Exception:
-                # It is tried again with the next write or start; searches go on in what there is.
-                log.exception("What a map is searched by could not be built to the end.")
-                self.problem = "what the map is searched by could not be built to the end; the log says why"
+                # It is tried again with the next write or start; searches use what is there.
+                log.exception("The index of a map could not be completed.")
+                self.problem = "the index of the map could not be completed; the log says why"
 
-    def _settle(self) -> None:
+    def _build(self) -> None:
         snapshot = self._map.snapshot()
         if self._wanted(snapshot) == "exact":
             if snapshot.table is not None or not snapshot.holds:
@@ -195,16 +194,16 @@ class Indexer:
             raise Stopped
         return self._map.publish(change)
 
-    def _told(self, done: int, total: int) -> None:
+    def _report(self, done: int, total: int) -> None:
         if self._stopping.is_set():
             raise Stopped
         self._progress = done / max(1, total)
 
     def rebuild(self, progress: Callable[[int, int], None]) -> None:
-        """Make all of it anew from the descriptors, and put it in the place of what is there, which serves until then.
+        """Build codes and lists again from the descriptors; the present ones are searched until they are replaced.
 
         Args:
-            progress: told of rows done and of all; what it raises leaves everything as it was.
+            progress: is called with the rows done and all rows; what it raises leaves everything as it was.
 
         Raises:
             Stopped: the map was closed.
@@ -221,7 +220,7 @@ class Indexer:
         try:
             if (wanted := self._wanted(self._map.snapshot())) == "exact":
                 return
-            made = remade(self._map.snapshot, wanted == "inverted", told)
+            made = rebuilt(self._map.snapshot, wanted == "inverted", told)
             self._publish(made.put_into)
             self._files.write_coder(made.table.coder)
             self._written.clear()
@@ -229,7 +228,7 @@ class Indexer:
             self._keep_codes()
             if made.lists is not None:
                 self._centred = made.lists.rows
-                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.named())
+                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.entries())
         finally:
             self._building.release()
             self.wake()
@@ -237,7 +236,7 @@ class Indexer:
     # Codes
 
     def _code_all(self) -> None:
-        """A code for every row, and no descriptor in memory."""
+        """Make codes of all rows and free the descriptors in memory."""
         newest = self._map.snapshot()
         if newest.table is None:
             coder = self._coder(newest)
@@ -247,7 +246,7 @@ class Indexer:
         while newest.coded < newest.rows:
             assert newest.table is not None
             newest = self._code_group(newest.table.coder, newest.coded)
-            self._told(newest.coded, newest.rows)
+            self._report(newest.coded, newest.rows)
         for number, segment in enumerate(newest.segments):
             if segment.held is not None:
                 self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
@@ -256,18 +255,18 @@ class Indexer:
         try:
             return self._files.read_coder()
         except StaleArrays as stale:
-            log.info("The codes of a map are made: coder.index: %s.", stale)
+            log.info("The codes of a map are built: coder.index: %s.", stale)
         coder = fitted_coder(snapshot)
         self._files.write_coder(coder)
         return coder
 
     def _code_group(self, coder: Coder, start: int) -> Snapshot:
-        """Codes of the next rows: from the group's file if they begin one that has a good one, else made."""
-        named = self._map.named()
+        """Add the codes of the next rows: those of a whole group from its file if that is good, else computed ones."""
+        entries = self._map.entries()
         newest = self._map.snapshot()
         per_segment = newest.rows_per_segment
         group = start // per_segment // self._files.group_size
-        of_group = self._files.named_group(named, group)
+        of_group = self._files.group_entries(entries, group)
         if start == group * self._files.group_size * per_segment:
             with suppress(StaleArrays):
                 codes = self._files.read_codes(coder, of_group)
@@ -280,11 +279,11 @@ class Indexer:
         newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None:
             newest = self._publish(lambda now: now.holding(number, None))
-        if stop == sum(segment.rows for segment in named[: (group + 1) * self._files.group_size]):
+        if stop == sum(segment.rows for segment in entries[: (group + 1) * self._files.group_size]):
             self._keep_group(of_group)
         return newest
 
-    def _keep_group(self, of_group: Sequence[NamedSegment]) -> None:
+    def _keep_group(self, of_group: Sequence[SegmentEntry]) -> None:
         snapshot = self._map.snapshot()
         first = of_group[0].number * snapshot.rows_per_segment
         if tuple(of_group) in self._written or snapshot.table is None:
@@ -294,17 +293,17 @@ class Indexer:
             self._written.add(tuple(of_group))
 
     def _keep_codes(self) -> None:
-        """The codes of every whole group in its file, those that the writer made included."""
-        named = self._map.named()
-        for group in range(len(named) // self._files.group_size):
-            of_group = self._files.named_group(named, group)
+        """Write the codes of every complete group to its file, including codes that writes have added."""
+        entries = self._map.entries()
+        for group in range(len(entries) // self._files.group_size):
+            of_group = self._files.group_entries(entries, group)
             if of_group[-1].rows == of_group[0].rows:
-                self._told(group, len(named))
+                self._report(group, len(entries))
                 self._keep_group(of_group)
 
-    def keep_tail(self, snapshot: Snapshot, named: Sequence[NamedSegment]) -> None:
-        """The codes of the last group, which is not whole, so that the next start need not make them again."""
-        of_group = self._files.named_group(named, max(0, len(named) - 1) // self._files.group_size)
+    def keep_tail(self, snapshot: Snapshot, entries: Sequence[SegmentEntry]) -> None:
+        """Write the codes of the last, incomplete group, so that the next start need not compute them."""
+        of_group = self._files.group_entries(entries, max(0, len(entries) - 1) // self._files.group_size)
         if of_group and snapshot.table is not None and snapshot.coded == snapshot.rows:
             first = of_group[0].number * snapshot.rows_per_segment
             if tuple(of_group) not in self._written:
@@ -313,23 +312,23 @@ class Indexer:
     # Lists
 
     def _list_all(self) -> None:
-        """Lists of nearly all rows; the few others are searched one by one."""
+        """Make lists of nearly all rows; the codes of the few others are all read by a search."""
         snapshot = self._map.snapshot()
         assert snapshot.table is not None
         lists = snapshot.lists
-        if lists is None or not self._centred:  # those that the map was opened with tell when they were found
+        if lists is None or not self._centred:  # the file says how many rows there were when the centres were computed
             with suppress(StaleArrays):
-                named = self._map.named()
-                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, named)
-        # Centres fit the places there were; of twice as many they are found again.
+                entries = self._map.entries()
+                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, entries)
+        # Centres are computed again when the rows have doubled.
         if lists is None or 2 * self._centred < snapshot.coded:
-            lists, self._centred = InvertedLists.built(snapshot.table, progress=self._told), snapshot.coded
+            lists, self._centred = InvertedLists.built(snapshot.table, progress=self._report), snapshot.coded
         elif snapshot.lists is not None and snapshot.coded - lists.rows <= _UNLISTED_SHARE * snapshot.rows:
             return
         else:
             lists = lists.extended(snapshot.table)
         self._publish(lambda now: replace(now, lists=lists))
-        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.named())
+        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.entries())
 
     # Recall
 
@@ -344,7 +343,7 @@ class Indexer:
         known = self._recall[1].places if self._recall is not None and self._recall[0] == present else 0
         if known * _GROWN >= len(snapshot):
             return
-        found = measured(snapshot, self._told)
+        found = measure_recall(snapshot, self._report)
         if found is not None:
             self._recall = (present, found)
             self._files.write_recall(snapshot.table.coder, present, found)
@@ -352,12 +351,12 @@ class Indexer:
     # Back to exact search
 
     def _hold_all(self) -> None:
-        """Every descriptor in memory, and no codes."""
+        """Read all descriptors into memory and drop the codes."""
         newest = self._publish(lambda now: replace(now, holds=True))
         for number, segment in enumerate(newest.segments):
             if segment.held is None and not segment.removed:
                 self._hold(number)
-            self._told(number + 1, len(newest.segments))
+            self._report(number + 1, len(newest.segments))
         self._publish(lambda now: replace(now, table=None, lists=None))
         with self._lock:
             self._recall = None
@@ -365,7 +364,7 @@ class Indexer:
         self._files.remove()
 
     def _hold(self, number: int) -> None:
-        """The descriptors of a segment in memory; it may grow meanwhile, if it is the last."""
+        """Read the descriptors of a segment into memory; the last segment may grow meanwhile."""
 
         def read(now: Snapshot, before: Held | None) -> Held:
             first, count = now.segments[number].first_row, len(now.segments[number])

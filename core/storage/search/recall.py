@@ -1,8 +1,8 @@
-"""How often do the codes of a map find what an exact search finds?
+"""Measuring how often a search by codes finds what an exact search finds.
 
-Nobody knows what robots will ask, so places of the map are looked for by made-up second visits: of every block of a
-descriptor's values a third, chosen at random, is that of the place, the rest is that of another place at random.  What
-an exact search of the same snapshot finds first is the truth, whichever place that is.
+Real queries are not known, so places of the map are searched for by synthetic second visits: a random third of the
+blocks of a descriptor is that of the place, the others are those of another random place.  The best place of an exact
+search of the same snapshot is the truth.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from core.storage.search.tiers import Recall
 QUERIES = 128
 OWN_SHARE = 1 / 3
 BLOCK = 128
-"""Values that come from one place together: a word's part of the default encoder's descriptors."""
+"""Values of a block: those of one visual word of the default encoder."""
 
 _TOGETHER = 256  # rows compared exactly at a time
 
 
 def second_visits(snapshot: Snapshot, count: int, seed: int = 0) -> NDArray[np.float32]:
-    """Made-up descriptors of second visits to living places, float32 [count, D]."""
+    """Synthetic descriptors of second visits to places of the map, float32 [count, D]."""
     random = np.random.default_rng(seed)
     living = np.flatnonzero(snapshot.alive)
     own, other = (snapshot.descriptors_at(random.choice(living, count)) for _ in range(2))
@@ -33,13 +33,13 @@ def second_visits(snapshot: Snapshot, count: int, seed: int = 0) -> NDArray[np.f
     return np.where(is_own, own, other)
 
 
-def best_rows(
+def best_products(
     snapshot: Snapshot, queries: NDArray[np.float32], progress: Callable[[int, int], None]
 ) -> NDArray[np.float32]:
-    """The largest inner product of each query with a living place, by comparing them all: float32 [B].
+    """The largest inner product of each query with any place, by comparing all places: float32 [B].
 
     Args:
-        progress: told rows done and rows in all; may raise to stop it.
+        progress: is called with the rows done and all rows; what it raises ends the work.
     """
     living = np.flatnonzero(snapshot.alive)
     best = np.full(len(queries), -np.inf, np.float32)
@@ -50,15 +50,18 @@ def best_rows(
     return best
 
 
-def measured(snapshot: Snapshot, progress: Callable[[int, int], None] = lambda done, total: None) -> Recall | None:
-    """The recall of a snapshot that has codes; None without places.
+def measure_recall(
+    snapshot: Snapshot, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Recall | None:
+    """The recall@1 of a snapshot with codes against exact search; None without places.
 
-    What is found first must be worth as much as the best, to float32 rounding: of places that are alike any will do.
+    A result counts as right if its inner product equals the best one up to float32 rounding, so that any of several
+    places with equal descriptors will do.
     """
     if not len(snapshot):
         return None
     queries = second_visits(snapshot, QUERIES)
-    truth = best_rows(snapshot, queries, progress)
+    truth = best_products(snapshot, queries, progress)
     found = np.array([snapshot.search(query)[1][0] for query in queries])
     tolerance = 1e-4 * np.maximum(1e-6, np.abs(truth))
     right = float(np.mean(found >= truth - tolerance))

@@ -1,40 +1,84 @@
-"""Consecutive rows of a map: where their places are and, in a map that is searched exactly, their descriptors."""
+"""A segment of a map in memory: where the places of its rows are and, if the map is searched exactly, descriptors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import nan
 
 import faiss
 import numpy as np
 from numpy.typing import NDArray
 
 from core.index.exact import Rows, compare
-from core.judgement.verdict import Whereabouts
+from core.places import NO_TIME, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
-from core.storage.search.spots import Spot, joined, memory_of, whereabouts_of
 
 _SMALLEST_TAIL = 8
 
 
+@dataclass(frozen=True)
+class Location:
+    """Where one place is; the fields are those of :class:`Whereabouts`."""
+
+    kind: int
+    position: tuple[float, float, float]
+    sequence: int
+    ordinal: int
+    heading: float = nan
+    timestamp: int = NO_TIME
+
+
+def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
+    """The whereabouts of n places, in their order."""
+    return Whereabouts(
+        np.array([location.kind for location in locations], dtype=np.int8),
+        np.array([location.position for location in locations], dtype=np.float64).reshape(-1, 3),
+        np.array([location.sequence for location in locations], dtype=np.int32),
+        np.array([location.ordinal for location in locations], dtype=np.int64),
+        np.array([location.heading for location in locations], dtype=np.float32),
+        np.array([location.timestamp for location in locations], dtype=np.int64),
+    )
+
+
+def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
+    """Concatenate whereabouts."""
+    if not parts:
+        return whereabouts_of([])
+    return Whereabouts(
+        np.concatenate([part.kind for part in parts]),
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.sequence for part in parts]),
+        np.concatenate([part.ordinal for part in parts]),
+        np.concatenate([part.heading for part in parts]),
+        np.concatenate([part.timestamp for part in parts]),
+    )
+
+
+def memory_of(whereabouts: Whereabouts) -> int:
+    """Bytes of the columns."""
+    columns = vars(whereabouts).values()
+    return sum(column.nbytes for column in columns)
+
+
 def flat_index(capacity: int, dimension: int, halves: bool = False) -> faiss.IndexFlatCodes:
-    """An inner-product index with room for ``capacity`` rows, all zero, to be filled through :func:`vectors`.
+    """An inner-product index with room for ``capacity`` rows of zeros, to be filled through :func:`vectors`.
 
     Args:
-        halves: the rows are kept in half precision; their values have to be such that nothing is lost by it.
+        halves: hold the rows in half precision; their values have to be exact in it.
     """
     index: faiss.IndexFlatCodes = faiss.IndexFlatIP(dimension)
     if halves:
         index = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
-        index.is_trained = True  # there is nothing to learn
+        index.is_trained = True  # this kind of index needs no training
     index.codes.resize(capacity * index.code_size)
     index.ntotal = capacity
     return index
 
 
 def vectors(index: faiss.IndexFlatCodes) -> Rows:
-    """The rows of an index itself, not a copy: float32 or float16 [capacity, D], valid as long as the index is."""
+    """The rows of an index without a copy: float32 or float16 [capacity, D], valid as long as the index lives."""
     size = index.ntotal * index.code_size
     flat = faiss.rev_swig_ptr(index.codes.data(), size) if size else np.empty(0, np.uint8)
     rows: Rows = flat.view(np.float16) if index.code_size == 2 * index.d else flat.view(np.float32)
@@ -43,10 +87,10 @@ def vectors(index: faiss.IndexFlatCodes) -> Rows:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """Descriptors of a segment in memory.
+    """The descriptors of a segment in memory.
 
-    index: holds the segment's rows, and behind them room that nobody reads.
-    local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room behind them.
+    index: the segment's rows, followed by room for further rows.
+    local: the local descriptors of the same rows, int8 [capacity, C, L], with the same room.
     """
 
     index: faiss.IndexFlatCodes
@@ -54,21 +98,21 @@ class Held:
 
     @cached_property
     def rows(self) -> Rows:
-        """The descriptors in the index itself."""
+        """The descriptors in the index, without a copy."""
         return vectors(self.index)
 
     @classmethod
     def nothing(cls, dimension: int, local_shape: tuple[int, int], halves: bool = False) -> Held:
-        """Of a segment without rows."""
+        """The descriptors of a segment without rows."""
         return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
 
     def appended(
         self, n: int, descriptors: Sequence[Descriptor] | Rows, local: Sequence[Local] | Local, largest: int
     ) -> Held:
-        """With more rows behind the first ``n``, in memory that is shared where it suffices."""
+        """With more rows after the first ``n``; the memory is shared if it has room for them."""
         index, cells, end = self.index, self.local, n + len(descriptors)
         if end > index.ntotal:
-            # Doubling: over a segment's life each row is copied about once.
+            # The room doubles, so that each row is copied about once over a segment's life.
             capacity = min(largest, max(end, 2 * index.ntotal, _SMALLEST_TAIL))
             index = flat_index(capacity, self.index.d, self.rows.dtype == np.float16)
             cells = np.zeros((capacity, *cells.shape[1:]), np.int8)
@@ -81,19 +125,20 @@ class Held:
 
 
 class Reading:
-    """As long as this lives, the file of a segment may be read."""
+    """A token: as long as it lives, the file of a segment may be read."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Consecutive rows of a map.
+    """Consecutive rows of a map.  Immutable.
 
-    held: their descriptors, or None: they are on the shelf (:class:`core.storage.files.row_reader.Shelf`).
-    first_row: the map's row that is row 0 here.
-    alive: bool [n], False for the rows of places that were forgotten or got another frame.
-    checksums: uint32 [n], what SQLite names of each row; 0 where it names none.
+    held: their descriptors in memory; None if they are read from disk
+        (:class:`core.storage.files.row_reader.RowReader`).
+    first_row: the row of the map that is row 0 of the segment.
+    alive: bool [n], False for rows of places that were deleted or got another frame.
+    checksums: uint32 [n], of each row as SQLite has it; 0 if it has none.
     reading: is shared by all states of the segment in which its file may be read.
-    removed: no row is alive, and there are no descriptors any more, in memory or on the shelf.
+    removed: no row is alive, and the descriptors are deleted in memory and on disk.
     """
 
     held: Held | None
@@ -109,48 +154,48 @@ class Segment:
 
     @property
     def index(self) -> faiss.IndexFlatCodes:
-        """Of a segment that holds its descriptors."""
+        """The index of a segment that holds its descriptors."""
         assert self.held is not None
         return self.held.index
 
     @property
     def local(self) -> Local:
-        """Of a segment that holds its descriptors: int8 [capacity, C, L]."""
+        """The local descriptors of a segment that holds them: int8 [capacity, C, L]."""
         assert self.held is not None
         return self.held.local
 
     @property
     def memory(self) -> int:
-        """Bytes that the segment takes."""
+        """Bytes of memory that the segment takes."""
         held = 0 if self.held is None else vectors(self.index).nbytes + self.local.nbytes
         return held + memory_of(self.whereabouts) + self.alive.nbytes + self.checksums.nbytes
 
     def appended(
         self,
         descriptors: Sequence[Descriptor] | Rows,
-        spots: Sequence[Spot],
+        locations: Sequence[Location],
         local: Sequence[Local] | Local,
         checksums: Sequence[int],
         largest: int,
     ) -> Segment:
-        """With more rows.  Only on the newest segment, by one thread: the room behind it is shared."""
+        """With more rows.  Call it only on the newest state, from one thread: the room after the rows is shared."""
         return replace(
             self,
             held=None if self.held is None else self.held.appended(len(self), descriptors, local, largest),
-            whereabouts=joined([self.whereabouts, whereabouts_of(spots)]),
+            whereabouts=joined([self.whereabouts, whereabouts_of(locations)]),
             alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
             checksums=np.concatenate([self.checksums, np.array(checksums, dtype=np.uint32)]),
         )
 
-    def moved(self, spots: Mapping[int, Spot]) -> Segment:
-        """With some of the map's rows somewhere else."""
+    def moved(self, locations: Mapping[int, Location]) -> Segment:
+        """With other locations of some of the map's rows."""
         old = self.whereabouts
         new = old.take(np.arange(len(old)))
-        for row, spot in spots.items():
+        for row, location in locations.items():
             offset = row - self.first_row
-            new.kind[offset], new.position[offset] = spot.kind, spot.position
-            new.sequence[offset], new.ordinal[offset] = spot.sequence, spot.ordinal
-            new.heading[offset], new.timestamp[offset] = spot.heading, spot.timestamp
+            new.kind[offset], new.position[offset] = location.kind, location.position
+            new.sequence[offset], new.ordinal[offset] = location.sequence, location.ordinal
+            new.heading[offset], new.timestamp[offset] = location.heading, location.timestamp
         return replace(self, whereabouts=new)
 
     def without(self, rows: Sequence[int]) -> Segment:
@@ -165,16 +210,11 @@ class Segment:
         """How many rows are alive."""
         return int(np.count_nonzero(self.alive))
 
-    @property
-    def has_life(self) -> bool:
-        """Whether any row is alive."""
-        return self.living > 0
-
     def without_rows(self) -> Segment:
-        """Removed: without descriptors, and without a hold on its file."""
+        """The removed segment: it has no descriptors and does not keep its file."""
         return replace(self, held=None, reading=Reading(), removed=True)
 
     def search(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The inner products of ``queries`` [B, D] with some of the map's rows [k] that are held: float32 [B, k]."""
+        """The inner products of ``queries`` [B, D] with some rows of the map [k] that are held: float32 [B, k]."""
         assert self.held is not None
         return compare(queries, self.held.rows, rows - self.first_row)

@@ -1,23 +1,25 @@
-"""What is searched: an immutable view of a map.
+"""Searching a map: an immutable snapshot of its places.
 
-A map's rows lie in segments of a fixed size; the last one, the tail, still grows.  A write makes a
-new snapshot that shares all descriptors and codes with the one before: rows are put behind those
-that older snapshots see, and only the few bytes per row that say where a place is, and whether it is
-still alive, are copied, for the segments that the write touches.
+A map's rows lie in segments of a fixed size, of which the last one still grows.  A write makes a new snapshot that
+shares descriptors and codes with the one before: rows are added after those that older snapshots see, and only the few
+bytes per row that say where a place is and whether it is alive are copied, for the segments that the write touches.
 
-A small map holds its descriptors in memory and ranks every place (the tier ``exact``).  A larger one
-holds codes of them (``compact``), by nearest centre too in the largest maps (``inverted``): the codes
-name the few places that are worth an exact comparison, whose descriptors are read from the shelf.
-Rows that have no code yet are compared exactly, so that what is searched is always the whole map.
+A small map holds its descriptors in memory and compares every place (the tier ``exact``).  A larger map holds codes of
+its descriptors (``compact``); in the largest maps these are also sorted into lists by nearest centre (``inverted``).
+The codes choose the few places whose descriptors are read from disk and compared exactly.  Rows without a code yet are
+compared exactly, so that the whole map is always searched.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
+from threading import Barrier
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,31 +28,50 @@ from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
 from core.index.exact import Rows
 from core.index.ranking import ranked
-from core.judgement.verdict import Whereabouts
-from core.method.cells import ScatteredCells
+from core.method.agreement import ScatteredCells
+from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
-from core.storage.files.row_reader import Shelf
+from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
-from core.storage.search.parallel import threads, together
-from core.storage.search.segment import Held, Segment, vectors
-from core.storage.search.spots import Spot, joined, whereabouts_of
+from core.storage.search.segment import Held, Location, Segment, joined, vectors, whereabouts_of
+from core.threads import cores, in_turns, keep_to
 
-__all__ = ["SHORTLIST", "Ranking", "Segment", "Snapshot", "Spot"]
+__all__ = ["SHORTLIST", "Location", "Ranking", "Segment", "Snapshot"]
 
 Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Rows, best first, and their inner products."""
 
 SHORTLIST = 100
-"""Places of a coded map whose descriptors are compared exactly; its rankings are of these."""
+"""Places of a map with codes whose descriptors are compared exactly; rankings of such a map hold only these."""
 
-_PART_BYTES = 32 << 20  # of descriptors that one thread compares at a time: about a millisecond's work
-_SHARE = 2  # one of two cores takes nearly all of the memory's speed, and the other has frames to encode
-_PART_ROWS = 25  # that one thread reads from the shelf at a time
+_PART_BYTES = 32 << 20  # of descriptors that a thread compares at a time, in about a millisecond
+_SHARE = 2  # half of the cores use nearly all of the memory's bandwidth; the others can encode frames
+_PART_ROWS = 25  # that a thread reads from disk at a time
+
+Part = TypeVar("Part")
+
+
+@cache
+def threads() -> tuple[ThreadPoolExecutor, int]:
+    """The threads that the searches of all maps share, one per core that the process may use; and their number."""
+    count = cores()
+    pool = ThreadPoolExecutor(count, "search", keep_to, (None,))
+    # They are all started now, because a thread inherits the niceness of its starter for good.
+    begun = Barrier(count)
+    for _ in range(count):
+        pool.submit(begun.wait)
+    return pool, count
+
+
+def together(run: Callable[[Part], None], parts: Sequence[Part], share: int = 1) -> None:
+    """Run every part once, on the calling thread and others, together one thread per ``share`` cores."""
+    helpers = min(len(parts), cores() // share) - 1
+    in_turns(run, parts, threads()[0] if helpers > 0 else None, helpers)
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Rows of a segment, and where among all that are compared they stand."""
+    """Rows of a segment, and their positions among all rows that are compared."""
 
     segment: Segment
     rows: NDArray[np.int64]
@@ -59,21 +80,22 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """All places of a map at one moment.  ``rows_per_segment`` and ``local_shape``, (C, L), are the map's.
+    """All places of a map at one moment.  Immutable; any thread may search it.
 
-    shelf: the descriptors of segments that hold none in memory.
+    dimension, rows_per_segment, local_shape: of the map; ``local_shape`` is (C, L).
+    row_reader: reads the descriptors of segments that hold none in memory.
     table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
-    lists: the same rows by nearest centre; None in all but the largest maps.
+    lists: the same rows by nearest centre; None except in the largest maps.
     holds: whether new rows are held in memory.
-    halves: their descriptors are held in half precision, which says all of what is stored.
-    guard: entered around everything that reads from the shelf; names what the disk refuses.
+    halves: descriptors in memory are in half precision, in which they are also stored.
+    guard: is entered around everything that reads from disk, to name its errors.
     """
 
     dimension: int
     rows_per_segment: int
     segments: tuple[Segment, ...] = ()
     local_shape: tuple[int, int] = NO_LOCAL
-    shelf: Shelf | None = None
+    row_reader: RowReader | None = None
     table: CodeTable | None = None
     lists: InvertedLists | None = None
     holds: bool = True
@@ -85,7 +107,7 @@ class Snapshot:
 
     @property
     def rows(self) -> int:
-        """Rows ever written, those of forgotten places included."""
+        """Rows ever written, including those of deleted places."""
         return self.segments[-1].first_row + len(self.segments[-1]) if self.segments else 0
 
     @property
@@ -95,11 +117,11 @@ class Snapshot:
 
     @cached_property
     def whereabouts(self) -> Whereabouts:
-        """By row, dead rows included: take the rows that :meth:`search` returns."""
+        """The whereabouts of all rows, including dead ones; index it by the rows that :meth:`search` returns."""
         return joined([segment.whereabouts for segment in self.segments])
 
     def whereabouts_at(self, rows: NDArray[np.int64]) -> Whereabouts:
-        """The same as ``whereabouts.take(rows)``, without putting all rows of a large map together for it."""
+        """The same as ``whereabouts.take(rows)``, without concatenating all segments of a large map."""
         if len(rows) * 8 > self.rows:
             return self.whereabouts.take(rows)
         numbers, offsets = np.divmod(rows, self.rows_per_segment)
@@ -111,18 +133,18 @@ class Snapshot:
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:
-        """By row, whether a place is there: bool [rows]."""
+        """Whether each row belongs to a place: bool [rows]."""
         parts = [segment.alive for segment in self.segments]
         return np.concatenate(parts) if parts else np.empty(0, dtype=np.bool_)
 
     @cached_property
     def _count(self) -> int:
-        """How many places are alive; counted anew only in the segments that a write touched."""
+        """How many places there are; segments that a write did not touch remember their count."""
         return sum(segment.living for segment in self.segments)
 
     @cached_property
     def _held(self) -> NDArray[np.bool_]:
-        """By row, whether its descriptor is not on the shelf, but in memory or removed: bool [rows]."""
+        """Whether each row is in memory or removed, and is not read from disk: bool [rows]."""
         return np.repeat(
             np.array([segment.held is not None or segment.removed for segment in self.segments], np.bool_),
             np.array([len(segment) for segment in self.segments], np.int64),
@@ -130,23 +152,23 @@ class Snapshot:
 
     @property
     def memory(self) -> int:
-        """Bytes that the segments and the codes take."""
+        """Bytes of memory that the segments and the codes take."""
         codes = 0 if self.table is None else self.table.coder.bytes_per_place * len(self.table)
         lists = 0 if self.lists is None else sum(array.nbytes for array in self.lists.tensors().values())
         return sum(segment.memory for segment in self.segments) + codes + lists
 
     @cached_property
     def _in_memory(self) -> NDArray[np.int64]:
-        """The rows that are compared where they are held: the living ones, ascending."""
+        """The living rows that are held in memory, ascending."""
         return np.flatnonzero(self.alive & self._held)
 
     @cached_property
     def _parts(self) -> list[_Part]:
-        """All of them, in parts."""
+        """The rows in memory, in parts."""
         return self._parts_of(self._in_memory)
 
     def _parts_of(self, rows: NDArray[np.int64]) -> list[_Part]:
-        """Rows in memory, in parts of about equal size within a segment; segments without any are left out."""
+        """Rows in memory, in parts of about equal size within each segment."""
         parts, most = [], max(1, _PART_BYTES // (self.dimension * (2 if self.halves else 4)))
         bounds = np.searchsorted(rows, np.arange(len(self.segments) + 1) * self.rows_per_segment).tolist()
         for segment, (first, end) in zip(self.segments, pairwise(bounds), strict=True):
@@ -156,38 +178,38 @@ class Snapshot:
         return parts
 
     def search(self, descriptor: Descriptor, allowed: NDArray[np.bool_] | None = None) -> Ranking:
-        """The living places, best first; equal ones by row.
+        """Rank the places of the map by inner product, best first; equal ones by row.
 
         Args:
             descriptor: float32 [D], finite.
-            allowed: bool [rows], the rows to choose from, of which only the living count; None: all.
+            allowed: bool [rows], the rows to choose from, of which only living ones count; None: all.
 
         Returns:
-            rows int64 [n] and inner products float32 [n] with what is stored: of all that are allowed, or, in a map
-            with codes, of those at least ``SHORTLIST`` that the codes chose.
+            Rows, int64 [n], and their inner products with the stored descriptors, float32 [n]: of all allowed places
+            or, in a map with codes, of the ``SHORTLIST`` or more that the codes chose.
         """
         return self.search_batch(descriptor[np.newaxis], allowed)[0]
 
     def search_batch(self, descriptors: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> list[Ranking]:
-        """The same for each of ``descriptors``, float32 [B, D].
+        """Rank the places for each of ``descriptors``, float32 [B, D], as :meth:`search` does.
 
-        Places in memory are read once for all of them, not B times.
+        Descriptors in memory are read once for all queries.
         """
         queries = np.ascontiguousarray(descriptors, dtype=np.float32)
         if queries.ndim != 2 or queries.shape[1] != self.dimension or not np.isfinite(queries).all():
             raise ValueError(f"a query is {self.dimension} finite values")
         if allowed is not None and allowed.shape != (self.rows,):
-            raise ValueError(f"the map has {self.rows} rows to allow")
+            raise ValueError(f"allowed must have {self.rows} values, one for each row")
         rows, products = self._compare_held(queries, allowed)
-        if self.shelf is None or self._held.all():
+        if self.row_reader is None or self._held.all():
             return [ranked(rows, found) for found in products]
         with self.guard():
-            return self._with_shelf(queries, allowed, rows, products)
+            return self._with_rows_on_disk(queries, allowed, rows, products)
 
     def _compare_held(
         self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The rows that are in memory, alive and allowed, ascending, and their inner products float32 [B, n]."""
+        """The allowed living rows in memory, ascending, and their inner products, float32 [B, n]."""
         rows, parts = self._in_memory, self._parts
         if allowed is not None:
             parts = self._parts_of(rows := rows[allowed[rows]])
@@ -199,20 +221,20 @@ class Snapshot:
         together(compare, parts, _SHARE)
         return rows, products
 
-    def _with_shelf(
+    def _with_rows_on_disk(
         self,
         queries: NDArray[np.float32],
         allowed: NDArray[np.bool_] | None,
         held: NDArray[np.int64],
         products: NDArray[np.float32],
     ) -> list[Ranking]:
-        """The rankings once the rows on the shelf are looked at too."""
+        """The rankings of the rows in memory together with those on disk."""
         chosen = self.alive & ~self._held
         if allowed is not None:
             chosen &= allowed
         by_code = chosen[: self.coded]
         if int(np.count_nonzero(by_code)) <= SHORTLIST:
-            by_code = np.zeros(self.coded, np.bool_)  # so few that all are compared exactly
+            by_code = np.zeros(self.coded, np.bool_)  # they are so few that all are compared exactly
         tail = np.flatnonzero(np.concatenate([chosen[: self.coded] & ~by_code, chosen[self.coded :]]))
         exact, exact_products = np.concatenate([held, tail]), np.hstack([products, self._compared(queries, tail)])
         rankings = []
@@ -226,7 +248,7 @@ class Snapshot:
         return rankings
 
     def _shortlist(self, query: NDArray[np.float32], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """The rows that the codes choose among those allowed, bool [coded]; ascending."""
+        """The rows that the codes choose among ``allowed``, bool [coded]; ascending."""
         assert self.table is not None
         every = None if allowed.all() else allowed
         coded = self.table.coder.query(query)
@@ -234,12 +256,12 @@ class Snapshot:
         return np.sort(found.rows)
 
     def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Inner products of queries with rows on the shelf, float32 [B, k]."""
-        assert self.shelf is not None
-        shelf, products = self.shelf, np.empty((len(queries), len(rows)), np.float32)
+        """Inner products of queries with rows on disk, float32 [B, k]."""
+        assert self.row_reader is not None
+        row_reader, products = self.row_reader, np.empty((len(queries), len(rows)), np.float32)
 
         def compare(part: slice) -> None:
-            products[:, part] = shelf.inner_products(queries, rows[part], self._checksums(rows[part]))
+            products[:, part] = row_reader.inner_products(queries, rows[part], self._checksums(rows[part]))
 
         parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
         if parts:
@@ -247,7 +269,7 @@ class Snapshot:
         return products
 
     def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
-        """What SQLite names of rows."""
+        """The checksums of rows that SQLite has."""
         segments = [(self.segments[row // self.rows_per_segment], row) for row in rows.tolist()]
         return np.array([segment.checksums[row - segment.first_row] for segment, row in segments], np.uint32)
 
@@ -256,19 +278,19 @@ class Snapshot:
             raise IndexError(f"the map has rows 0 to {self.rows - 1}")
         for number in set((rows // self.rows_per_segment).tolist()):
             if self.segments[number].removed:
-                raise UnknownPlace("A place was deleted while it was looked at.")
+                raise UnknownPlace("A place was deleted while it was read.")
 
     def locals_at(self, rows: NDArray[np.int64]) -> Local:
-        """The local descriptors of rows, as :meth:`search` returns them: int8 [k, C, L], a copy.
+        """A copy of the local descriptors of rows that :meth:`search` returned: int8 [k, C, L].
 
         Raises:
             IndexError: there is no such row.
-            UnknownPlace: it is of a place that was deleted, and its segment was removed.
+            UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         return self.locals_in_place(rows).together()
 
     def locals_in_place(self, rows: NDArray[np.int64]) -> ScatteredCells:
-        """The same where they are held, as nobody will change them; those on the shelf are read."""
+        """The local descriptors of rows without copying those in memory; they must not be changed."""
         self._check_rows(rows)
         numbers, offsets = np.divmod(rows, self.rows_per_segment)
         used = sorted(set(numbers.tolist()))
@@ -276,24 +298,24 @@ class Snapshot:
         blocks = [self.segments[number].local for number in held]
         block = np.searchsorted(held, numbers)
         if len(held) < len(used) or not used:
-            on_shelf = np.flatnonzero(~np.isin(numbers, held))
-            blocks.append(self._locals_on_shelf(rows[on_shelf]))
-            block[on_shelf], offsets[on_shelf] = len(held), np.arange(len(on_shelf))
+            on_disk = np.flatnonzero(~np.isin(numbers, held))
+            blocks.append(self._locals_on_disk(rows[on_disk]))
+            block[on_disk], offsets[on_disk] = len(held), np.arange(len(on_disk))
         return ScatteredCells(tuple(blocks), block, offsets)
 
-    def _locals_on_shelf(self, rows: NDArray[np.int64]) -> Local:
+    def _locals_on_disk(self, rows: NDArray[np.int64]) -> Local:
         if not len(rows):
             return np.empty((0, *self.local_shape), np.int8)
-        assert self.shelf is not None
+        assert self.row_reader is not None
         with self.guard():
-            return self.shelf.locals(rows, self._checksums(rows))
+            return self.row_reader.locals(rows, self._checksums(rows))
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The descriptors of rows: float32 [k, D], a copy.
+        """A copy of the descriptors of rows: float32 [k, D].
 
         Raises:
             IndexError: there is no such row.
-            UnknownPlace: it is of a place that was deleted, and its segment was removed.
+            UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
         self._check_rows(rows)
         found = np.empty((len(rows), self.dimension), np.float32)
@@ -302,29 +324,29 @@ class Snapshot:
             segment = self.segments[int(rows[position]) // self.rows_per_segment]
             found[position] = vectors(segment.index)[int(rows[position]) - segment.first_row]
         if not held.all():
-            assert self.shelf is not None
+            assert self.row_reader is not None
             wanted = rows[~held]
             with self.guard():
-                found[~held] = self.shelf.descriptors(wanted, self._checksums(wanted))
+                found[~held] = self.row_reader.descriptors(wanted, self._checksums(wanted))
         return found
 
     def appended(
         self,
         descriptors: Sequence[Descriptor] | Rows,
-        spots: Sequence[Spot],
+        locations: Sequence[Location],
         local: Sequence[Local] | Local = (),
         checksums: Sequence[int] | None = None,
     ) -> Snapshot:
-        """With further places.  Only on the newest snapshot, by one thread at a time.
+        """The snapshot with further places.  Call it only on the newest snapshot, from one thread at a time.
 
         Args:
-            descriptors, spots, local: one of each a place, float32 [D] (or float16, in a map that holds halves) and
-                int8 [C, L]; ``local`` may be left out where the map has no local descriptors.
-            checksums: what SQLite names of the rows; None: nothing.
+            descriptors, locations, local: one of each per place, float32 [D] (or float16 in a map that holds halves)
+                and int8 [C, L]; ``local`` may be left out if the map has no local descriptors.
+            checksums: of the rows, as SQLite has them; None: it has none.
         """
         if self.local_shape != NO_LOCAL and len(local) != len(descriptors):
             raise ValueError("every place of this map has local descriptors")
-        named = [0] * len(descriptors) if checksums is None else checksums
+        sums = [0] * len(descriptors) if checksums is None else checksums
         segments, done = list(self.segments), 0
         while done < len(descriptors):
             if not segments or len(segments[-1]) == self.rows_per_segment:
@@ -334,7 +356,7 @@ class Snapshot:
                 segments.append(Segment(held, row, whereabouts_of([]), nobody, nothing))
             stop = done + self.rows_per_segment - len(segments[-1])
             segments[-1] = segments[-1].appended(
-                descriptors[done:stop], spots[done:stop], local[done:stop], named[done:stop], self.rows_per_segment
+                descriptors[done:stop], locations[done:stop], local[done:stop], sums[done:stop], self.rows_per_segment
             )
             done = min(stop, len(descriptors))
         table = self.table
@@ -342,15 +364,15 @@ class Snapshot:
             table = table.appended(table.coder.encode(np.asarray(descriptors, np.float32)))
         return replace(self, segments=tuple(segments), table=table)
 
-    def moved(self, spots: Mapping[int, Spot]) -> Snapshot:
-        """With the places of some rows somewhere else."""
+    def moved(self, locations: Mapping[int, Location]) -> Snapshot:
+        """The snapshot with other locations of some rows."""
         segments = list(self.segments)
-        for number, rows in self._by_segment(list(spots)).items():
-            segments[number] = segments[number].moved({row: spots[row] for row in rows})
+        for number, rows in self._by_segment(list(locations)).items():
+            segments[number] = segments[number].moved({row: locations[row] for row in rows})
         return replace(self, segments=tuple(segments))
 
     def without(self, rows: Sequence[int]) -> Snapshot:
-        """With some rows dead."""
+        """The snapshot without the places of some rows."""
         segments = list(self.segments)
         for number, dead in self._by_segment(rows).items():
             segments[number] = segments[number].without(dead)
@@ -363,12 +385,12 @@ class Snapshot:
         return groups
 
     def with_codes(self, codes: Codes) -> Snapshot:
-        """With codes of the rows behind those that have one.  Only on the newest snapshot, by one thread at a time."""
+        """The snapshot with the codes of further rows.  Call it only on the newest one, from one thread at a time."""
         assert self.table is not None
         return replace(self, table=self.table.appended(codes))
 
     def holding(self, number: int, held: Held | None) -> Snapshot:
-        """With the descriptors of a segment in memory, or on the shelf only; one that was removed has none."""
+        """The snapshot with a segment's descriptors in memory, or only on disk (None); a removed segment stays."""
         segments = list(self.segments)
         if segments[number].removed:
             return self
@@ -377,7 +399,7 @@ class Snapshot:
 
 
 def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) -> Ranking:
-    """At most ``count`` of rows, those with the largest products, ascending by row."""
+    """The at most ``count`` rows with the largest products, ascending by row."""
     if len(rows) <= count:
         return rows, products
     chosen = np.sort(np.argpartition(-products, count)[:count])

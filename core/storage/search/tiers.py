@@ -1,4 +1,4 @@
-"""How a map is searched: chosen by its size, or by its owner."""
+"""The tiers: how a map is searched, chosen by its size or by its owner, and what it reports about this."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ Tier = Literal["exact", "compact", "inverted"]
 TierSetting = Literal["auto", "exact", "compact", "inverted"]
 
 COMPACT_FROM = 4096
-"""Places from which on codes pay: 270 MB of the default encoder's descriptors would be held in memory otherwise."""
+"""From so many places on codes are used; with fewer the default encoder's descriptors take at most 270 MB of memory."""
 
 INVERTED_FROM = 250_000
-"""Places from which on reading every code takes longer than lists are worth."""
+"""From so many places on lists are used, because reading every code takes too long."""
 
 _ORDER: tuple[Tier, ...] = ("exact", "compact", "inverted")
 
 
 def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
-    """The tier that a map of so many places is to have.
+    """The tier that a map of so many places should have.
 
-    A map that shrinks goes back at half the number at which it went on, so that one that is about that size is not
-    built again and again.
+    A map that shrinks changes its tier at half the number of places at which a growing one does, so that a map of about
+    that size is not built again and again.
 
     Args:
-        present: the tier that it has.
+        present: the tier that the map has.
     """
     if setting != "auto":
         return setting if places else "exact"
@@ -76,7 +76,7 @@ class IndexStatus(BaseModel):
 
 
 def unopened(setting: TierSetting, places: int) -> IndexStatus:
-    """Of a map that was not read from disk yet."""
+    """The status of a map that was not read from disk yet."""
     tier = tier_for(setting, places, "exact")
     return IndexStatus(
         setting=setting,
@@ -103,7 +103,7 @@ class StorageStatus(BaseModel):
 
 
 def storage_of(folder: Path, precision: Precision, places: int) -> StorageStatus:
-    """What the files of a map take; one that vanishes meanwhile takes nothing.
+    """How much room the files of a map take; a file that is deleted meanwhile counts as empty.
 
     Raises:
         OSError: the disk refuses.

@@ -1,4 +1,4 @@
-"""``placerec evaluate``: systems recognize one traverse by another, in the figures of the thesis."""
+"""``placerec evaluate``: how well systems recognize one traverse by another, in the figures of the thesis."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from rich.progress import Progress, TaskID
 
 from core.evaluation import Comparison
 from service.commands.console import progress, remark
-from service.commands.evaluation.saved import SavedOptions
-from service.commands.evaluation.systems import build_systems, parse_weights, show_list
-from service.commands.evaluation.tables import (
+from service.commands.evaluation.output import (
     comparison_json,
     remark_notes,
     show_costs,
@@ -23,91 +21,116 @@ from service.commands.evaluation.tables import (
     write_json,
     write_results,
 )
+from service.commands.evaluation.saved_results import SavedOptions
+from service.commands.evaluation.systems import build_systems, parse_weights, show_list
 from service.commands.evaluation.traverses import TraverseOptions, TruthOptions, choose_training
-from service.commands.models import ModelsDir, load_image, open_catalogue
+from service.commands.model import ModelsDir, load_image, open_catalogue
 
 if TYPE_CHECKING:
     from core.evaluation.cache import EvaluationCache
 
 TRAVERSES, TRUTH, SYSTEMS, OUTPUT, FILES = (
     "Traverses",
-    "What is true (one of the three, where no --dataset says it)",
+    "Ground truth (one of three ways, unless --dataset brings its own)",
     "Systems",
     "Output",
-    "Figures of results that others have saved",
+    "Results that other tools have saved",
 )
 
 
 def evaluate(
     reference: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="The traverse that is known.", rich_help_panel=TRAVERSES)
+        Path | None,
+        typer.Option(metavar="DIR", help="The known traverse: a directory of images.", rich_help_panel=TRAVERSES),
     ] = None,
     query: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="The traverse to recognize.", rich_help_panel=TRAVERSES)
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="The traverse to recognize: a directory of images.", rich_help_panel=TRAVERSES
+        ),
     ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="A known data set instead; --list names them.", rich_help_panel=TRAVERSES),
+        typer.Option(metavar="NAME", help="A known data set instead; see --list.", rich_help_panel=TRAVERSES),
     ] = None,
     data: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Where the data set's traverses lie.", rich_help_panel=TRAVERSES),
+        typer.Option(
+            metavar="DIR", help="The directory that holds the data set's traverses.", rich_help_panel=TRAVERSES
+        ),
     ] = None,
     reduced: Annotated[
         bool,
-        typer.Option("--reduced", help="Keep only the thesis's number of references.", rich_help_panel=TRAVERSES),
+        typer.Option("--reduced", help="Keep only as many references as the thesis.", rich_help_panel=TRAVERSES),
     ] = False,
     limit_references: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Keep only the references whose indices stand here, one a line.",
+            help="Keep only the references whose indices this file lists, one per line.",
             rich_help_panel=TRAVERSES,
         ),
     ] = None,
     seed: Annotated[
         int,
         typer.Option(
-            min=0, help="Of reduced references, of what is learned and of disturbances.", rich_help_panel=TRAVERSES
+            min=0,
+            help="Seed of the reduced references, of training and of the disturbances.",
+            rich_help_panel=TRAVERSES,
         ),
     ] = 0,
     tolerance: Annotated[
         int | None,
-        typer.Option(metavar="N", min=0, help="Query i is true at the references i-N to i+N.", rich_help_panel=TRUTH),
+        typer.Option(
+            metavar="N", min=0, help="Query i shows the same place as references i-N to i+N.", rich_help_panel=TRUTH
+        ),
     ] = None,
     ground_truth: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Rows query,reference; indices from 0.", rich_help_panel=TRUTH)
+        Path | None,
+        typer.Option(
+            metavar="CSV",
+            help="Rows query,reference: the true references of each query, indices from 0.",
+            rich_help_panel=TRUTH,
+        ),
     ] = None,
     poses: Annotated[
         bool,
         typer.Option(
             "--poses",
-            help="Poses of places.csv in both directories (as for enroll), of the files' names "
-            "(@easting@northing@…) or of their EXIF data.",
+            help="By the poses in places.csv of both directories (as for enroll), in file names "
+            "(@easting@northing@…) or in EXIF data.",
             rich_help_panel=TRUTH,
         ),
     ] = False,
     metres: Annotated[
         float | None,
-        typer.Option(metavar="N", min=0, help="With --poses: true within so many metres.", rich_help_panel=TRUTH),
+        typer.Option(
+            metavar="N", min=0, help="With --poses: true if at most so many metres apart.", rich_help_panel=TRUTH
+        ),
     ] = None,
     degrees: Annotated[
         float | None,
         typer.Option(
-            metavar="N", min=0, max=180, help="With --poses: and within so many degrees.", rich_help_panel=TRUTH
+            metavar="N",
+            min=0,
+            max=180,
+            help="With --poses: and if headings differ by at most so many degrees.",
+            rich_help_panel=TRUTH,
         ),
     ] = None,
     encoder: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME",
-            help="Encoder by name or identity, or system by name; may be repeated. Default: the service's encoder.",
+            help="Encoder (name or identity) or system (name); may be repeated. Default: the service's encoder.",
             rich_help_panel=SYSTEMS,
         ),
     ] = None,
     every: Annotated[
         bool,
-        typer.Option("--all", help="All systems that need no file, or whose file is given.", rich_help_panel=SYSTEMS),
+        typer.Option(
+            "--all", help="All systems that need no weights file, or whose file is given.", rich_help_panel=SYSTEMS
+        ),
     ] = False,
     weights: Annotated[
         list[str] | None,
@@ -119,7 +142,7 @@ def evaluate(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Pictures, those below included, for systems that learn. Default: the kept references.",
+            help="Images (subdirectories included) for systems that learn. Default: the kept references.",
             rich_help_panel=SYSTEMS,
         ),
     ] = None,
@@ -134,38 +157,40 @@ def evaluate(
         Path | None,
         typer.Option(
             metavar="OUT.csv",
-            help="Write a row per query; of further encoders to OUT.ENCODER.csv.",
+            help="Write one row per query; further encoders go to OUT.ENCODER.csv.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write an HTML page with curves and pictures.", rich_help_panel=OUTPUT),
+        typer.Option(metavar="DIR", help="Write an HTML page with curves and images.", rich_help_panel=OUTPUT),
     ] = None,
     scalability: Annotated[
         bool,
-        typer.Option("--scalability", help="Measure growing traverses as well (Fig. 3.9).", rich_help_panel=OUTPUT),
+        typer.Option(
+            "--scalability", help="Also measure traverses of growing length (thesis, Fig. 3.9).", rich_help_panel=OUTPUT
+        ),
     ] = False,
     severity: Annotated[
         bool,
-        typer.Option("--severity", help="Measure disturbed queries as well, in steps.", rich_help_panel=OUTPUT),
+        typer.Option("--severity", help="Also measure queries that are disturbed in steps.", rich_help_panel=OUTPUT),
     ] = False,
     cache: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Where measurements are kept. Default: placerec/evaluations in the user's cache directory.",
+            help="Directory of the cache. Default: placerec/evaluations in the user's cache directory.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
     no_cache: Annotated[
-        bool, typer.Option("--no-cache", help="Measure everything anew; keep nothing.", rich_help_panel=OUTPUT)
+        bool, typer.Option("--no-cache", help="Measure everything again and keep nothing.", rich_help_panel=OUTPUT)
     ] = False,
     from_results: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE.csv",
-            help="Rows query,retrieved,score,matched, with or without this header; may be repeated.",
+            help="Rows query,retrieved,score,matched, with or without a header; may be repeated.",
             rich_help_panel=FILES,
         ),
     ] = None,
@@ -173,21 +198,22 @@ def evaluate(
         list[Path] | None,
         typer.Option(
             metavar="FILE.npy",
-            help="A matrix, a row a query, a column a reference; with --ground-truth or --tolerance; may be repeated.",
+            help="A matrix with a row per query and a column per reference; needs --ground-truth or --tolerance; "
+            "may be repeated.",
             rich_help_panel=FILES,
         ),
     ] = None,
     transposed: Annotated[
         bool,
-        typer.Option("--transposed", help="The matrix has a row a reference instead.", rich_help_panel=FILES),
+        typer.Option("--transposed", help="The matrix has a row per reference instead.", rich_help_panel=FILES),
     ] = False,
 ) -> None:
     """Evaluate place recognition on two traverses of the same places.
 
     Images of a directory (not of its subfolders) are taken in natural order; one
     that cannot be decoded stops the run. A query without a kept true reference is
-    a true negative. A second run computes only what it has not seen; times are
-    then those of the first.
+    a true negative. Results are cached: a second run measures only what is new and
+    repeats the times of the first.
     """
     truth = TruthOptions(tolerance, ground_truth, poses, metres, degrees)
     if listed:
@@ -195,10 +221,10 @@ def evaluate(
         return
     if from_results or from_similarity:
         saved = SavedOptions(from_results or [], from_similarity or [], transposed, truth, limit_references)
-        needs_pictures = {"reference": reference, "query": query, "dataset": dataset, "data": data, "reduced": reduced}
+        needs_images = {"reference": reference, "query": query, "dataset": dataset, "data": data, "reduced": reduced}
         needs_systems = {"encoder": encoder, "all": every, "weights": weights, "training": training}
         needs_both = {"report": report, "scalability": scalability, "severity": severity}
-        saved.check({**needs_pictures, **needs_systems, **needs_both}, results)
+        saved.check({**needs_images, **needs_systems, **needs_both}, results)
         saved.show(json_file, results)
         return
     if transposed:
@@ -223,7 +249,7 @@ def evaluate(
         )
     _show(comparison, kept)
     by_name = {run.about.name: run for run in comparison.runs}
-    runs = [by_name[system.about.name] for system in systems]  # as asked for
+    runs = [by_name[system.about.name] for system in systems]  # in the order of the command line
     if json_file is not None:
         write_json(json_file, comparison_json(comparison, runs))
     if results is not None:
@@ -236,7 +262,7 @@ def evaluate(
 
 
 class _Bar:
-    """Tells a progress bar how far the evaluation is."""
+    """Shows the progress of the evaluation as a bar."""
 
     def __init__(self, bar: Progress) -> None:
         self._bar = bar

@@ -1,4 +1,4 @@
-"""``placerec evaluate``: which systems, and the list of those that there are."""
+"""``placerec evaluate``: choosing the systems, and listing all of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rich.box import HEAVY_HEAD
 from rich.markup import escape
 
 from service.commands.console import output, show, table
-from service.commands.models import default_encoder, name_of
+from service.commands.model import default_encoder, name_of
 
 if TYPE_CHECKING:
     from core.baselines.system import About, System
@@ -34,17 +34,17 @@ def parse_weights(given: list[str]) -> dict[str, Path]:
 
 
 def build_systems(names: list[str], every: bool, weights: dict[str, Path], models: EncoderCatalogue) -> list[System]:
-    """The systems that were asked for, each once, in that order.
+    """The systems that the options name, each once, in that order.
 
     Args:
-        names: of systems or encoders; the default encoder where there are none.
-        every: all systems that run without a file, or whose file is given, follow.
+        names: of systems or encoders; if empty, the default encoder.
+        every: add all systems that run without a file, or whose file is given.
 
     Raises:
         MissingWeights, UnknownEncoder, InvalidModel: one cannot be made.
-        typer.BadParameter: a file is given for a system that was not asked for.
+        typer.BadParameter: a file is given for a system that is not among them.
     """
-    from core.baselines.catalogue import build, systems
+    from core.baselines.registry import build, systems
 
     asked = list(names)
     if every:
@@ -57,7 +57,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
     asked = list(dict.fromkeys(asked or [default_encoder()]))
     idle = weights.keys() - {name_of(name) for name in asked}
     if idle:
-        raise typer.BadParameter(f"--weights for {', '.join(sorted(idle))}, which --encoder does not ask for")
+        raise typer.BadParameter(f"--weights for {', '.join(sorted(idle))}, which --encoder does not name")
     built: dict[str, System] = {}
     for name in asked:
         system = build(name, models=models, weights=weights.get(name))
@@ -67,7 +67,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
 
 def show_list(models: EncoderCatalogue) -> None:
     """Write name, paper, configuration and weights of all systems, then the data sets."""
-    from core.baselines.catalogue import systems
+    from core.baselines.registry import systems
     from core.evaluation.data.datasets import DATASETS
 
     shown = table("name", "system and paper", "configuration", "weights", title="Systems, for --encoder")

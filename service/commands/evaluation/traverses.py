@@ -1,4 +1,4 @@
-"""``placerec evaluate``: which traverses, what is true of them, which pictures to learn from."""
+"""``placerec evaluate``: the traverses, their ground truth, and the images to learn from."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from core.frames.traverses import (
 
 if TYPE_CHECKING:
     from core.evaluation.data.pairs import TraversePair
-    from core.evaluation.subjects import Training
+    from core.evaluation.subject import Training
 
 
 @dataclass(frozen=True)
 class TruthOptions:
-    """How it is told what a query shows; one of the three ways."""
+    """The ground truth options: one of three ways."""
 
     tolerance: int | None
     ground_truth: Path | None
@@ -33,7 +33,7 @@ class TruthOptions:
     degrees: float | None
 
     def check(self) -> None:
-        """See that exactly one way is chosen.
+        """Check that exactly one way is chosen.
 
         Raises:
             typer.BadParameter: none is, or more than one.
@@ -47,17 +47,17 @@ class TruthOptions:
             raise typer.BadParameter("--poses needs a distance: --metres N, and --degrees N where headings count")
 
     def given(self) -> bool:
-        """Whether anything is said of the truth."""
+        """Whether any of the options is given."""
         chosen = (self.tolerance, self.ground_truth, self.metres, self.degrees)
         return self.poses or any(value is not None for value in chosen)
 
     def of_counts(self, queries: int, references: int) -> Truth:
-        """The truth where there are numbers of pictures, but no pictures."""
+        """The truth by numbers of images alone."""
         if self.ground_truth is not None:
             return read_ground_truth(self.ground_truth, queries, references)
         return tolerance_truth(queries, references, self.tolerance or 0)
 
-    def of_pictures(self, queries: list[Path], references: list[Path]) -> Truth:
+    def of_images(self, queries: list[Path], references: list[Path]) -> Truth:
         """The truth of two traverses."""
         if not self.poses:
             return self.of_counts(len(queries), len(references))
@@ -81,7 +81,7 @@ class TraverseOptions:
     seed: int
 
     def check(self) -> None:
-        """See that they go together.
+        """Check that the options go together.
 
         Raises:
             typer.BadParameter: they do not.
@@ -114,7 +114,7 @@ class TraverseOptions:
         else:
             assert self.reference is not None and self.query is not None, "checked"
             references, queries = find_images(self.reference), find_images(self.query)
-            truth, kept = self.truth.of_pictures(queries, references), all_references(references)
+            truth, kept = self.truth.of_images(queries, references), all_references(references)
             pair = TraversePair(name_pair(self.reference, self.query), references, queries, truth, kept)
         if self.limit_references is None:
             return pair
@@ -123,7 +123,7 @@ class TraverseOptions:
 
 
 def name_pair(reference: Path, query: Path) -> str:
-    """What two traverses are called: ``nordland, winter against summer`` if both lie in one folder, else without it."""
+    """The name of a pair: ``nordland, winter against summer`` if both lie in one folder, else without the folder."""
     known, asked = reference.resolve(), query.resolve()
     traverses = f"{asked.name} against {known.name}"
     same = known.parent == asked.parent and known.parent.name
@@ -131,14 +131,14 @@ def name_pair(reference: Path, query: Path) -> str:
 
 
 def choose_training(directory: Path | None, pair: TraversePair, seed: int) -> Training:
-    """The pictures to learn from: those of a directory, or else the references, which are known beforehand.
+    """The images to learn from: those of a directory, or else the kept references.
 
     Raises:
         InvalidTraverse: the directory holds no image.
     """
-    from core.evaluation.subjects import Training
+    from core.evaluation.subject import Training
 
     if directory is None:
         return Training(pair.kept_references, "the kept references", seed)
-    pictures = find_images_below(directory)
-    return Training(pictures, f"{len(pictures)} pictures of {directory.resolve().name}", seed)
+    images = find_images_below(directory)
+    return Training(images, f"{len(images)} images of {directory.resolve().name}", seed)

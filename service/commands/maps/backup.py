@@ -207,7 +207,7 @@ def _manifest_of(file: Path) -> Any:
 
 
 def _write_index(folder: Path, index: Index) -> None:
-    from core.storage.files.disk import write_file
+    from core.disk.files import write_file
 
     text = json.dumps(index.model_dump(mode="json"), indent=2) + "\n"
     try:
@@ -227,9 +227,9 @@ def _remove_strays(folder: Path, index: Index) -> None:
 
 @contextmanager
 def _held(folder: Path) -> Iterator[None]:
-    """Lock the folder for this process."""
+    """The folder for this process alone."""
+    from core.disk.files import FolderLock
     from core.errors import DataDirectoryLocked
-    from core.storage.files.disk import FolderLock
 
     try:
         folder.mkdir(parents=True, exist_ok=True)

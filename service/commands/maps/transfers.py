@@ -176,7 +176,7 @@ def settle(partial: Path, path: Path) -> None:
     Raises:
         Failure: the file cannot be renamed.
     """
-    from core.storage.files.disk import sync_folder
+    from core.disk.files import sync_folder
 
     try:
         os.replace(partial, path)

@@ -73,7 +73,7 @@ def test_one_channel_by_hand(tmp_path: Path) -> None:
     weights["conv3"][:, 0, 1, 1] = [1, -1, 2, 0]
     biases = zeros(biases=True)
     biases["conv3"][:] = [0, 0, -50, 3]
-    system = Calc(load_calc(save(tmp_path / "calc.caffemodel", written(weights, biases))))
+    system = Calc(ABOUT, load_calc(save(tmp_path / "calc.caffemodel", written(weights, biases))))
     found = system.describe(PICTURE)
 
     seen = np.pad(grey_input(PICTURE).astype(np.float64), 4)
@@ -94,7 +94,7 @@ def test_it_is_what_opencv_makes_of_the_file(tmp_path: Path, generation: str, fo
     net = cv2.dnn.readNetFromCaffe(np.frombuffer(text, np.uint8), np.frombuffer(caffemodel(layers), np.uint8))
     net.setInput(grey_input(PICTURE)[None, None])
     wanted = net.forward("relu3").reshape(-1)
-    found = np.asarray(Calc(network).describe(PICTURE).arrays["descriptor"])
+    found = np.asarray(Calc(ABOUT, network).describe(PICTURE).arrays["descriptor"])
     np.testing.assert_allclose(found, wanted / np.linalg.norm(wanted), atol=1e-5)
 
 
@@ -106,10 +106,10 @@ def test_the_input_is_equalized_grey() -> None:
 
 
 def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
-    system = Calc(load_calc(save(tmp_path / "calc.caffemodel", written(zeros(), zeros(biases=True)))))
+    system = Calc(ABOUT, load_calc(save(tmp_path / "calc.caffemodel", written(zeros(), zeros(biases=True)))))
     blank = system.describe(np.zeros((20, 20, 3), np.uint8))
     assert not blank.arrays["descriptor"].any()
-    assert system.index([blank, blank]).compare([blank]).tolist() == [[0, 0]]
+    assert system.index([blank, blank]).score([blank]).tolist() == [[0, 0]]
 
 
 def test_networks_that_are_not_calc(tmp_path: Path) -> None:
@@ -127,8 +127,8 @@ def test_networks_that_are_not_calc(tmp_path: Path) -> None:
 
 def test_identities_tell_weights_apart(tmp_path: Path) -> None:
     weights, biases = random_weights()
-    first = Calc(load_calc(save(tmp_path / "a.caffemodel", written(weights, biases)))).identity
+    first = Calc(ABOUT, load_calc(save(tmp_path / "a.caffemodel", written(weights, biases)))).identity
     biases["conv2"][5] += 1
-    second = Calc(load_calc(save(tmp_path / "b.caffemodel", written(weights, biases)))).identity
+    second = Calc(ABOUT, load_calc(save(tmp_path / "b.caffemodel", written(weights, biases)))).identity
     assert first != second and first.startswith("calc@")
     assert ABOUT.weights is not None and "calc.caffemodel" in ABOUT.weights

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.baselines.convnets import ALEXNET, SYSTEMS, Differences
-from core.baselines.entry import Entry, Ingredients
+from core.baselines import registry
+from core.baselines.convnets import ALEXNET, AMOSNET, HYBRIDNET, PLACES365, Differences
 from core.baselines.system import Description, System
 from core.errors import InvalidModel, MissingWeights
 from core.method.catalogue import EncoderCatalogue
@@ -19,7 +19,6 @@ from core.networks.network import save_network
 from tests.core.networks.caffe_writer import Layer, caffemodel, field, layer, relu
 
 Array = NDArray[Any]
-ENTRIES: dict[str, Entry] = {entry.about.name: entry for entry in SYSTEMS}
 MEAN = (10.0, 20.0, 30.0)
 PICTURE = np.random.default_rng(0).integers(0, 256, (227, 227, 3), np.uint8)
 SEEN = np.maximum(PICTURE.astype(np.float64) - MEAN, 0)  # 227 x 227 x 3
@@ -40,7 +39,7 @@ def trunk(last: int = 5) -> list[Layer]:
 
 
 def build(name: str, path: Path) -> System:
-    return ENTRIES[name].build(Ingredients(EncoderCatalogue(), path))
+    return registry.build(name, models=EncoderCatalogue(), weights=path)
 
 
 def write(path: Path, layers: list[Layer], mean: str | None = None, **options: Any) -> Path:
@@ -50,8 +49,8 @@ def write(path: Path, layers: list[Layer], mean: str | None = None, **options: A
     return path
 
 
-def vector(system: System, picture: NDArray[np.uint8]) -> Array:
-    return np.asarray(system.describe(picture).arrays["descriptor"])
+def vector(system: System, frame: NDArray[np.uint8]) -> Array:
+    return np.asarray(system.describe(frame).arrays["descriptor"])
 
 
 def unit(vector: Array) -> Array:
@@ -68,7 +67,7 @@ def test_alexnet_is_conv3_by_the_cosine(tmp_path: Path, generation: str) -> None
     found = system.describe(PICTURE)
     np.testing.assert_allclose(np.asarray(found.arrays["descriptor"]), unit(SEEN.reshape(-1)), atol=1e-6)
     darker = system.describe(np.asarray(PICTURE // 2, np.uint8))
-    scores: Array = system.index([found, darker]).compare([found])
+    scores: Array = system.index([found, darker]).score([found])
     half = unit(np.maximum(PICTURE // 2 - np.array(MEAN), 0).reshape(-1))
     assert scores.tolist() == [[pytest.approx(1), pytest.approx(unit(SEEN.reshape(-1)) @ half, abs=1e-5)]]
 
@@ -94,7 +93,7 @@ def test_a_blank_frame_has_a_description(tmp_path: Path) -> None:
         system = build(name, path)
         blank = system.describe(np.full((50, 60, 3), 200, np.uint8))
         assert not blank.arrays["descriptor"].any()
-        assert np.isfinite(system.index([blank]).compare([blank, system.describe(PICTURE)])).all()
+        assert np.isfinite(system.index([blank]).score([blank, system.describe(PICTURE)])).all()
 
 
 # AMOSNet and HybridNet
@@ -123,7 +122,7 @@ def test_a_spatial_pyramid_of_conv5(tmp_path: Path, name: str, model: str, mean:
 def test_scores_fall_with_the_differences() -> None:
     references = np.array([[0, 0, 0], [65536, 0, -65536]], np.float32)
     queries = [Description({"descriptor": np.array(values, np.float32)}) for values in ([0, 0, 0], [65536, 32768, 0])]
-    assert Differences(references).compare(queries).tolist() == [[1, -1], [-0.5, -0.5]]
+    assert Differences(references).score(queries).tolist() == [[1, -1], [-0.5, -0.5]]
 
 
 @pytest.mark.parametrize("name", ["amosnet", "hybridnet", "places365"])
@@ -181,9 +180,9 @@ def test_places365_is_fc7_by_the_cosine(tmp_path: Path, generation: str, form: s
     fc6 = [blue[0], green[1] + 1, 2 * red[3], 0]  # cells row by row, channel by channel: 5 is green's second
     fc7 = [fc6[0], max(fc6[1] - fc6[2], 0), sum(fc6) - 7]
     np.testing.assert_allclose(found, unit(np.array(fc7)), atol=1e-6)
-    assert system.index([Description({"descriptor": found})]).compare([system.describe(PICTURE)])[
-        0, 0
-    ] == pytest.approx(1)
+    assert system.index([Description({"descriptor": found})]).score([system.describe(PICTURE)])[0, 0] == pytest.approx(
+        1
+    )
 
 
 HALVES = (slice(0, 114), slice(114, 227))
@@ -199,6 +198,6 @@ def test_fully_connected_layers_that_do_not_fit(tmp_path: Path) -> None:
 
 
 def test_each_says_which_file_it_needs() -> None:
-    for entry in SYSTEMS:
-        assert entry.about.weights is not None and ".caffemodel" in entry.about.weights
+    for about in (ALEXNET, AMOSNET, HYBRIDNET, PLACES365):
+        assert about.weights is not None and ".caffemodel" in about.weights
     assert ALEXNET.configuration["layer"] == "conv3"

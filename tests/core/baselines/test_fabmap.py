@@ -8,14 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from core.baselines.chow_liu import Tree
 from core.baselines.fabmap import (
     P_Z_GIVEN_E,
     P_Z_GIVEN_NOT_E,
     FabMap,
+    Tree,
+    chow_liu,
     local_features,
     log_likelihoods,
     log_odds,
+    mutual_information,
 )
 from core.baselines.system import Trainable
 from core.errors import InvalidModel
@@ -96,7 +98,7 @@ def test_log_odds_tell_certain_matches_apart() -> None:
 
 
 def scene(seed: int) -> Pixels:
-    """A picture full of corners: random rectangles."""
+    """A frame full of corners: random rectangles."""
     generator = np.random.default_rng(seed)
     canvas = np.full((120, 160, 3), 128, np.uint8)
     for _ in range(60):
@@ -115,7 +117,7 @@ def test_places_are_recognized_after_training() -> None:
 
     index = system.index([system.describe(place) for place in places])
     moved = [np.ascontiguousarray(np.roll(place, 3, axis=1)) for place in places]
-    scores = index.compare([system.describe(place) for place in moved])
+    scores = index.score([system.describe(place) for place in moved])
     assert scores.shape == (12, 12) and scores.dtype == np.float32 and np.isfinite(scores).all()
     assert (scores.argmax(axis=1) == np.arange(12)).mean() > 0.9
 
@@ -124,19 +126,69 @@ def test_a_blank_frame_and_a_single_place_have_scores() -> None:
     system = FabMap()
     system.train([scene(1), scene(2)], seed=0)
     blank = system.describe(np.zeros((120, 160, 3), np.uint8))
-    assert np.isfinite(system.index([system.describe(scene(1))]).compare([blank])).all()
+    assert np.isfinite(system.index([system.describe(scene(1))]).score([blank])).all()
 
 
 def test_large_frames_are_shrunk_first() -> None:
     grey = cv2.resize(scene(1)[:, :, 0], (1280, 960), interpolation=cv2.INTER_CUBIC)
     shrunk = cv2.resize(grey, (640, 480), interpolation=cv2.INTER_AREA)
-    large, small = (local_features(np.asarray(np.dstack([picture] * 3), np.uint8)) for picture in (grey, shrunk))
+    large, small = (local_features(np.asarray(np.dstack([image] * 3), np.uint8)) for image in (grey, shrunk))
     assert len(small) > 10
     np.testing.assert_array_equal(large, small)
 
 
 def test_a_system_without_training_or_features_says_so() -> None:
-    with pytest.raises(InvalidModel, match="no training picture"):
+    with pytest.raises(InvalidModel, match="no training image"):
         FabMap().train([np.zeros((64, 64, 3), np.uint8)], seed=0)
     with pytest.raises(InvalidModel, match="train it"):
         FabMap().describe(scene(1))
+
+
+# The tree of Chow and Liu: data that was drawn from a known one
+
+
+PARENTS = [0, 0, 0, 1, 1, 2]  # of each variable; 0 is the root
+P_IF_PARENT_IS = np.array([[0.4, 0.1, 0.7, 0.2, 0.3, 0.15], [0.4, 0.8, 0.2, 0.9, 0.05, 0.75]])
+
+
+def draw(count: int) -> np.ndarray:
+    generator = np.random.default_rng(3)
+    observations = np.zeros((count, len(PARENTS)), np.bool_)
+    for variable, parent in enumerate(PARENTS):
+        chances = P_IF_PARENT_IS[observations[:, parent].astype(int), variable]
+        observations[:, variable] = generator.random(count) < chances
+    return observations
+
+
+def test_a_known_tree_is_found_with_its_probabilities() -> None:
+    observations = draw(20_000)
+    tree = chow_liu(observations)
+    np.testing.assert_array_equal(tree.parents, PARENTS)
+    np.testing.assert_allclose(tree.given, P_IF_PARENT_IS, atol=0.02)
+    np.testing.assert_allclose(tree.marginals, observations.mean(axis=0), atol=1e-3)
+
+
+def test_variables_may_come_in_any_order() -> None:
+    order = np.array([4, 2, 0, 5, 3, 1])
+    tree = chow_liu(draw(20_000)[:, order])
+    edges = {frozenset((order[child], order[parent])) for child, parent in enumerate(tree.parents) if child != parent}
+    assert edges == {frozenset((child, parent)) for child, parent in enumerate(PARENTS) if child != parent}
+    assert tree.parents[0] == 0
+
+
+def test_mutual_information_by_hand() -> None:
+    observations = np.array([[0, 0, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1]], np.bool_)
+    information = mutual_information(observations)
+    # Pairs (0, 1): two of the cases were seen twice; each counts half a time more, of 4 + 2.
+    same, other = 2.5 / 6, 0.5 / 6
+    expected = 2 * same * np.log(same / 0.25) + 2 * other * np.log(other / 0.25)
+    assert information[0, 1] == pytest.approx(expected)
+    assert information[0, 2] == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(information, information.T, atol=1e-12)
+
+
+def test_one_variable_and_one_observation() -> None:
+    tree = chow_liu(np.array([[True]]))
+    np.testing.assert_array_equal(tree.parents, [0])
+    np.testing.assert_allclose(tree.marginals, [2 / 3])
+    np.testing.assert_allclose(tree.given, [[2 / 3], [2 / 3]])

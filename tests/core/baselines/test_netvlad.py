@@ -20,11 +20,11 @@ from core.baselines.netvlad import (
     NetVladLayer,
     Whitening,
     aggregate,
+    load_netvlad,
     soft_assignment,
 )
-from core.baselines.netvlad_files import load_netvlad
 from core.errors import InvalidModel
-from core.method.vlad import assign, residuals
+from core.method.equations import assign, residuals
 from core.networks.vgg import torchvision_indices
 from tests.core.networks.vgg_writer import blocks, plain_maps, plain_vgg
 
@@ -182,7 +182,7 @@ def vlad_core(biased: bool = False) -> dict[str, Any]:
 
 
 def describe(path: Path) -> Array:
-    system = NetVlad(*load_netvlad(path))
+    system = NetVlad(ABOUT, *load_netvlad(path))
     description = system.describe(PICTURE)
     assert set(description.milliseconds) == {"forward", "vlad"}
     assert system.identity.startswith("netvlad@")
@@ -259,7 +259,7 @@ def test_identities_tell_weights_apart(tmp_path: Path) -> None:
         tensors = port()
         tensors["pool.centroids"] += change
         torch.save(tensors, tmp_path / "a.pth")
-        identities.add(NetVlad(*load_netvlad(tmp_path / "a.pth")).identity)
+        identities.add(NetVlad(ABOUT, *load_netvlad(tmp_path / "a.pth")).identity)
     assert len(identities) == 2
 
 

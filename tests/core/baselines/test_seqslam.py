@@ -85,7 +85,7 @@ def test_short_traverses_and_free_paths_have_finite_scores() -> None:
     assert np.isfinite(distinctness(np.array([[0, 0, 0]], np.float32))).all()
     system = SeqSlam()
     blank = system.describe(np.zeros((48, 64, 3), np.uint8))
-    assert system.index([blank]).compare([blank]).tolist() == [[1.0]]
+    assert system.index([blank]).score([blank]).tolist() == [[1.0]]
 
 
 def view(place: float, generator: np.random.Generator, noise: float) -> Pixels:
@@ -104,8 +104,8 @@ def test_a_drive_of_known_velocity_is_found_through_noise(velocity: float) -> No
     assert system.sequential
     references = [system.describe(view(place, generator, 0)) for place in range(120)]
     queries = [system.describe(view(place, generator, 160)) for place in places]
-    found = system.index(references).compare(queries).argmax(axis=1)
-    alone = differences(stack(queries, "picture"), stack(references, "picture")).argmin(axis=1)
+    found = system.index(references).score(queries).argmax(axis=1)
+    alone = differences(stack(queries, "patches"), stack(references, "patches")).argmin(axis=1)
 
     inner = slice(D_S // 2, -D_S // 2)  # with whole sequences
     assert np.mean(np.abs(found - places)[inner] <= 1) > 0.95

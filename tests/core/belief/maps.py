@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from core.belief import Evidence, PlaceGraph, place_graph
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
 
 NEIGHBORHOOD = Neighborhood(radius=1.0, frames=1)
 

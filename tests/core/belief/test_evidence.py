@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from core.belief.evidence import LISTED, STRENGTH, STRONGEST, UNKNOWN, evidence
-from core.judgement.verdict import Calibration, Neighborhood, judge
+from core.judgement.verdict import Calibration, judge
+from core.places import Neighborhood
 from tests.core.belief.maps import walk
 
 CALIBRATION = Calibration(

@@ -26,7 +26,7 @@ from core.belief.filter import (
     uninformed,
 )
 from core.belief.motion import Pending, Transition, transition
-from core.judgement.verdict import Neighborhood, Whereabouts
+from core.places import Neighborhood, Whereabouts
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
 Matrix = NDArray[np.float64]
@@ -49,16 +49,6 @@ def likelihoods(graph: PlaceGraph, seen: Evidence) -> Matrix:
     return np.exp(values)
 
 
-def sequence_matrix(graph: PlaceGraph, stride: Stride) -> Matrix:
-    """The stride's kernel, written out: what would leave the sequence counts for the rest of it."""
-    n = len(graph)
-    made = np.zeros((n, n))
-    for i, (offset, weight) in itertools.product(range(n), zip(*stride.kernel(), strict=True)):
-        if graph.first[i] <= i + offset < graph.last[i]:
-            made[i, i + offset] = weight
-    return made / made.sum(axis=1, keepdims=True)
-
-
 evidences = st.lists(
     st.tuples(st.lists(st.integers(0, 4), max_size=3, unique=True), st.floats(0.1, 6), st.floats(0, 2)),
     min_size=1,
@@ -71,7 +61,8 @@ evidences = st.lists(
 def test_it_is_the_sum_over_all_paths(told: list[tuple[list[int], float, float]], advance: float, back: bool) -> None:
     graph, stride = graph_of(walk(3, 2)), Stride(advance, back)
     frames = [shows(*rows, gain=gain, unknown=unknown) for rows, gain, unknown in told]
-    matrix = (1 - JUMP) * sequence_matrix(graph, stride) + JUMP / len(graph)
+    moved = transition(graph, Step(), stride, Pending())
+    matrix = (1 - JUMP) * moved.moves[0].matrix() + JUMP / len(graph)
 
     totals, unknown = np.zeros(len(graph)), START_UNKNOWN
     inside = 1.0  # of the frames so far, if the robot sees the map
@@ -83,8 +74,7 @@ def test_it_is_the_sum_over_all_paths(told: list[tuple[list[int], float, float]]
                 chance *= matrix[path[step - 1], place]
         totals[path[-1]] += chance
 
-    belief, moved = uninformed(len(graph)), transition(graph, Step(), stride, Pending())
-    before = 1.0
+    belief, before = uninformed(len(graph)), 1.0
     for step, frame in enumerate(frames):
         if step:
             unknown = (1 - RETURNING) * unknown + LEAVING * (1 - unknown)

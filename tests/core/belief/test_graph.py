@@ -7,7 +7,7 @@ import pytest
 
 from core.belief import place_graph
 from core.belief.graph import ALONG
-from core.judgement.verdict import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
 from tests.core.belief.maps import graph_of, posed, walk
 
 

@@ -9,8 +9,7 @@ import pytest
 
 from core.belief import Odometry, PlaceGraph, Step, Stride
 from core.belief.motion import FARTHEST_STEPS, Pending, transition
-from core.judgement.verdict import GEOGRAPHIC, Whereabouts
-from core.places import Pose
+from core.places import GEOGRAPHIC, Pose, Whereabouts
 from tests.core.belief.maps import graph_of, posed, walk
 
 

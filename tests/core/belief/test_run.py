@@ -22,7 +22,7 @@ from core.belief import (
     to_bytes,
 )
 from core.belief.run import LOST_AFTER
-from core.judgement.verdict import Neighborhood
+from core.places import Neighborhood
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
 BAYES, PATH = RunOptions(), RunOptions(filter="path")

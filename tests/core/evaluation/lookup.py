@@ -1,4 +1,4 @@
-"""Small systems whose scores can be worked out by hand: a picture's value says what it is described by."""
+"""Small systems whose scores can be worked out by hand: a frame's value says what it is described by."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from core.baselines.system import About, Description, Index, InnerProducts, stac
 from core.frames.preprocessing import Pixels
 
 
-def write_pictures(folder: Path, values: Sequence[int]) -> list[Path]:
-    """Files whose only content is their number: ``load`` makes a picture of it."""
+def write_images(folder: Path, values: Sequence[int]) -> list[Path]:
+    """Files whose only content is their number: ``load`` makes a frame of it."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for place, value in enumerate(values):
@@ -24,14 +24,14 @@ def write_pictures(folder: Path, values: Sequence[int]) -> list[Path]:
 
 
 def load(path: Path) -> Pixels:
-    """A 1 x 1 picture of the number in a file."""
+    """A 1 x 1 frame of the number in a file."""
     return np.full((1, 1, 3), int(path.read_text()), np.uint8)
 
 
 class Lookup:
-    """Describes a picture by the row of a table; half the inner product is the score.
+    """Describes a frame by the row of a table; half the inner product is the score.
 
-    described: how many pictures it has seen.
+    described: how many frames it has seen.
     """
 
     sequential = False
@@ -57,7 +57,7 @@ class Lookup:
 
 
 class Learner(Lookup):
-    """Must see pictures first; then it takes the mean of what they are described by away."""
+    """Must see frames first; then it takes the mean of what they are described by away."""
 
     def __init__(self, table: NDArray[np.float32], name: str = "learner") -> None:
         super().__init__(table, name)
@@ -68,8 +68,8 @@ class Learner(Lookup):
     def identity(self) -> str:
         return f"{self.about.name}@{'untrained' if self.mean is None else self.mean.tolist()}"
 
-    def train(self, pictures: Iterable[Pixels], seed: int) -> None:
-        self.seen = [int(pixels[0, 0, 0]) for pixels in pictures]
+    def train(self, frames: Iterable[Pixels], seed: int) -> None:
+        self.seen = [int(pixels[0, 0, 0]) for pixels in frames]
         self.mean = self.table[self.seen].mean(axis=0) * np.float32(seed + 1)
 
     def describe(self, pixels: Pixels) -> Description:
@@ -92,6 +92,6 @@ class _Together:
         self.known = known
         self.calls: list[int] = []
 
-    def compare(self, queries: Sequence[Description]) -> NDArray[np.float32]:
+    def score(self, queries: Sequence[Description]) -> NDArray[np.float32]:
         products = np.stack([query.arrays["descriptor"] for query in queries]) @ self.known.T
         return np.asarray(products - products.mean(axis=0), np.float32)

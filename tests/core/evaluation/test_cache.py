@@ -81,7 +81,7 @@ def test_a_key_depends_on_the_parts_and_on_the_code(monkeypatch: pytest.MonkeyPa
         assert key != cache_key(kind="run", system="a@0")
 
 
-@pytest.mark.parametrize("library", ["faiss-cpu", "numba", "numpy", "opencv-python-headless", "scikit-learn", "torch"])
+@pytest.mark.parametrize("library", ["faiss-cpu", "numba", "numpy", "opencv-python-headless", "scipy", "torch"])
 def test_a_key_depends_on_what_the_libraries_are(monkeypatch: pytest.MonkeyPatch, library: str) -> None:
     key = cache_key(kind="run")
     others = {**module._libraries(), library: "0.0.1"}

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.evaluation import auc_pr
 from core.frames.images import decode
 from core.frames.traverses import find_images
-from core.judgement.verdict import Neighborhood, Whereabouts, judge
+from core.judgement.curves import auc_pr
+from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
+from core.places import Neighborhood, Whereabouts
 
 CORRIDOR = Path(__file__).parents[4] / "shared/datasets/eval/corridor"
 MAP_DEFAULTS = Neighborhood(radius=5.0, frames=3)

@@ -7,9 +7,9 @@ import numpy as np
 from core.evaluation.cache import EvaluationCache
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.scalability import scalability, scale_sizes
-from core.evaluation.subjects import Subject, Training
+from core.evaluation.subject import Subject, Training
 from core.frames.traverses import tolerance_truth
-from tests.core.evaluation.lookup import Lookup, load, write_pictures
+from tests.core.evaluation.lookup import Lookup, load, write_images
 
 
 def test_sizes_grow_evenly_up_to_all() -> None:
@@ -23,7 +23,7 @@ def made(folder: Path, count: int = 16) -> tuple[TraversePair, np.ndarray]:
     """Query i looks like reference i, but from the tenth on like reference 9."""
     table = np.eye(count, dtype=np.float32)
     shown = [min(number, 9) for number in range(count)]
-    references, queries = write_pictures(folder / "r", range(count)), write_pictures(folder / "q", shown)
+    references, queries = write_images(folder / "r", range(count)), write_images(folder / "q", shown)
     return TraversePair("made", references, queries, tolerance_truth(count, count, 0), np.arange(count)), table
 
 
@@ -42,7 +42,7 @@ def test_both_traverses_grow(tmp_path: Path) -> None:
     assert [point.recall_at_1 for point in points] == [1.0, 1.0, 10 / 11, 10 / 12, 10 / 14, 10 / 16]
     assert points[0].auc_pr == 1.0 and points[-1].auc_pr < 0.9
     assert all(point.milliseconds > 0 and point.system == "lookup" for point in points)
-    assert system.described == 32  # each picture once
+    assert system.described == 32  # each image once
 
 
 def test_a_query_counts_where_a_true_reference_is_kept(tmp_path: Path) -> None:

@@ -5,29 +5,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.baselines.catalogue import build
+from core.baselines.registry import build
 from core.evaluation.cache import EvaluationCache
 from core.evaluation.data.disturbances import Disturbance, darkness
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.severity import severity, severity_steps
-from core.evaluation.subjects import Subject, Training
+from core.evaluation.subject import Subject, Training
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels
 from core.frames.traverses import tolerance_truth
 from core.method.catalogue import EncoderCatalogue
-from tests.core.evaluation.lookup import Lookup, load, write_pictures
+from tests.core.evaluation.lookup import Lookup, load, write_images
 from tests.service.scenes import encoded, scene
 
 DIMMER = Disturbance("dimmer", "% gone", (0, 50, 90), darkness)
 
 
 def made(folder: Path) -> TraversePair:
-    references, queries = write_pictures(folder / "r", [0, 8, 16]), write_pictures(folder / "q", [0, 8, 16])
+    references, queries = write_images(folder / "r", [0, 8, 16]), write_images(folder / "q", [0, 8, 16])
     return TraversePair("made", references, queries, tolerance_truth(3, 3, 0), np.arange(3))
 
 
 def by_value() -> Lookup:
-    """Rows by a picture's value: 16 dimmed by half is 8, which looks like another place; 8 becomes 4, like itself."""
+    """Rows by an image's value: 16 dimmed by half is 8, which looks like another place; 8 becomes 4, like itself."""
     table = np.zeros((17, 3), np.float32)
     table[0] = table[2] = [1, 0, 0]
     table[8] = [0, 1, 0]

@@ -1,4 +1,4 @@
-"""The clockwork of the benchmarks."""
+"""Interleaved runs, and what they run."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from core.evaluation.timing import LAYOUTS, encoding_runs, forward_passes, jpeg, medians, sample_picture
-from core.frames.images import decode
+from core.evaluation.samples import jpeg, sample_frame
+from core.evaluation.timing import LAYOUTS, encoding_runs, forward_passes, medians, search_run
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.backbone import PluggedNetwork
@@ -33,15 +33,8 @@ def test_runs_take_turns_and_the_warm_up_does_not_count() -> None:
     assert times["b"] < times["a"]
 
 
-def test_the_picture_is_that_of_a_camera() -> None:
-    data = jpeg(sample_picture())
-    assert data == jpeg(sample_picture())
-    assert decode(data).shape == (480, 640, 3)
-    assert 30_000 < len(data) < 300_000
-
-
 def test_the_bare_passes_compute_what_the_encoder_computes(encoder: Encoder) -> None:
-    pixels = sample_picture(3)
+    pixels = sample_frame(3)
     passes = forward_passes(encoder, pixels)
     assert set(passes) == set(LAYOUTS)
     wanted = encoder.extractor.activations([pixels])[0]
@@ -56,7 +49,7 @@ def test_the_runs_leave_the_encoder_as_it_was(encoder: Encoder) -> None:
     backbone = encoder.extractor.backbone
     assert isinstance(backbone, torch.nn.Module)
     before = [tensor.clone() for tensor in backbone.state_dict().values()]
-    for run in encoding_runs(encoder, jpeg(sample_picture())).values():
+    for run in encoding_runs(encoder, jpeg(sample_frame())).values():
         run()
     assert all(torch.equal(a, b) for a, b in zip(before, backbone.state_dict().values(), strict=True))
 
@@ -66,4 +59,12 @@ def test_another_kind_of_backbone_is_refused(encoder: Encoder, monkeypatch: pyte
     plugged = PluggedNetwork(torch.nn.Sequential(layer), ["0"], encoder.extractor.backbone.input, "a test's")
     monkeypatch.setattr(encoder.extractor, "backbone", plugged)
     with pytest.raises(TypeError, match="no torch module"):
-        forward_passes(encoder, sample_picture())
+        forward_passes(encoder, sample_frame())
+
+
+def test_a_search_is_a_whole_query_of_a_map(encoder: Encoder) -> None:
+    with search_run(encoder, places=4) as search:
+        found = search()
+    assert isinstance(found, list)
+    (located,) = found
+    assert len(located.matches) == 4 and located.matches[0][1].id == "p00000"

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 
-from core.frames.exif import read_orientation, read_whereabouts
+from core.frames.exif import read_orientation, read_pose_and_time
 from core.places import Pose
 
 GPS = {1: "N", 2: (48.0, 51.0, 29.6), 3: "E", 4: (2.0, 17.0, 40.2), 7: (9.0, 30.0, 15.0), 29: "2026:11:20"}
@@ -46,7 +46,7 @@ def test_the_orientation_in_both_byte_orders(order: Any, kind: int, size: int) -
 
 @pytest.mark.parametrize("name", ["JPEG", "PNG", "WEBP"])
 def test_position_and_satellite_time(name: str) -> None:
-    pose, moment = read_whereabouts(photograph(name, GPS))
+    pose, moment = read_pose_and_time(photograph(name, GPS))
     assert pose is not None
     assert (pose.latitude, pose.longitude) == pytest.approx(EIFFEL, abs=1e-7)
     assert pose.heading is None
@@ -54,7 +54,7 @@ def test_position_and_satellite_time(name: str) -> None:
 
 
 def test_south_and_west_are_negative() -> None:
-    pose, _ = read_whereabouts(photograph(gps=GPS | {1: "S", 3: "W"}))
+    pose, _ = read_pose_and_time(photograph(gps=GPS | {1: "S", 3: "W"}))
     assert pose is not None
     assert (pose.latitude, pose.longitude) == pytest.approx((-EIFFEL[0], -EIFFEL[1]), abs=1e-7)
 
@@ -62,7 +62,7 @@ def test_south_and_west_are_negative() -> None:
 @pytest.mark.parametrize(("reference", "heading"), [("T", 123.5), ("M", None), (None, 123.5)])
 def test_only_a_direction_from_true_north_is_a_heading(reference: str | None, heading: float | None) -> None:
     direction = {17: 123.5} if reference is None else {16: reference, 17: 123.5}
-    pose, _ = read_whereabouts(photograph(gps=GPS | direction))
+    pose, _ = read_pose_and_time(photograph(gps=GPS | direction))
     assert pose is not None
     assert pose.heading == heading
 
@@ -80,18 +80,18 @@ def test_only_a_direction_from_true_north_is_a_heading(reference: str | None, he
     ],
 )
 def test_a_position_that_makes_no_sense_is_absent(gps: dict[int, Any]) -> None:
-    assert read_whereabouts(photograph(gps=gps))[0] is None
+    assert read_pose_and_time(photograph(gps=gps))[0] is None
 
 
 def test_the_clock_with_an_offset_comes_before_the_satellites() -> None:
-    _, moment = read_whereabouts(photograph(gps=GPS, clock=CLOCK))
+    _, moment = read_pose_and_time(photograph(gps=GPS, clock=CLOCK))
     assert moment == datetime(2026, 11, 20, 9, 30, 16, 250_000, tzinfo=UTC)
 
 
 def test_a_clock_without_an_offset_names_no_instant() -> None:
     clock = {0x9003: CLOCK[0x9003]}
-    assert read_whereabouts(photograph(clock=clock)) == (None, None)
-    assert read_whereabouts(photograph(gps=GPS, clock=clock))[1] == datetime(2026, 11, 20, 9, 30, 15, tzinfo=UTC)
+    assert read_pose_and_time(photograph(clock=clock)) == (None, None)
+    assert read_pose_and_time(photograph(gps=GPS, clock=clock))[1] == datetime(2026, 11, 20, 9, 30, 15, tzinfo=UTC)
 
 
 @pytest.mark.parametrize(
@@ -104,12 +104,12 @@ def test_a_clock_without_an_offset_names_no_instant() -> None:
     ],
 )
 def test_a_time_that_makes_no_sense_is_absent(clock: dict[int, Any]) -> None:
-    assert read_whereabouts(photograph(clock=clock)) == (None, None)
+    assert read_pose_and_time(photograph(clock=clock)) == (None, None)
 
 
 @pytest.mark.parametrize("data", [b"", b"hello", b"GIF89a", b"\xff\xd8\xff\xe1"])
 def test_other_bytes_know_nothing(data: bytes) -> None:
-    assert read_whereabouts(data) == (None, None)
+    assert read_pose_and_time(data) == (None, None)
 
 
 WHOLE = photograph(gps=GPS | {16: "T", 17: 10.0}, clock=CLOCK)
@@ -117,7 +117,7 @@ START, END = WHOLE.index(b"Exif\0\0") + 6, WHOLE.index(b"\xff\xdb")
 
 
 def test_the_block_that_is_mutated_below_is_whole() -> None:
-    pose, moment = read_whereabouts(WHOLE)
+    pose, moment = read_pose_and_time(WHOLE)
     assert pose == Pose(latitude=EIFFEL[0], longitude=EIFFEL[1], heading=10.0)
     assert moment is not None
 
@@ -128,7 +128,7 @@ def test_a_broken_block_never_raises(changes: list[tuple[int, int]]) -> None:
     data = bytearray(WHOLE)
     for place, value in changes:
         data[START + place] = value
-    pose, moment = read_whereabouts(bytes(data))
+    pose, moment = read_pose_and_time(bytes(data))
     assert pose is None or pose.kind() == "geographic"
     assert moment is None or moment.tzinfo is UTC
     assert read_orientation(bytes(data[START:END])) in range(1, 9)

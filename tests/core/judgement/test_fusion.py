@@ -7,8 +7,8 @@ import pytest
 
 from core.judgement.fusion import BLIND, Fused, View, fuse, joint_probabilities, log_odds_of
 from core.judgement.probability import Curve, sigmoid
-from core.judgement.verdict import Calibration, Judgement, Neighborhood, judge
-from core.places import Pose
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Pose
 from tests.core.judgement.test_priors import places
 
 CALIBRATION = Calibration(

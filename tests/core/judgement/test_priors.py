@@ -25,8 +25,8 @@ from core.judgement.priors import (
     weighed,
 )
 from core.judgement.probability import Curve
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Calibration, Whereabouts
-from core.places import EARTH_RADIUS, Pose
+from core.judgement.verdict import Calibration
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts
 
 CALIBRATION = Calibration(
     source="test", threshold=0.2, margin=0.01, background_mean=0.1, background_deviation=0.05,

@@ -11,19 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.judgement.probability import Curve
-from core.judgement.verdict import (
-    GEOGRAPHIC,
-    METRIC,
-    NO_POSE,
-    Calibration,
-    Neighborhood,
-    Whereabouts,
-    completed,
-    judge,
-    probability_of,
-    standing_out,
-)
-from core.places import Pose
+from core.judgement.verdict import Calibration, completed, judge, probability_of, standing_out
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Pose, Whereabouts
 
 CALIBRATION = Calibration(
     source="encoder-default", threshold=2.0, margin=0.01, background_mean=0.02, background_deviation=0.01

@@ -1,4 +1,4 @@
-"""The second stage against a plain reading of its definition, and on grids where the answer is known."""
+"""The second stage on grids where the answer is known, and the cells that it compares where they lie in memory."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from pydantic import ValidationError
 from core.method.agreement import (
     RESOLUTION,
     AgreementDefinition,
+    ScatteredCells,
     agreement,
     correspondences,
+    in_one_block,
     local_descriptors,
     reranked,
 )
@@ -28,42 +30,22 @@ def random_cells(seed: int, count: int = ROWS * COLUMNS, values: int = 8) -> NDA
     return local_descriptors([rows / np.linalg.norm(rows, axis=1, keepdims=True)], definition(values=values))
 
 
-def plainly(query: NDArray[np.int8], reference: NDArray[np.int8], stage: AgreementDefinition) -> dict[int, int]:
-    """Mutual best matches by two loops over all cells."""
-    products = query.astype(int) @ reference.T.astype(int)
-
-    def best(of: int, values: NDArray[np.int_]) -> int:
-        y, x = divmod(of, COLUMNS)
-        within = [
-            cell
-            for cell in range(len(values))
-            if abs(cell // COLUMNS - y) <= stage.reach[0] and abs(cell % COLUMNS - x) <= stage.reach[1]
-        ]
-        return max(within, key=lambda cell: (values[cell], -cell))
-
-    there = {cell: best(cell, products[cell]) for cell in range(len(query))}
-    return {a: b for a, b in there.items() if best(b, products[:, b]) == a and products[a, b] > 0}
-
-
 @pytest.mark.parametrize("seed", range(6))
-def test_mutual_matches_and_their_sum_equal_a_plain_search(seed: int) -> None:
+def test_the_gain_is_the_share_of_the_mean_squared_cosine(seed: int) -> None:
     stage, query = definition(), random_cells(seed)
     references = np.stack([random_cells(100 + seed + n) for n in range(3)])
     gains = agreement(query, references, COLUMNS, stage)
     for reference, gain in zip(references, gains, strict=True):
-        expected = plainly(query, reference, stage)
-        found = correspondences(query, reference, COLUMNS, stage)
-        assert dict(zip(found.query.tolist(), found.reference.tolist(), strict=True)) == expected
-        cosines = [
-            float(query[a].astype(float) @ reference[b].astype(float)) / RESOLUTION**2 for a, b in expected.items()
-        ]
-        np.testing.assert_allclose(found.cosines, cosines, rtol=1e-5)
-        assert gain == pytest.approx(stage.share * sum(c * c for c in cosines) / len(query), rel=1e-5)
+        found = correspondences(query, reference, COLUMNS, stage.reach)
+        assert len(found.query)
+        products = np.einsum("nl,nl->n", query[found.query].astype(int), reference[found.reference].astype(int))
+        np.testing.assert_allclose(found.cosines, products / RESOLUTION**2, rtol=1e-6)
+        assert gain == pytest.approx(stage.share * float((found.cosines**2).sum()) / len(query), rel=1e-5)
 
 
 def test_a_frame_agrees_with_itself_in_every_cell() -> None:
     cells, stage = random_cells(0, values=64), definition(values=64)
-    found = correspondences(cells, cells, COLUMNS, stage)
+    found = correspondences(cells, cells, COLUMNS, stage.reach)
     np.testing.assert_array_equal(found.query, found.reference)
     assert len(found.query) == ROWS * COLUMNS
     assert agreement(cells, cells[np.newaxis], COLUMNS, stage)[0] == pytest.approx(stage.share, rel=0.02)
@@ -72,7 +54,7 @@ def test_a_frame_agrees_with_itself_in_every_cell() -> None:
 def test_a_shifted_frame_is_found_within_reach_and_not_beyond() -> None:
     cells = random_cells(3, values=64)
     shifted = np.roll(cells.reshape(ROWS, COLUMNS, -1), 2, axis=1).reshape(ROWS * COLUMNS, -1)
-    near = correspondences(cells, shifted, COLUMNS, definition((0, 2), 64))
+    near = correspondences(cells, shifted, COLUMNS, (0, 2))
     moved = near.reference % COLUMNS - near.query % COLUMNS
     assert np.count_nonzero(moved == 2) >= ROWS * (COLUMNS - 2)
     within, beyond = (agreement(cells, shifted[np.newaxis], COLUMNS, definition((0, d), 64))[0] for d in (2, 1))
@@ -122,3 +104,68 @@ def test_a_definition_that_makes_no_sense_is_refused(wrong: dict[str, object]) -
     AgreementDefinition.model_validate(right)
     with pytest.raises(ValidationError):
         AgreementDefinition.model_validate({**right, **wrong})
+
+
+def scattered(values: int) -> ScatteredCells:
+    random = np.random.default_rng(1)
+    blocks = tuple(random.integers(-90, 91, (n, ROWS * COLUMNS, values)).astype(np.int8) for n in (3, 1, 5))
+    return ScatteredCells(blocks, np.array([2, 0, 1, 2, 2]), np.array([4, 0, 0, 1, 4]))
+
+
+def test_together_they_stand_in_order() -> None:
+    lying = scattered(8)
+    assert lying.shape == (5, ROWS * COLUMNS, 8)
+    expected = [lying.blocks[block][row] for block, row in ((2, 4), (0, 0), (1, 0), (2, 1), (2, 4))]
+    np.testing.assert_array_equal(lying.together(), expected)
+    lying.together()[:] = 0
+    assert lying.blocks[2][4].any()
+
+
+@pytest.mark.parametrize("values", [8, 6, 3])
+def test_they_agree_with_a_frame_as_copies_do(values: int) -> None:
+    lying = scattered(values)
+    stage = definition(values=values)
+    query = lying.blocks[1][0]
+    gains = agreement(query, lying, COLUMNS, stage)
+    assert gains[2] > gains[0] > 0
+    np.testing.assert_allclose(gains, agreement(query, lying.together(), COLUMNS, stage), rtol=1e-6)
+    backwards = lying.together()[::-1]
+    np.testing.assert_allclose(gains[::-1], agreement(query, backwards, COLUMNS, stage), rtol=1e-6)
+    query.flags.writeable = False
+    np.testing.assert_allclose(gains, agreement(query, lying, COLUMNS, stage), rtol=1e-6)
+
+
+def test_addresses_are_those_of_the_blocks() -> None:
+    lying = scattered(8)
+    size = ROWS * COLUMNS * 8
+    assert lying.addresses().tolist() == [
+        lying.blocks[block].ctypes.data + row * size for block, row in ((2, 4), (0, 0), (1, 0), (2, 1), (2, 4))
+    ]
+    nothing = in_one_block(np.empty((0, 4, 8), np.int8))
+    assert (len(nothing), nothing.addresses().tolist()) == (0, [])
+
+
+@pytest.mark.parametrize(("block", "row"), [(0, 3), (1, 1), (2, -1)])
+def test_a_row_that_is_not_there_is_refused(block: int, row: int) -> None:
+    with pytest.raises(IndexError):
+        ScatteredCells(scattered(8).blocks, np.array([0, block]), np.array([0, row])).addresses()
+
+
+@pytest.mark.parametrize(
+    "other", [np.zeros((2, 12, 9), np.int8), np.zeros((2, 12, 16), np.int8)[:, :, ::2], np.zeros((2, 12, 8), np.int16)]
+)
+def test_blocks_of_another_kind_are_refused(other: np.ndarray) -> None:
+    blocks = (np.zeros((2, 12, 8), np.int8), other)
+    with pytest.raises(ValueError, match="alike"):
+        ScatteredCells(blocks, np.array([0]), np.array([0])).addresses()
+
+
+def test_grids_that_are_not_alike_are_refused() -> None:
+    stage = definition()
+    for query, columns in (
+        (np.zeros((24, 4), np.int8), 6),
+        (np.zeros((9, 8), np.int8), 3),
+        (np.zeros((24, 8), np.int8), 5),
+    ):
+        with pytest.raises(ValueError, match="held against"):
+            agreement(query, scattered(8), columns, stage)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from core.method.equations import unit_length
 from core.method.projection import Projection, fit_projection
-from core.method.regions import unit_length
 
 
 def test_what_conditions_change_is_left_out_and_what_tells_spots_apart_is_kept() -> None:

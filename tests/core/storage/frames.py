@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from core.places import PlaceFields, Pose
 from core.storage import Enrolment
+from core.storage.files.segment_files import Layout
 
 ENCODER = "made-up@" + "0" * 64
 DIMENSION = 16
@@ -66,3 +68,13 @@ def frame(
         thumbnail=f"thumbnail of {shown}".encode(),
         image=f"image of {shown}".encode(),
     )
+
+
+def packed(
+    layout: Layout, descriptors: Sequence[NDArray[np.float32]], local: Sequence[NDArray[np.int8]], first_row: int
+) -> NDArray[np.void]:
+    """Records of frames, float32 [D] and int8 [C, L] each, for the rows from ``first_row`` on."""
+    records = np.zeros(len(descriptors), layout.record)
+    for row, (descriptor, cells) in enumerate(zip(descriptors, local, strict=True)):
+        layout.pack(records[row], descriptor, cells, first_row + row)
+    return records

@@ -43,7 +43,7 @@ def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, mo
     monkeypatch.setattr(lab.cameras, "_writing", told)
     changing = threading.Thread(target=lambda: lab.cameras.put("back", MASK), daemon=True)
     asking = threading.Thread(target=lambda: found.append(lab.cameras.all()), daemon=True)
-    with lab.transfer.quiet():
+    with lab.transfer.paused_writes():
         changing.start()
         assert waiting.wait(SECONDS)
         asking.start()

@@ -23,7 +23,7 @@ from core.errors import (
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Enrolment, Map, MapSettings, SameFrame
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
@@ -145,6 +145,30 @@ def test_one_wrong_item_refuses_them_all(lab: Map, wrong: object, error: type[Ex
         lab.place("p")
     assert changes(lab, frame("after")) == ["created"]
     assert best(lab, "after") == "after"
+    assert lab.verify().ok
+
+
+def test_known_frames_and_new_ones_are_one_commit_in_their_order(lab: Map) -> None:
+    lab.enrol([frame("a"), frame("b"), frame("c")])
+    monday = PlaceFields(sequence="monday")
+    items: list[Enrolment | SameFrame] = [
+        SameFrame("b", monday, digest_of("b")),
+        frame("new", sequence="monday"),
+        SameFrame("a", monday, digest_of("a")),
+        SameFrame("c", monday, digest_of("another")),
+        SameFrame("nobody", monday, digest_of("nobody")),
+    ]
+    done = lab.enrol(items)
+    assert [one and one[1] for one in done] == ["updated", "created", "updated", None, None]
+    order = {place.id: place.ordinal for place in lab.transfer.outline() if place.sequence == "monday"}
+    assert order == {"b": 0, "new": 1, "a": 2}
+
+    too_deep: dict[str, object] = {}
+    for _ in range(100):
+        too_deep = {"in": too_deep}
+    with pytest.raises(InvalidField):
+        lab.enrol([frame("newer"), SameFrame("a", PlaceFields(metadata=too_deep), digest_of("a"))])
+    assert lab.digest("newer") is None, "all or none"
     assert lab.verify().ok
 
 
@@ -390,6 +414,20 @@ def test_a_damaged_picture_is_not_handed_out(lab: Map) -> None:
     lab.enrol([frame("p")])
     with lab._writing() as write:
         write.connection.execute("UPDATE pictures SET bytes = x'00'")
-    with pytest.raises(StorageFailure, match="damaged"):
-        lab.thumbnail("p")
+    for read in (lab.thumbnail, lab.picture):
+        with pytest.raises(StorageFailure, match="damaged"):
+            read("p")
     assert lab.place("p").id == "p"
+
+
+ENDLESS = b"\x89PNG\r\n\x1a\n\0\0\0\x0dIHDR" + (1 << 20).to_bytes(4, "big") * 2 + bytes(9)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"), [(ENDLESS, "1048576x1048576 pixels"), (b"<script>", "not those of an image")]
+)
+def test_a_kept_picture_that_cannot_be_shown_is_no_thumbnail(lab: Map, content: bytes, why: str) -> None:
+    lab.edit({"keep": "image"})
+    lab.enrol([replace(frame("p"), image=content)])
+    with pytest.raises(NoThumbnail, match=why):
+        lab.thumbnail("p")

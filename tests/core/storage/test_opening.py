@@ -199,7 +199,7 @@ def test_a_damaged_map_is_quarantined_and_the_others_serve(
         atlas.close()
 
 
-def test_metadata_that_is_filed_otherwise_is_filed_anew(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_index_of_metadata_that_is_wrong_is_rebuilt(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
     """What places are found by follows from the places, and another SQLite may make it otherwise."""
     atlas = Atlas(directory)
     lab = atlas.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
@@ -210,7 +210,7 @@ def test_metadata_that_is_filed_otherwise_is_filed_anew(directory: Path, caplog:
     run(folder, "DELETE FROM place_values WHERE key = 'note' AND row = 2")
     atlas = Atlas(directory)
     lab = atlas.get("lab")
-    assert "filed anew" in caplog.text and "map lab" in caplog.text.lower()
+    assert "is rebuilt" in caplog.text and "map lab" in caplog.text.lower()
     assert lab.attributes.rows_with({"floor": 1}).tolist() == [1]
     assert lab.attributes.rows_with({"floor": 7}).tolist() == []
     assert lab.attributes.rows_with({"note": "a"}).tolist() == [0, 1, 2]
@@ -219,5 +219,5 @@ def test_metadata_that_is_filed_otherwise_is_filed_anew(directory: Path, caplog:
     caplog.clear()
     atlas = Atlas(directory)
     atlas.get("lab")
-    assert "filed anew" not in caplog.text
+    assert "is rebuilt" not in caplog.text
     atlas.close()

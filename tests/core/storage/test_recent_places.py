@@ -12,7 +12,7 @@ import pytest
 from core.places import Place, PlaceFields, Pose
 from core.storage import Map
 from core.storage.database import ledger
-from core.storage.recent_places import LONGEST, MOST, Memo
+from core.storage.map import LONGEST_METADATA, MOST_RECENT, RecentPlaces
 from tests.core.storage.frames import frame
 
 
@@ -78,16 +78,16 @@ def test_a_write_that_fails_changes_nothing(lab: Map) -> None:
 
 
 def test_what_is_remembered_is_bounded(lab: Map) -> None:
-    lab.enrol([frame("p0"), replace(frame("p1"), fields=PlaceFields(metadata={"text": "x" * LONGEST}))])
+    lab.enrol([frame("p0"), replace(frame("p1"), fields=PlaceFields(metadata={"text": "x" * LONGEST_METADATA}))])
     place, long = lab.places_at([0, 1])
     assert place is not None and long is not None
-    memo, state = Memo(), object()
-    for first in range(0, 3 * MOST, 7):
-        memo.keep(state, {first + i: place for i in range(7)})
-        assert first in memo.places(state, [first])
-        assert len(memo.places(state, range(3 * MOST))) <= MOST
-    memo.keep(state, {5: long})
-    assert memo.places(state, [5]).get(5) is not long
-    memo.keep(state, dict.fromkeys(range(2 * MOST), place))
-    assert len(memo.places(state, range(2 * MOST))) == MOST
-    assert memo.places(object(), range(2 * MOST)) == {}
+    recent, state = RecentPlaces(), object()
+    for first in range(0, 3 * MOST_RECENT, 7):
+        recent.keep(state, {first + i: place for i in range(7)})
+        assert first in recent.places(state, [first])
+        assert len(recent.places(state, range(3 * MOST_RECENT))) <= MOST_RECENT
+    recent.keep(state, {5: long})
+    assert recent.places(state, [5]).get(5) is not long
+    recent.keep(state, dict.fromkeys(range(2 * MOST_RECENT), place))
+    assert len(recent.places(state, range(2 * MOST_RECENT))) == MOST_RECENT
+    assert recent.places(object(), range(2 * MOST_RECENT)) == {}

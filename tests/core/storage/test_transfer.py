@@ -1,4 +1,4 @@
-"""Places from one map to another: with all that is kept of them, all or none."""
+"""Copying places from one map to another, and deleting many at once."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import InvalidField, StorageFailure
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, History, Map, MapSettings, SameFrame
+from core.storage import Atlas, Enrolment, History, Map, MapSettings
 from core.storage.transfer import Outline
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
@@ -35,7 +34,7 @@ def test_a_place_comes_with_its_history(lab: Map, hall: Map) -> None:
     place = hall.place("a")
     assert (place.created_at, place.updated_at, place.regions) == (EARLIER, LATER, 7)
     assert place.picture == "thumbnail", "although this map keeps none of its own"
-    assert hall.transfer.picture("a") == b"small"
+    assert hall.picture("a") == b"small"
     (outline,) = hall.transfer.outline()
     assert (outline.id, outline.sequence, outline.ordinal, outline.digest) == ("a", "monday", 41, item.digest)
     assert hall.snapshot().whereabouts.ordinal.tolist() == [41]
@@ -43,30 +42,6 @@ def test_a_place_comes_with_its_history(lab: Map, hall: Map) -> None:
     hall.enrol([frame("b", sequence="monday")])
     assert hall.snapshot().whereabouts.ordinal.tolist() == [41, 42], "the next one comes behind"
     assert hall.verify().ok
-
-
-def test_known_frames_and_new_ones_are_one_commit_in_their_order(lab: Map) -> None:
-    lab.enrol([frame("a"), frame("b"), frame("c")])
-    monday = PlaceFields(sequence="monday")
-    items: list[Enrolment | SameFrame] = [
-        SameFrame("b", monday, digest_of("b")),
-        frame("new", sequence="monday"),
-        SameFrame("a", monday, digest_of("a")),
-        SameFrame("c", monday, digest_of("another")),
-        SameFrame("nobody", monday, digest_of("nobody")),
-    ]
-    done = lab.transfer.enrol(items)
-    assert [one and one[1] for one in done] == ["updated", "created", "updated", None, None]
-    order = {place.id: place.ordinal for place in lab.transfer.outline() if place.sequence == "monday"}
-    assert order == {"b": 0, "new": 1, "a": 2}
-
-    too_deep: dict[str, object] = {}
-    for _ in range(100):
-        too_deep = {"in": too_deep}
-    with pytest.raises(InvalidField):
-        lab.transfer.enrol([frame("newer"), SameFrame("a", PlaceFields(metadata=too_deep), digest_of("a"))])
-    assert lab.digest("newer") is None, "all or none"
-    assert lab.verify().ok
 
 
 def test_what_is_searched_is_what_is_stored(atlas: Atlas, directory: Path, hall: Map) -> None:
@@ -135,32 +110,19 @@ def test_what_a_map_can_tell(lab: Map) -> None:
     for name, image in (("a", content), ("b", None)):
         lab.enrol([Enrolment(name, item.fields, item.descriptor, 1, item.digest, item.local, image=image)])
     assert lab.transfer.count_without_image() == 1
-    assert lab.transfer.picture("a") == content and lab.transfer.picture("none") is None
+    assert lab.picture("a") == content and lab.picture("none") is None
     found = lab.transfer.find(["a", "none", "b"])
     assert {name: row for name, (_, row) in found.items()} == {"a": 0, "b": 1}
 
 
-def test_a_damaged_picture_is_not_given_on(atlas: Atlas, directory: Path, lab: Map) -> None:
-    import sqlite3
-
-    item = frame("a")
-    lab.enrol([Enrolment("a", item.fields, item.descriptor, 1, item.digest, item.local, thumbnail=b"small")])
-    connection = sqlite3.connect(directory / "maps" / "lab" / "map.sqlite")
-    with connection:
-        connection.execute("UPDATE pictures SET bytes = x'00'")
-    connection.close()
-    with pytest.raises(StorageFailure, match="damaged"):
-        lab.transfer.picture("a")
-
-
-def test_nobody_writes_in_the_quiet(lab: Map) -> None:
+def test_nobody_else_writes_while_writes_are_paused(lab: Map) -> None:
     done = threading.Event()
 
     def write() -> None:
         lab.enrol([frame("b")])
         done.set()
 
-    with lab.transfer.quiet():
+    with lab.transfer.paused_writes():
         writer = threading.Thread(target=write)
         writer.start()
         assert not done.wait(0.2)

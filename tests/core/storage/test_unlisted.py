@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from core.disk import files as disk
 from core.errors import MapExists, StorageFailure, UnknownMap
 from core.storage import Atlas, Map
 from core.storage import atlas as storage_atlas
-from core.storage.files import disk
 from core.storage.opening import UNLISTED
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 

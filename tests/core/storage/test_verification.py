@@ -53,7 +53,7 @@ def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:
         flip(folder / name, HEADER_BYTES + (row % 4) * RECORD_BYTES)
     problems = "\n".join(hall.verify().problems)
     assert "descriptors-000001.seg: row 1 (place 'p1') does not match its checksum" in problems
-    assert "descriptors-000002.seg: row 6 (no place any more) does not match its checksum" in problems
+    assert "descriptors-000002.seg: row 6 (of no place) does not match its checksum" in problems
     assert "descriptors-000003.seg: row 9 (place 'p9') does not match its checksum" in problems
 
 
@@ -75,7 +75,7 @@ def test_many_damaged_rows_are_counted(atlas: Atlas, directory: Path) -> None:
         flip(directory / "maps" / "lab" / "descriptors-000001.seg", HEADER_BYTES + row * RECORD_BYTES)
     problems = lab.verify().problems
     assert len([problem for problem in problems if "does not match" in problem]) == 10
-    assert "descriptors-000001.seg: so with 20 more rows" in problems
+    assert "descriptors-000001.seg: the same is true of 20 more rows" in problems
 
 
 def test_a_missing_segment_does_not_hide_the_others(hall: Map, folder: Path) -> None:
@@ -99,7 +99,7 @@ def test_an_image_that_is_not_the_one_enrolled_is_named(hall: Map) -> None:
 
 def test_a_picture_that_is_missing_is_named(hall: Map) -> None:
     execute(hall, "DELETE FROM pictures WHERE place = 3")
-    assert hall.verify().problems == ["map.sqlite: place 'p2' is said to keep image, which is not so"]
+    assert hall.verify().problems == ["map.sqlite: place 'p2' is recorded to keep image, which is not true"]
 
 
 def test_what_is_searched_must_be_what_is_stored(hall: Map) -> None:
@@ -115,15 +115,15 @@ def test_what_is_compared_after_the_search_must_be_what_is_stored(hall: Map) -> 
 @pytest.mark.parametrize(
     ("statement", "problem"),
     [
-        ("UPDATE places SET x = 1, y = 2 WHERE id = 'p1'", "row 1 is searched otherwise than map.sqlite has it"),
-        ("UPDATE places SET ordinal = 77 WHERE id = 'p1'", "row 1 is searched otherwise than map.sqlite has it"),
+        ("UPDATE places SET x = 1, y = 2 WHERE id = 'p1'", "row 1 differs between what is searched and map.sqlite"),
+        ("UPDATE places SET ordinal = 77 WHERE id = 'p1'", "row 1 differs between what is searched and map.sqlite"),
         ("DELETE FROM places WHERE id = 'p1'", "9 places in 10 rows are searched, 8 in 10 are stored"),
-        ("UPDATE places SET row = 6 WHERE id = 'p1'", "row 6 is searched otherwise than map.sqlite has it"),
+        ("UPDATE places SET row = 6 WHERE id = 'p1'", "row 6 differs between what is searched and map.sqlite"),
         ("UPDATE places SET row = 99 WHERE id = 'p1'", "map.sqlite: place 'p1' has row 99, but there are 10"),
-        ("UPDATE places SET checksum = 5 WHERE id = 'p1'", "row 1 (place 'p1') is not the one that map.sqlite names"),
+        ("UPDATE places SET checksum = 5 WHERE id = 'p1'", "row 1 (place 'p1') is not the one that map.sqlite records"),
         (
             "UPDATE segments SET checksum = 5 WHERE number = 2",
-            "its rows are not those that map.sqlite names",
+            "its rows are not those in map.sqlite",
         ),
     ],
 )
@@ -172,7 +172,7 @@ def test_the_log_can_be_emptied_while_descriptors_are_read(hall: Map, folder: Pa
             hall.enrol([frame("late")])
             for i in range(4):
                 hall.forget(f"p{i}")
-            opened.database.settle()
+            opened.database.empty_log()
             assert log.stat().st_size == 0
         told.append(done)
 

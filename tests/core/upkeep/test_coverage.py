@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from core.judgement.verdict import METRIC, NO_POSE, NO_TIME, Whereabouts
+from core.places import METRIC, NO_POSE, NO_TIME, Whereabouts
 from core.upkeep.coverage import backward_steps, distances, durations, long_steps, unlike_steps
 
 

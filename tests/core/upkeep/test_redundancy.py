@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from core.judgement.verdict import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 from core.upkeep.redundancy import MOST_NEIGHBOURS, Thinning, Trial, best_thinning, neighbour_pairs, steps, thinned
 

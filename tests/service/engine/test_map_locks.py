@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import threading
 
-from service.engine.map_locks import Possession
+from service.engine.engine import MapLocks
 
 
 def test_one_holder_at_a_time_and_nothing_is_left() -> None:
-    possession, inside, most = Possession(), list[int](), list[int]()
+    locks, inside, most = MapLocks(), list[int](), list[int]()
 
     def work(number: int) -> None:
         for _ in range(50):
-            with possession.of("lab"), possession.of("lab"):
+            with locks.of("lab"), locks.of("lab"):
                 inside.append(number)
                 most.append(len(inside))
                 inside.remove(number)
@@ -23,4 +23,4 @@ def test_one_holder_at_a_time_and_nothing_is_left() -> None:
     for thread in threads:
         thread.join()
     assert set(most) == {1} and len(most) == 200
-    assert len(possession) == 0
+    assert len(locks) == 0

@@ -24,8 +24,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.threads import cores
 from service.engine import microbatches
-from service.engine.microbatches import MOST_BULK, MOST_FRAMES, Encoded, MicroBatches, Turn
-from service.engine.queue import AHEAD, Inference, Outcomes, Patience
+from service.engine.microbatches import MOST_BULK, MOST_FRAMES, Encoded, MicroBatches, QueuedFrame
+from service.engine.queue import AHEAD, EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
@@ -56,11 +56,11 @@ class Watched:
         self.sizes: list[int] = []
         self.catalogue = catalogue
         self.batches = MicroBatches(self.load, Limits(), self.sizes.append)
-        self.taken: list[list[Turn]] = []
+        self.taken: list[list[QueuedFrame]] = []
         """The batches in the order in which threads took them."""
         take = self.batches._take
 
-        def noted(share: int) -> list[Turn]:
+        def noted(share: int) -> list[QueuedFrame]:
             if found := take(share):
                 self.taken.append(found)
             return found
@@ -82,9 +82,9 @@ class Watched:
         assert begun.wait(30)
         return free.set
 
-    def turn(self, seed: int, name: str = DEFAULT_ENCODER, **more: Any) -> Turn:
+    def frame(self, seed: int, name: str = DEFAULT_ENCODER, **more: Any) -> QueuedFrame:
         given: dict[str, Any] = {"mask": None, "deadline": time.monotonic() + 60, **more}
-        return Turn(self.catalogue.resolve(name), given.pop("data", None) or jpeg(seed), **given)
+        return QueuedFrame(self.catalogue.resolve(name), given.pop("data", None) or jpeg(seed), **given)
 
 
 @pytest.fixture
@@ -100,56 +100,56 @@ def cosine(a: Encoding, b: Encoding) -> float:
 
 
 def noting(order: list[Any], what: object) -> Callable[[Future[Encoded]], None]:
-    """Notes when a turn is settled."""
+    """Notes when a frame is settled."""
     return lambda _: order.append(what)
 
 
-def answers(turns: Sequence[Turn]) -> list[Encoded]:
-    return [turn.result.result(60) for turn in turns]
+def answers(frames: Sequence[QueuedFrame]) -> list[Encoded]:
+    return [frame.result.result(60) for frame in frames]
 
 
 def test_what_waits_together_shares_a_pass_and_gives_what_each_gives_alone(watched: Watched, default: Encoder) -> None:
-    turns = [watched.turn(seed, mask=UPPER_HALF if seed == 2 else None) for seed in range(5)]
+    frames = [watched.frame(seed, mask=UPPER_HALF if seed == 2 else None) for seed in range(5)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    for seed, (turn, found) in enumerate(zip(turns, answers(turns), strict=True)):
-        alone = default.encode(decode(turn.data), turn.mask)
+    for seed, (frame, found) in enumerate(zip(frames, answers(frames), strict=True)):
+        alone = default.encode(decode(frame.data), frame.mask)
         assert cosine(found.encoding, alone) > 0.9999, seed
         assert len(found.encoding.regions) == len(alone.regions)
         assert np.abs(found.encoding.local.astype(int) - alone.local).max(initial=0) <= 1
-        assert np.array_equal(found.pixels, decode(turn.data))
+        assert np.array_equal(found.pixels, decode(frame.data))
     assert sum(watched.sizes) == 5 and len(watched.sizes) < 5
-    assert cosine(turns[2].result.result().encoding, default.encode(scene(2))) < 0.99, "the mask counted"
+    assert cosine(frames[2].result.result().encoding, default.encode(scene(2))) < 0.99, "the mask counted"
 
 
 def test_a_frame_alone_does_not_wait_for_company(watched: Watched) -> None:
     for seed in range(3):
-        turn = watched.turn(seed)
-        watched.batches.put([turn])
-        turn.result.result(60)
+        frame = watched.frame(seed)
+        watched.batches.put([frame])
+        frame.result.result(60)
     assert watched.sizes == [1, 1, 1]
 
 
 def test_many_frames_are_several_batches_in_their_order(watched: Watched) -> None:
     count = 2 * cores() * MOST_FRAMES + 3
-    turns = [watched.turn(seed % 4) for seed in range(count)]
+    frames = [watched.frame(seed % 4) for seed in range(count)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    answers(turns)
-    assert [turn for batch in watched.taken for turn in batch] == turns
+    answers(frames)
+    assert [frame for batch in watched.taken for frame in batch] == frames
     assert sum(watched.sizes) == count and max(watched.sizes) == MOST_FRAMES
 
 
 @pytest.mark.parametrize("poison", [b"poison", jpeg(1)[:2000]])
 def test_a_poisoned_image_fails_alone(watched: Watched, poison: bytes) -> None:
-    turns = [watched.turn(0), watched.turn(1, data=poison), watched.turn(2)]
+    frames = [watched.frame(0), watched.frame(1, data=poison), watched.frame(2)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    assert isinstance(turns[1].result.exception(60), (NotAnImage, TruncatedImage))
-    assert len(answers([turns[0], turns[2]])) == 2
+    assert isinstance(frames[1].result.exception(60), (NotAnImage, TruncatedImage))
+    assert len(answers([frames[0], frames[2]])) == 2
     assert sum(watched.sizes) == 2
 
 
@@ -163,21 +163,21 @@ def test_a_frame_that_breaks_the_encoder_fails_alone(watched: Watched, monkeypat
         return encode_batch(self, frames, masks)
 
     monkeypatch.setattr(Encoder, "encode_batch", breaks)
-    turns = [watched.turn(seed) for seed in range(3)]
+    frames = [watched.frame(seed) for seed in range(3)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    assert isinstance(turns[1].result.exception(60), ArithmeticError)
-    assert len(answers([turns[0], turns[2]])) == 2
+    assert isinstance(frames[1].result.exception(60), ArithmeticError)
+    assert len(answers([frames[0], frames[2]])) == 2
 
 
 def test_encoders_are_batched_apart(watched: Watched, catalogue: EncoderCatalogue) -> None:
     names = [DEFAULT_ENCODER, COARSE, DEFAULT_ENCODER, COARSE, COARSE]
-    turns = [watched.turn(seed, name) for seed, name in enumerate(names)]
+    frames = [watched.frame(seed, name) for seed, name in enumerate(names)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    found = answers(turns)
+    found = answers(frames)
     assert [one.encoder.name for one in found] == names
     assert sum(watched.sizes) == 5 and len(watched.sizes) < 5
     for seed, one in enumerate(found):
@@ -189,8 +189,8 @@ def scene_of(seed: int) -> Pixels:
 
 
 def test_an_encoder_that_is_not_there_fails_its_own_frames(watched: Watched) -> None:
-    absent = Turn("absent", jpeg(0), None, time.monotonic() + 60)
-    there = watched.turn(1)
+    absent = QueuedFrame("absent", jpeg(0), None, time.monotonic() + 60)
+    there = watched.frame(1)
     go = watched.hold()
     watched.batches.put([absent, there])
     go()
@@ -199,7 +199,7 @@ def test_an_encoder_that_is_not_there_fails_its_own_frames(watched: Watched) -> 
 
 
 def test_what_is_late_or_given_up_is_not_encoded(watched: Watched) -> None:
-    late, given_up, there = watched.turn(0, deadline=time.monotonic() - 1), watched.turn(1), watched.turn(2)
+    late, given_up, there = watched.frame(0, deadline=time.monotonic() - 1), watched.frame(1), watched.frame(2)
     go = watched.hold()
     watched.batches.put([late, given_up, there])
     assert given_up.result.cancel()
@@ -212,9 +212,9 @@ def test_what_is_late_or_given_up_is_not_encoded(watched: Watched) -> None:
 
 
 def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
-    bulk = [watched.turn(0, bulk=True) for _ in range(cores() * (MOST_BULK + 6))]
-    robots = [watched.turn(1) for _ in range(cores() * MOST_FRAMES)]
-    watched.batches.put(first := [watched.turn(0)])
+    bulk = [watched.frame(0, bulk=True) for _ in range(cores() * (MOST_BULK + 6))]
+    robots = [watched.frame(1) for _ in range(cores() * MOST_FRAMES)]
+    watched.batches.put(first := [watched.frame(0)])
     answers(first)  # its encoder is loaded
     go = watched.hold()
     watched.batches.put(bulk)
@@ -222,7 +222,7 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
     go()
     answers([*bulk, *robots])
     kept = MOST_FRAMES // microbatches.BULK_SHARE
-    kinds = [[turn.bulk for turn in batch] for batch in watched.taken[1:]]
+    kinds = [[frame.bulk for frame in batch] for batch in watched.taken[1:]]
     most = MOST_FRAMES - kept
     with_robots = -(-len(robots) // most)
     assert kinds[: len(robots) // most] == [[False] * most + [True] * kept] * (len(robots) // most)
@@ -230,41 +230,41 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
     assert all(all(batch) and len(batch) <= MOST_BULK for batch in kinds[with_robots:])
 
 
-@pytest.mark.parametrize(("seconds", "asks"), [(0.0, True), (3600.0, True), (3600.0, False)])
+@pytest.mark.parametrize(("seconds", "from_robot"), [(0.0, True), (3600.0, True), (3600.0, False)])
 def test_bulk_alone_comes_in_small_batches_while_robots_are_about(
-    watched: Watched, seconds: float, asks: bool, monkeypatch: pytest.MonkeyPatch
+    watched: Watched, seconds: float, from_robot: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(microbatches, "QUIET_SECONDS", seconds)
-    watched.batches.put(first := [watched.turn(0, asks=asks)])
+    watched.batches.put(first := [watched.frame(0, from_robot=from_robot)])
     answers(first)
-    turns = [watched.turn(0, bulk=True) for _ in range(cores() * MOST_FRAMES)]
+    frames = [watched.frame(0, bulk=True) for _ in range(cores() * MOST_FRAMES)]
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    answers(turns)
-    most = MOST_BULK if seconds and asks else MOST_FRAMES
-    assert max(watched.sizes[1:]) == most and len(watched.sizes[1:]) <= len(turns) // most + cores()
+    answers(frames)
+    most = MOST_BULK if seconds and from_robot else MOST_FRAMES
+    assert max(watched.sizes[1:]) == most and len(watched.sizes[1:]) <= len(frames) // most + cores()
 
 
 def test_what_is_decoded_at_one_time_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(microbatches, "MOST_PIXELS", 3 * 320 * 240)
-    turns = [watched.turn(seed) for seed in range(7)]
-    turns.append(watched.turn(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
+    frames = [watched.frame(seed) for seed in range(7)]
+    frames.append(watched.frame(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
     go = watched.hold()
-    watched.batches.put(turns)
+    watched.batches.put(frames)
     go()
-    answers(turns)
+    answers(frames)
     assert watched.sizes == [3, 3, 1, 1]
 
 
 def test_what_waits_is_dropped_at_the_end(catalogue: EncoderCatalogue) -> None:
     watched = Watched(catalogue)
     go = watched.hold()
-    turn, errand = watched.turn(0), watched.batches.call(lambda: None)
-    watched.batches.put([turn])
+    frame, task = watched.frame(0), watched.batches.call(lambda: None)
+    watched.batches.put([frame])
     threading.Timer(0.2, go).start()
     watched.batches.close()
-    assert turn.result.cancelled() and errand.cancelled()
+    assert frame.result.cancelled() and task.cancelled()
     after: Future[None] = watched.batches.call(lambda: None)
     assert after.cancelled()
 
@@ -277,22 +277,22 @@ async def stays() -> None:
 
 
 @pytest.fixture
-def inference(catalogue: EncoderCatalogue) -> Iterator[Inference]:
-    made = Inference(catalogue, Limits(), queue_length=2, threads=0, metrics=Metrics())
+def queue(catalogue: EncoderCatalogue) -> Iterator[EncoderQueue]:
+    made = EncoderQueue(catalogue, Limits(), queue_length=2, threads=0, metrics=Metrics())
     yield made
     made.close()
 
 
-async def collected(inference: Inference, frames: Sequence[bytes], patience: Patience) -> Outcomes:
+async def collected(queue: EncoderQueue, frames: Sequence[bytes], deadline: RequestDeadline) -> Outcomes:
     identity = EncoderCatalogue().resolve(DEFAULT_ENCODER)
-    return [one async for some in inference.encode_many(identity, frames, patience) for one in some]
+    return [one async for some in queue.encode_many(identity, frames, deadline) for one in some]
 
 
 @pytest.mark.anyio
-async def test_many_frames_of_one_request(inference: Inference, default: Encoder) -> None:
+async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
     frames = [jpeg(index % 6) for index in range(AHEAD + 10)]
     frames[4] = b"poison"
-    found = await collected(inference, frames, Patience(time.monotonic() + 60, stays))
+    found = await collected(queue, frames, RequestDeadline(time.monotonic() + 60, stays))
     assert sorted(index for index, _ in found) == list(range(len(frames)))
     for index, outcome in found:
         if index == 4:
@@ -300,26 +300,28 @@ async def test_many_frames_of_one_request(inference: Inference, default: Encoder
         else:
             assert not isinstance(outcome, Exception)
             assert cosine(outcome.encoding, default.encode(scene_of(index % 6))) > 0.9999
-    assert await collected(inference, [], Patience(time.monotonic() + 60, stays)) == []
+    assert await collected(queue, [], RequestDeadline(time.monotonic() + 60, stays)) == []
 
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("fault", [DeadlineExceeded, ClientGone])
-async def test_what_is_left_of_a_request_is_given_up(inference: Inference, fault: type[Exception]) -> None:
+async def test_what_is_left_of_a_request_is_given_up(queue: EncoderQueue, fault: type[Exception]) -> None:
     async def leaves() -> None:
         await asyncio.sleep(0.2)
 
-    await inference.load(EncoderCatalogue().resolve(DEFAULT_ENCODER))
+    await queue.load(EncoderCatalogue().resolve(DEFAULT_ENCODER))
     free = threading.Event()
-    inference._batches.call(lambda: free.wait(30))
-    patience = Patience(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
+    queue._batches.call(lambda: free.wait(30))
+    deadline = RequestDeadline(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
     if fault is DeadlineExceeded:
-        patience = Patience(patience.deadline, stays)
+        deadline = RequestDeadline(deadline.at, stays)
     with pytest.raises(fault):
-        await collected(inference, [jpeg(0)] * (AHEAD + 5), patience)
+        await collected(queue, [jpeg(0)] * (AHEAD + 5), deadline)
     free.set()
-    await inference.encode(EncoderCatalogue().resolve(DEFAULT_ENCODER), jpeg(1), Patience(time.monotonic() + 60, stays))
-    count = inference._metrics.registry.get_sample_value("placerec_encoded_together_sum")
+    await queue.encode(
+        EncoderCatalogue().resolve(DEFAULT_ENCODER), jpeg(1), RequestDeadline(time.monotonic() + 60, stays)
+    )
+    count = queue._metrics.registry.get_sample_value("placerec_encoded_together_sum")
     assert count == 1, "nothing of the request was encoded"
 
 
@@ -386,14 +388,14 @@ def test_bulk_for_a_second_encoder_gets_its_turn(watched: Watched, monkeypatch: 
     monkeypatch.setattr(microbatches, "MOST_FRAMES", 2)
     monkeypatch.setattr(microbatches, "MOST_BULK", 2)
     order: list[object] = []
-    robots = [watched.turn(seed, DEFAULT_ENCODER) for seed in range(12)]
-    bulk = [watched.turn(seed, COARSE, bulk=True) for seed in range(2)]
-    for name, turns in (("robot", robots), ("bulk", bulk)):
-        for turn in turns:
-            turn.result.add_done_callback(noting(order, name))
+    robots = [watched.frame(seed, DEFAULT_ENCODER) for seed in range(12)]
+    bulk = [watched.frame(seed, COARSE, bulk=True) for seed in range(2)]
+    for name, frames in (("robot", robots), ("bulk", bulk)):
+        for frame in frames:
+            frame.result.add_done_callback(noting(order, name))
     go = watched.hold()
     watched.batches.put([*bulk, *robots])
     go()
-    for turn in (*robots, *bulk):
-        turn.result.result(60)
+    for frame in (*robots, *bulk):
+        frame.result.result(60)
     assert order.index("bulk") == 6, "three batches of robots, then theirs"

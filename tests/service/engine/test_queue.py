@@ -1,4 +1,4 @@
-"""The encoder's turn: bounded, timed, given up by those who leave, and never in the way of the event loop."""
+"""The encoder's queue: it is bounded, keeps deadlines, drops frames of clients that left, and never blocks the loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from core.errors import NotAnImage, UnknownEncoder
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from service.engine.queue import Inference, Patience
+from service.engine.queue import EncoderQueue, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
 from tests.service.scenes import encoded, jpeg, scene
@@ -29,20 +29,20 @@ async def stays() -> None:
     await asyncio.Event().wait()
 
 
-def patience(seconds: float = 30) -> Patience:
-    return Patience(time.monotonic() + seconds, stays)
+def deadline(seconds: float = 30) -> RequestDeadline:
+    return RequestDeadline(time.monotonic() + seconds, stays)
 
 
 @pytest.fixture
-async def inference() -> AsyncIterator[Inference]:
-    made = Inference(EncoderCatalogue(), Limits(), queue_length=2, threads=0, metrics=Metrics())
+async def queue() -> AsyncIterator[EncoderQueue]:
+    made = EncoderQueue(EncoderCatalogue(), Limits(), queue_length=2, threads=0, metrics=Metrics())
     await made.load(IDENTITY)
     yield made
     made.close()
 
 
 @pytest.fixture
-def busy(inference: Inference) -> Iterator[threading.Event]:
+def busy(queue: EncoderQueue) -> Iterator[threading.Event]:
     """The encoder is at work until the event is set."""
     done, begun = threading.Event(), threading.Event()
 
@@ -50,25 +50,25 @@ def busy(inference: Inference) -> Iterator[threading.Event]:
         begun.set()
         done.wait(30)
 
-    inference._batches.call(work)
+    queue._batches.call(work)
     assert begun.wait(5)
     yield done
     done.set()
 
 
-def frames_encoded(inference: Inference) -> float:
-    return inference._metrics.registry.get_sample_value("placerec_encode_stage_seconds_count", {"stage": "vlad"}) or 0
+def frames_encoded(queue: EncoderQueue) -> float:
+    return queue._metrics.registry.get_sample_value("placerec_encode_stage_seconds_count", {"stage": "vlad"}) or 0
 
 
-async def test_a_frame_is_decoded_and_encoded(inference: Inference) -> None:
-    encoded = await inference.encode(IDENTITY, jpeg(1), patience())
+async def test_a_frame_is_decoded_and_encoded(queue: EncoderQueue) -> None:
+    encoded = await queue.encode(IDENTITY, jpeg(1), deadline())
     assert encoded.pixels.shape == (240, 320, 3) and len(encoded.encoding.regions) > 0
     assert set(encoded.milliseconds) == {"wait", "decode", "forward", "regions", "vlad"}
-    assert frames_encoded(inference) == 1
+    assert frames_encoded(queue) == 1
 
 
-async def test_the_event_loop_goes_on(inference: Inference, busy: threading.Event) -> None:
-    waiting = asyncio.ensure_future(inference.encode(IDENTITY, jpeg(1), patience()))
+async def test_the_event_loop_goes_on(queue: EncoderQueue, busy: threading.Event) -> None:
+    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
     start = time.monotonic()
     for _ in range(100):
         await asyncio.sleep(0)
@@ -77,71 +77,71 @@ async def test_the_event_loop_goes_on(inference: Inference, busy: threading.Even
     assert (await waiting).milliseconds["wait"] > 0
 
 
-async def test_a_full_queue_refuses(inference: Inference) -> None:
-    with inference.place_in_queue(), inference.place_in_queue():
+async def test_a_full_queue_refuses(queue: EncoderQueue) -> None:
+    with queue.place(), queue.place():
         with pytest.raises(QueueFull):
-            inference.check_room()
-        with pytest.raises(QueueFull), inference.place_in_queue():
+            queue.check_room()
+        with pytest.raises(QueueFull), queue.place():
             pass
-    inference.check_room()
-    assert inference._metrics.registry.get_sample_value("placerec_queue_length") == 0
+    queue.check_room()
+    assert queue._metrics.registry.get_sample_value("placerec_queue_length") == 0
 
 
-async def test_a_late_frame_is_dropped_before_it_is_encoded(inference: Inference, busy: threading.Event) -> None:
+async def test_a_late_frame_is_dropped_before_it_is_encoded(queue: EncoderQueue, busy: threading.Event) -> None:
     start = time.monotonic()
     with pytest.raises(DeadlineExceeded):
-        await inference.encode(IDENTITY, jpeg(1), patience(0.2))
+        await queue.encode(IDENTITY, jpeg(1), deadline(0.2))
     assert time.monotonic() - start < 5, "told at the deadline, not when the encoder is free"
     with pytest.raises(DeadlineExceeded):
-        await inference.encode(IDENTITY, jpeg(1), patience(-1))
+        await queue.encode(IDENTITY, jpeg(1), deadline(-1))
     busy.set()
-    await inference.encode(IDENTITY, jpeg(2), patience())
-    assert frames_encoded(inference) == 1
+    await queue.encode(IDENTITY, jpeg(2), deadline())
+    assert frames_encoded(queue) == 1
 
 
-async def test_who_hangs_up_is_dropped(inference: Inference, busy: threading.Event) -> None:
+async def test_who_hangs_up_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
     async def leaves() -> None:
         await asyncio.sleep(0.05)
 
     with pytest.raises(ClientGone):
-        await inference.encode(IDENTITY, jpeg(1), Patience(time.monotonic() + 30, leaves))
+        await queue.encode(IDENTITY, jpeg(1), RequestDeadline(time.monotonic() + 30, leaves))
     busy.set()
-    await inference.encode(IDENTITY, jpeg(2), patience())
-    assert frames_encoded(inference) == 1
+    await queue.encode(IDENTITY, jpeg(2), deadline())
+    assert frames_encoded(queue) == 1
 
 
-async def test_a_cancelled_request_is_dropped(inference: Inference, busy: threading.Event) -> None:
-    waiting = asyncio.ensure_future(inference.encode(IDENTITY, jpeg(1), patience()))
+async def test_a_cancelled_request_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
+    waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
     await asyncio.sleep(0.05)
     waiting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await waiting
     busy.set()
-    await inference.encode(IDENTITY, jpeg(2), patience())
-    assert frames_encoded(inference) == 1
+    await queue.encode(IDENTITY, jpeg(2), deadline())
+    assert frames_encoded(queue) == 1
 
 
-async def test_a_poisoned_frame_fails_alone(inference: Inference) -> None:
+async def test_a_poisoned_frame_fails_alone(queue: EncoderQueue) -> None:
     frames = [jpeg(1), b"poison", jpeg(2)]
     results = await asyncio.gather(
-        *(inference.encode(IDENTITY, data, patience()) for data in frames), return_exceptions=True
+        *(queue.encode(IDENTITY, data, deadline()) for data in frames), return_exceptions=True
     )
     assert isinstance(results[1], NotAnImage)
     assert not isinstance(results[0], BaseException) and not isinstance(results[2], BaseException)
 
 
-async def test_an_encoder_that_is_not_there(inference: Inference) -> None:
+async def test_an_encoder_that_is_not_there(queue: EncoderQueue) -> None:
     with pytest.raises(UnknownEncoder):
-        await inference.load("absent")
+        await queue.load("absent")
     with pytest.raises(UnknownEncoder):
-        await inference.encode("absent", jpeg(1), patience())
+        await queue.encode("absent", jpeg(1), deadline())
 
 
-async def test_turns_are_taken_in_order(inference: Inference, busy: threading.Event) -> None:
+async def test_turns_are_taken_in_order(queue: EncoderQueue, busy: threading.Event) -> None:
     order: list[int] = []
 
     async def one(number: int) -> None:
-        await inference.encode(IDENTITY, jpeg(number), patience())
+        await queue.encode(IDENTITY, jpeg(number), deadline())
         order.append(number)
 
     waiting = []
@@ -199,18 +199,18 @@ def test_a_bad_deadline(server: Server, value: str) -> None:
 
 
 def test_requests_of_many_frames_have_half_of_the_queue() -> None:
-    inference = Inference(EncoderCatalogue(), Limits(), 8, 0, Metrics())
+    queue = EncoderQueue(EncoderCatalogue(), Limits(), 8, 0, Metrics())
     try:
         with ExitStack() as places:
             for _ in range(4):
-                places.enter_context(inference.place_in_queue(2))
-            with pytest.raises(QueueFull), inference.place_in_queue(2):
+                places.enter_context(queue.place(2))
+            with pytest.raises(QueueFull), queue.place(2):
                 pass
             for _ in range(4):
-                places.enter_context(inference.place_in_queue(1))
-            with pytest.raises(QueueFull), inference.place_in_queue(1):
+                places.enter_context(queue.place(1))
+            with pytest.raises(QueueFull), queue.place(1):
                 pass
-        with inference.place_in_queue(2):
-            assert inference.waiting == 1
+        with queue.place(2):
+            assert queue.waiting == 1
     finally:
-        inference.close()
+        queue.close()

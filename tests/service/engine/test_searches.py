@@ -15,7 +15,7 @@ from core.errors import StorageFailure
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields
-from core.recognition.localization import Located, locate
+from core.recognition.recognition import Answer, locate
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from service.engine import searches
 from service.engine.searches import MOST_TOGETHER, Searches
@@ -70,7 +70,7 @@ def sizes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many queries each search was for."""
     noted: list[int] = []
 
-    def noting(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Located]:
+    def noting(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Answer]:
         noted.append(len(encodings))
         return locate(map_, encoder, encodings, *more)
 
@@ -78,7 +78,7 @@ def sizes(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return noted
 
 
-def ids(located: Located) -> list[str]:
+def ids(located: Answer) -> list[str]:
     return [place.id for _, place in located.matches]
 
 
@@ -135,7 +135,7 @@ async def test_a_large_batch_is_several_searches_in_its_order(
 async def test_a_failing_query_fails_alone(
     map_: Map, encoder: Encoder, queries: list[Encoding], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def failing(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Located]:
+    def failing(map_: Map, encoder: Encoder, encodings: Sequence[Encoding], *more: Any) -> list[Answer]:
         if any(encoding is queries[1] for encoding in encodings):
             raise StorageFailure("the disk cannot be read")
         return locate(map_, encoder, encodings, *more)

@@ -9,7 +9,7 @@ import pytest
 from service.settings import PREFIX, Settings
 from tests.service.server import ROOT
 
-PAGE = ROOT / "docs" / "operations.md"
+PAGE = ROOT / "docs" / "reference" / "limits.md"
 ROW = re.compile(rf"^\| `{PREFIX}([A-Z_]+)` \| ([^|]+) \| ([^|]+) \| (?:`([^`]+)`|none) \|$", re.MULTILINE)
 ROWS = {name.lower(): test for name, _, _, test in ROW.findall(PAGE.read_text())}
 

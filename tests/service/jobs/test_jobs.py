@@ -14,7 +14,8 @@ import pytest
 
 from core.errors import DataDirectoryTooNew, UnknownMap
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
-from service.jobs.jobs import JobContext, Jobs
+from service.jobs.context import JobContext
+from service.jobs.jobs import Jobs
 from service.jobs.records import FILE, Job
 
 Kinds = Mapping[str, Callable[[JobContext], Mapping[str, Any]]]
@@ -29,7 +30,7 @@ def running(folder: Path, kinds: Kinds | None = None, **limits: int) -> Iterator
     try:
         yield jobs
     finally:
-        jobs.close(patience=5)
+        jobs.close(timeout=5)
 
 
 def end_of(jobs: Jobs, job: Job) -> Job:
@@ -354,7 +355,7 @@ def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
 
 def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None:
     from core.storage import Atlas
-    from service.jobs.context import born
+    from service.jobs.context import creation_time
 
     atlas, gate = Atlas(tmp_path / "data"), threading.Event()
     lab = atlas.create("lab", "some@" + "0" * 64, 8)
@@ -364,11 +365,13 @@ def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None
         return {"places": context.map(atlas).count_places()}
 
     with running(tmp_path) as jobs:
-        bound = jobs.submit("look", "lab", look, maps={"lab": born(lab)})
+        bound = jobs.submit("look", "lab", look, maps={"lab": creation_time(lab)})
         atlas.delete("lab")
         again = atlas.create("lab", "some@" + "0" * 64, 8)
         gate.set()
         failed = end_of(jobs, bound)
         assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
-        assert end_of(jobs, jobs.submit("look", "lab", look, maps={"lab": born(again)})).result == {"places": 0}
+        assert end_of(jobs, jobs.submit("look", "lab", look, maps={"lab": creation_time(again)})).result == {
+            "places": 0
+        }
     atlas.close()

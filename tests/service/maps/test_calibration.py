@@ -14,8 +14,8 @@ from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.storage import Map
 from service.maps import calibration as calibrating
-from service.maps.calibration_schemas import CalibrationOrder, CalibrationReport
-from tests.service.engines import ENCODER, end_of, engine_at
+from service.maps.schemas import CalibrationOrder, CalibrationReport
+from tests.service.engines import ENCODER, end_of, runtime_at
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
@@ -230,8 +230,8 @@ def test_an_edit_in_between_is_noticed(client: httpx.Client, walked: str) -> Non
 
 def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The job, a restart between its commit and its end, and an order that came too late; without HTTP."""
-    with engine_at(tmp_path) as engine:
-        lab = engine.atlas.create("lab", ENCODER, 8)
+    with runtime_at(tmp_path) as runtime:
+        lab = runtime.engine.atlas.create("lab", ENCODER, 8)
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
         found = manual.model_copy(update={"source": "map", "threshold": 0.25})
 
@@ -243,10 +243,10 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
             )
 
         monkeypatch.setattr(calibrating, "measured", measured)
-        monkeypatch.setattr(calibrating, "load_encoder", lambda *_: None)
+        monkeypatch.setattr(runtime.engine, "load_encoder", lambda _: None)
         wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
         happens: Calibration | None = manual
-        job = end_of(engine, engine.jobs.submit(calibrating.KIND, "lab", arguments=wanted))
+        job = end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted))
         assert job.problem is not None and job.problem["type"] == "urn:placerec:problem:revision-mismatch"
         assert lab.record.calibration == manual
 
@@ -254,7 +254,7 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
         lab.edit({"description": "any other change does not matter"})
         wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
         lab.edit({"description": "nor one that comes later"})
-        assert end_of(engine, engine.jobs.submit(calibrating.KIND, "lab", arguments=wanted)).state == "succeeded"
+        assert end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted)).state == "succeeded"
         assert lab.record.calibration == found
 
         with pytest.raises(RevisionMismatch):

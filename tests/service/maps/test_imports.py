@@ -10,22 +10,22 @@ from typing import Any
 
 import pytest
 
+from core.disk.files import write_at
 from core.storage import MapSettings
 from core.storage.archives import building
 from core.storage.files import segment_files as descriptors
-from core.storage.files.disk import write_at
-from service.engine.engine import Engine
+from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
-from service.http import incoming_file
-from service.maps.imports import Arrived
+from service.maps import imports
+from service.maps.imports import ReceivedFile
 from tests.core.storage.archives.files import exported
-from tests.service.engines import ENCODER, engine_at, enrolments
+from tests.service.engines import ENCODER, enrolments, runtime_at
 
 
 @pytest.fixture
 def content(tmp_path: Path) -> bytes:
-    with engine_at(tmp_path / "source") as engine:
-        lab = engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
+    with runtime_at(tmp_path / "source") as runtime:
+        lab = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
         lab.enrol(enrolments(1, 3, "p", "monday"))
         return exported(lab, tmp_path / "kept")
 
@@ -34,8 +34,8 @@ async def chunks(data: bytes) -> AsyncIterator[bytes]:
     yield data
 
 
-async def received(engine: Engine, data: bytes) -> Arrived:
-    return await engine.imports.receive(chunks(data), 0, [], lambda _: "lab")
+async def received(runtime: Runtime, data: bytes) -> ReceivedFile:
+    return await runtime.imports.receive(chunks(data), 0, [], lambda _: "lab")
 
 
 class Gate:
@@ -67,10 +67,10 @@ class Gate:
 
 @pytest.mark.anyio
 async def test_cancelled_while_it_arrives(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(tmp_path) as engine:
+    with runtime_at(tmp_path) as runtime:
         gate = Gate(write_at)
-        monkeypatch.setattr(incoming_file, "write_at", gate)
-        task = asyncio.create_task(received(engine, content))
+        monkeypatch.setattr(imports, "write_at", gate)
+        task = asyncio.create_task(received(runtime, content))
         await gate.cancelled_there(task)
         with (tmp_path / "another").open("xb") as another:  # which would get the number of a file that was closed
             await gate.open(task)
@@ -78,31 +78,31 @@ async def test_cancelled_while_it_arrives(tmp_path: Path, content: bytes, monkey
         assert (tmp_path / "another").read_bytes() == b""
         assert list((tmp_path / "data" / "imports").iterdir()) == []
         monkeypatch.undo()
-        first, second = await received(engine, content), await received(engine, content)
+        first, second = await received(runtime, content), await received(runtime, content)
         with pytest.raises(TooManyImports):
-            await received(engine, content)
+            await received(runtime, content)
         assert len({first.name, second.name}) == 2
-    with engine_at(tmp_path) as engine:
-        engine.imports.clean()
+    with runtime_at(tmp_path) as runtime:
+        runtime.imports.clean()
         assert list((tmp_path / "data" / "imports").iterdir()) == []
-        await received(engine, content)
+        await received(runtime, content)
 
 
 @pytest.mark.anyio
 async def test_cancelled_while_the_map_is_built(
     tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with engine_at(tmp_path) as engine:
-        monkeypatch.setattr(engine.imports, "check_encoder", lambda _: None)  # its maps are made up
+    with runtime_at(tmp_path) as runtime:
+        monkeypatch.setattr(runtime.imports, "check_encoder", lambda _: None)  # its maps are made up
         monkeypatch.setattr(building, "CHUNK_BYTES", 1)
         gate = Gate(descriptors.append)
         with monkeypatch.context() as disk:
             disk.setattr(descriptors, "append", gate)
-            task = asyncio.create_task(engine.imports.build(await received(engine, content)))
+            task = asyncio.create_task(runtime.imports.build(await received(runtime, content)))
             await gate.cancelled_there(task)
             await gate.open(task)
         assert list((tmp_path / "data" / "imports").iterdir()) == []
         assert list((tmp_path / "data" / "maps").iterdir()) == [], "broken off after the first of three commits"
-        arrived = await received(engine, content)
-        await engine.imports.build(arrived)
-        assert engine.atlas.get("lab").count_places() == 3
+        arrived = await received(runtime, content)
+        await runtime.imports.build(arrived)
+        assert runtime.engine.atlas.get("lab").count_places() == 3

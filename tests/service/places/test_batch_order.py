@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import httpx
 import pytest
 
-from service.engine.queue import Patience
+from service.engine.queue import RequestDeadline
 from service.errors.faults import BatchOutOfOrder, ClientGone
-from service.places import batch_order as succession
-from service.places.batch_order import Sequel, Stage, Succession
+from service.places import batch_order
+from service.places.batch_order import BatchOrder, BatchTurn, Stage
 from tests.service.places.test_batches import send
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
@@ -21,11 +21,11 @@ from tests.service.server import Server, assert_problem
 SMALL = [jpeg(seed, 96, 72) for seed in range(24)]
 
 
-def patience(seconds: float = 20.0, gone: asyncio.Event | None = None) -> Patience:
+def deadline(seconds: float = 20.0, gone: asyncio.Event | None = None) -> RequestDeadline:
     async def hung_up() -> None:
         await (gone or asyncio.Event()).wait()
 
-    return Patience(time.monotonic() + seconds, hung_up)
+    return RequestDeadline(time.monotonic() + seconds, hung_up)
 
 
 async def begun(waiting: asyncio.Task[None]) -> None:
@@ -35,63 +35,63 @@ async def begun(waiting: asyncio.Task[None]) -> None:
 
 @pytest.mark.anyio
 async def test_one_waits_until_the_other_has_come_so_far() -> None:
-    line = Succession()
-    with line.enter("lab", "b", "a", patience()) as second:
+    line = BatchOrder()
+    with line.enter("lab", "b", "a", deadline()) as second:
         encoding = asyncio.ensure_future(second.wait_for(Stage.ENCODED))
         storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
-        with line.enter("lab", "a", None, patience()) as first, line.enter("hall", "a", None, patience()) as elsewhere:
+        with line.enter("lab", "a", None, deadline()) as first, line.enter("hall", "a", None, deadline()) as elsewhere:
             await begun(encoding)
-            elsewhere.reach(Stage.ENCODED)
+            elsewhere.report(Stage.ENCODED)
             await begun(encoding)
-            first.reach(Stage.ENCODED)
+            first.report(Stage.ENCODED)
             await asyncio.wait_for(encoding, 5)
             await begun(storing)
         await asyncio.wait_for(storing, 5)
-    with line.enter("lab", None, "b", patience()) as third:
+    with line.enter("lab", None, "b", deadline()) as third:
         await asyncio.wait_for(third.wait_for(Stage.STORED), 5)
 
 
 @pytest.mark.anyio
 async def test_what_fails_is_not_stored_and_may_come_again() -> None:
-    line = Succession()
-    second = Sequel(line, "lab", None, "a", patience())
-    with pytest.raises(ValueError), line.enter("lab", "a", None, patience()):
+    line = BatchOrder()
+    second = BatchTurn(line, "lab", None, "a", deadline())
+    with pytest.raises(ValueError), line.enter("lab", "a", None, deadline()):
         raise ValueError
     storing = asyncio.ensure_future(second.wait_for(Stage.STORED))
     await begun(storing)
-    with line.enter("lab", "a", None, patience()):
+    with line.enter("lab", "a", None, deadline()):
         await begun(storing)
     await asyncio.wait_for(storing, 5)
     # What was stored stays so, whatever becomes of a request that says the same again.
-    with pytest.raises(ValueError), line.enter("lab", "a", None, patience()):
+    with pytest.raises(ValueError), line.enter("lab", "a", None, deadline()):
         raise ValueError
     await asyncio.wait_for(second.wait_for(Stage.STORED), 5)
 
 
 @pytest.mark.anyio
 async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    line = Succession()
-    with line.enter("lab", "slow", None, patience()):
+    line = BatchOrder()
+    with line.enter("lab", "slow", None, deadline()):
         with pytest.raises(BatchOutOfOrder):
-            await Sequel(line, "lab", None, "slow", patience(0.05)).wait_for(Stage.STORED)
+            await BatchTurn(line, "lab", None, "slow", deadline(0.05)).wait_for(Stage.STORED)
         gone = asyncio.Event()
-        storing = asyncio.ensure_future(Sequel(line, "lab", None, "slow", patience(20, gone)).wait_for(Stage.STORED))
+        storing = asyncio.ensure_future(BatchTurn(line, "lab", None, "slow", deadline(20, gone)).wait_for(Stage.STORED))
         await begun(storing)
         gone.set()
         with pytest.raises(ClientGone):
             await asyncio.wait_for(storing, 5)
-    monkeypatch.setattr(succession, "GRACE", 0.05)
+    monkeypatch.setattr(batch_order, "GRACE", 0.05)
     with pytest.raises(BatchOutOfOrder):
-        await asyncio.wait_for(Sequel(line, "lab", None, "never", patience()).wait_for(Stage.ENCODED), 5)
+        await asyncio.wait_for(BatchTurn(line, "lab", None, "never", deadline()).wait_for(Stage.ENCODED), 5)
 
 
 @pytest.mark.anyio
 async def test_so_many_names_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(succession, "KEPT", 3)
-    line = Succession()
-    with line.enter("lab", "open", None, patience()):
+    monkeypatch.setattr(batch_order, "KEPT", 3)
+    line = BatchOrder()
+    with line.enter("lab", "open", None, deadline()):
         for number in range(9):
-            with line.enter("lab", str(number), None, patience()):
+            with line.enter("lab", str(number), None, deadline()):
                 pass
         assert [number for number in range(9) if line.stage("lab", str(number)) is not None] == [6, 7, 8]
         assert line.stage("lab", "open") == Stage.BEGUN

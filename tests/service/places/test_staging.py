@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
+from core.disk.files import write_at
 from core.errors import StorageFailure, StorageFull
-from core.storage.files.disk import write_at
 from service.errors.faults import BodyTooLarge, ClientGone, MalformedBody, StagingFull
 from service.places import staging as module
 from service.places.staging import Staging
@@ -76,7 +76,7 @@ async def test_what_does_not_come_whole_leaves_nothing(tmp_path: Path, monkeypat
         with pytest.raises(StorageFull):
             await received(staging, body(one=b"1"))
     with monkeypatch.context() as disk:
-        disk.setattr("service.places.staging.os.fsync", full)
+        disk.setattr("os.fsync", full)
         with pytest.raises(StorageFull):
             await received(staging, body(one=b"1"))
     assert left(tmp_path) == []

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 
 from benchmarks.endurance import growth, judge
-from benchmarks.fleet import Fleet, Picture, Plan, Seen
+from benchmarks.fleet import Fleet, Plan, Scene, Seen
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
@@ -17,10 +17,10 @@ FIXED = 4
 def plan(server: Server, map_id: str) -> Plan:
     for number in range(FIXED):
         assert server.enrol(map_id, f"fixed-{number}", jpeg(number)).status_code == 201
-    pictures = [Picture(jpeg(number), jpeg(number)) for number in range(FIXED)]
+    scenes = [Scene(jpeg(number), jpeg(number)) for number in range(FIXED)]
     url = str(server.client.base_url)
     fixed = {f"fixed-{number}": number for number in range(FIXED)}
-    return Plan(url, map_id, pictures, [jpeg(40)], fixed, robots=2, operators=0, rate=5)
+    return Plan(url, map_id, scenes, [jpeg(40)], fixed, robots=2, operators=0, rate=5)
 
 
 def test_a_fleet_is_content_and_finds_what_is_there(server: Server, map_id: str) -> None:
@@ -44,8 +44,8 @@ def test_a_place_that_is_lost_or_comes_back_is_complained_of(server: Server, map
 
 
 def test_operators_and_the_one_who_deletes_keep_the_count(server: Server, map_id: str) -> None:
-    pictures = [Picture(jpeg(number), jpeg(number)) for number in range(40)]
-    fleet = Fleet(Plan(str(server.client.base_url), map_id, pictures * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
+    scenes = [Scene(jpeg(number), jpeg(number)) for number in range(40)]
+    fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
     asyncio.run(fleet.fill())
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 160
     asyncio.run(fleet.work(2.0, exports=False))

@@ -13,9 +13,10 @@ import pytest
 from core.errors import StorageFailure
 from core.places import PlaceFields
 from core.storage import Map, MapSettings
+from service.app.runtime import Runtime
 from service.engine.engine import Engine
-from service.engine.queue import Patience
-from service.places.enrolment import Candidate, enrol
+from service.engine.queue import RequestDeadline
+from service.places.enrolment import FrameToEnrol, enrol
 from service.sessions.frames import take_in
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
 from service.sessions.sessions import Session
@@ -28,44 +29,44 @@ pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
+def runtime(tmp_path: Path) -> Iterator[Runtime]:
     install_coarse_encoder(tmp_path / "models")
-    running = Engine(Settings(data_dir=tmp_path / "data", encoder=COARSE), Metrics())
+    running = Runtime(Settings(data_dir=tmp_path / "data", encoder=COARSE), Metrics())
     yield running
     running.jobs.close(1)
-    running.upkeep.close()
-    running.inference.close()
+    running.statistics.close()
     running.sessions.close()
-    running.atlas.close()
+    running.engine.close()
 
 
-def patience() -> Patience:
-    return Patience(time.monotonic() + 60, asyncio.Event().wait)  # type: ignore[arg-type]
+def deadline() -> RequestDeadline:
+    return RequestDeadline(time.monotonic() + 60, asyncio.Event().wait)  # type: ignore[arg-type]
 
 
 async def walked(engine: Engine) -> Map:
     """A map of four places."""
     identity = engine.resolve(None)
-    encoder = await engine.inference.load(identity)
+    encoder = await engine.queue.load(identity)
     made = engine.atlas.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
-    await enrol(engine, made, [Candidate(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], patience())
+    await enrol(engine, made, [FrameToEnrol(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
     return made
 
 
-async def send(engine: Engine, map_: Map, session: Session, number: int) -> SessionAnswer:
+async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> SessionAnswer:
     options = FrameParameters(frame=number)
-    return await take_in(engine, map_, session, jpeg(number), options, patience(), None)
+    parts = runtime.engine, runtime.sessions, runtime.statistics
+    return await take_in(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
 @pytest.mark.parametrize("kind", ["bayes", "path"])
 async def test_a_frame_whose_answer_fails_was_not_taken_in(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, kind: Any
+    runtime: Runtime, monkeypatch: pytest.MonkeyPatch, kind: Any
 ) -> None:
-    map_ = await walked(engine)
-    session, other = (engine.sessions.create(map_, NewSession(filter=kind)) for _ in range(2))
+    map_ = await walked(runtime.engine)
+    session, other = (runtime.sessions.create(map_, NewSession(filter=kind)) for _ in range(2))
     for number in range(2):
-        await send(engine, map_, session, number)
-        await send(engine, map_, other, number)
+        await send(runtime, map_, session, number)
+        await send(runtime, map_, other, number)
 
     asked = 0
 
@@ -78,20 +79,20 @@ async def test_a_frame_whose_answer_fails_was_not_taken_in(
 
     monkeypatch.setattr(map_, "places_at", fail_once)
     with pytest.raises(StorageFailure):
-        await send(engine, map_, session, 2)
+        await send(runtime, map_, session, 2)
     monkeypatch.undo()
     assert (session.number, session.run) == (1, None)
 
-    again, expected = await send(engine, map_, session, 2), await send(engine, map_, other, 2)
+    again, expected = await send(runtime, map_, session, 2), await send(runtime, map_, other, 2)
     assert not again.repeated and (again.frame, again.frames) == (2, 3)
     assert again.candidates[0].place == expected.candidates[0].place
     assert again.candidates[0].probability == pytest.approx(expected.candidates[0].probability, abs=1e-3)
 
 
-async def test_a_session_that_is_ended_during_a_frame_does_not_come_back(engine: Engine) -> None:
-    map_ = await walked(engine)
-    session = engine.sessions.create(map_, NewSession())
-    await send(engine, map_, session, 0)
-    engine.sessions.delete(session)
-    assert not engine.sessions.save(session), "as the frame does that was under way"
-    assert engine.sessions._store.read(session.id) is None
+async def test_a_session_that_is_ended_during_a_frame_does_not_come_back(runtime: Runtime) -> None:
+    map_ = await walked(runtime.engine)
+    session = runtime.sessions.create(map_, NewSession())
+    await send(runtime, map_, session, 0)
+    runtime.sessions.delete(session)
+    assert not runtime.sessions.save(session), "as the frame does that was under way"
+    assert runtime.sessions._store.read(session.id) is None

@@ -48,7 +48,7 @@ def test_a_file_that_cannot_be_read_is_put_aside(tmp_path: Path, damage: str) ->
             connection.execute("PRAGMA user_version = 99" if damage == "version" else "DROP TABLE sessions")
         connection.close()
     again = SessionStore(tmp_path)
-    assert again.all() == [] and path.with_name(f"{FILE}.damaged").exists()
+    assert again.all() == [] and list(tmp_path.glob(f"{FILE}.damaged-*"))
     again.write(ONE)
     assert again.read("s-1") == ONE
     again.close()

@@ -14,7 +14,7 @@ import pytest
 
 from service.sessions.schemas import NewSession
 from tests.service.encoders import COARSE, install_coarse_encoder
-from tests.service.engines import ENCODER, engine_at, enrolments
+from tests.service.engines import ENCODER, enrolments, runtime_at
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text, typed
 
@@ -288,16 +288,16 @@ def small(tmp_path: Path) -> Iterator[Server]:
 
 
 def test_what_was_charted_for_a_session_goes_with_it(tmp_path: Path) -> None:
-    with engine_at(tmp_path) as engine:
-        map_ = engine.atlas.create("lab", ENCODER, 8)
+    with runtime_at(tmp_path) as runtime:
+        map_ = runtime.engine.atlas.create("lab", ENCODER, 8)
         map_.open()
         for number in range(4):
             map_.enrol(enrolments(10 * number, 3, "p", f"s{number}"))
-        engine.sessions.create(map_, NewSession())
+        runtime.sessions.create(map_, NewSession())
         for number in range(4):
-            engine.sessions.delete(engine.sessions.create(map_, NewSession(sequences=[f"s{number}"])))
-        assert len(engine.sessions._charts) == 1 and engine.sessions.count() == 1
-        engine.sessions.close()
+            runtime.sessions.delete(runtime.sessions.create(map_, NewSession(sequences=[f"s{number}"])))
+        assert len(runtime.sessions._charts) == 1 and runtime.sessions.count() == 1
+        runtime.sessions.close()
 
 
 def test_sessions_expire_and_are_bounded(small: Server) -> None:

@@ -16,9 +16,9 @@ from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, MapSettings
 from core.storage.transfer import Transfer
 from service.engine.engine import Engine
-from service.jobs.context import born
+from service.jobs.context import creation_time
 from service.upkeep import merging
-from tests.service.engines import ENCODER, end_of, engine_at, enrolments, state_of
+from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of
 
 COUNT = 5 * merging.CHUNK
 WANTED: dict[str, Any] = {"from": "hall", "dry_run": False, "on_conflict": "rename", "prefix": "h.", "sample": 0}
@@ -27,12 +27,13 @@ WANTED: dict[str, Any] = {"from": "hall", "dry_run": False, "on_conflict": "rena
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Two maps that share a sequence's name and one place's id."""
-    with engine_at(tmp_path) as engine:
+    with runtime_at(tmp_path) as runtime:
         for name, first, count in (("lab", 1, 70), ("hall", 1001, COUNT)):
-            map_ = engine.atlas.create(name, ENCODER, 8, MapSettings(keep="thumbnail"))
+            map_ = runtime.engine.atlas.create(name, ENCODER, 8, MapSettings(keep="thumbnail"))
             map_.enrol(enrolments(first, count, name[0], "monday"))
-        engine.atlas.get("hall").enrol(enrolments(5000, 1, "l", "monday"))
-        engine.atlas.get("lab").enrol([Enrolment("l5000", PlaceFields(), np.ones(8, np.float32), 1, b"\x01" * 32)])
+        runtime.engine.atlas.get("hall").enrol(enrolments(5000, 1, "l", "monday"))
+        one = Enrolment("l5000", PlaceFields(), np.ones(8, np.float32), 1, b"\x01" * 32)
+        runtime.engine.atlas.get("lab").enrol([one])
     return tmp_path
 
 
@@ -65,59 +66,59 @@ def check_merged(engine: Engine, before: list[tuple[Any, ...]], theirs: list[tup
 
 
 def test_all_comes_over(folder: Path) -> None:
-    with engine_at(folder) as engine:
-        before, theirs = state_of(engine, "lab"), state_of(engine, "hall")
-        done = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+    with runtime_at(folder) as runtime:
+        before, theirs = state_of(runtime.engine, "lab"), state_of(runtime.engine, "hall")
+        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert done.state == "succeeded" and done.result is not None
         assert done.result["renamed"] == {"places": 1, "sequences": {"monday": "h.monday"}, "cameras": {}}
-        check_merged(engine, before, theirs)
-    with engine_at(folder) as engine:
-        check_merged(engine, before, theirs)
+        check_merged(runtime.engine, before, theirs)
+    with runtime_at(folder) as runtime:
+        check_merged(runtime.engine, before, theirs)
 
 
 def test_a_stop_in_the_middle_and_a_start_bring_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(folder) as engine:
-        before, theirs = state_of(engine, "lab"), state_of(engine, "hall")
-        after_two_commits(monkeypatch, lambda _: engine.jobs.stop_soon())
-        job = engine.jobs.submit(merging.KIND, "lab", arguments=WANTED)
+    with runtime_at(folder) as runtime:
+        before, theirs = state_of(runtime.engine, "lab"), state_of(runtime.engine, "hall")
+        after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
+        job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED)
         until = time.monotonic() + 20
-        while not engine.jobs.stopping and time.monotonic() < until:
+        while not runtime.jobs.stopping and time.monotonic() < until:
             time.sleep(0.01)
-    with engine_at(folder) as engine:
-        assert end_of(engine, job).state == "succeeded"
-        assert engine.jobs.get(job.id).attempt == 2
-        check_merged(engine, before, theirs)
+    with runtime_at(folder) as runtime:
+        assert end_of(runtime, job).state == "succeeded"
+        assert runtime.jobs.get(job.id).attempt == 2
+        check_merged(runtime.engine, before, theirs)
 
 
 def test_cancelled_in_the_middle_it_leaves_what_others_enrolled(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(folder) as engine:
-        before = state_of(engine, "lab")
+    with runtime_at(folder) as runtime:
+        before = state_of(runtime.engine, "lab")
         own = enrolments(9000, 2, "robot", "tuesday")
 
         def cancel(context: Any) -> None:
-            engine.atlas.get("lab").enrol(own)
-            engine.jobs.cancel(context.id)
+            runtime.engine.atlas.get("lab").enrol(own)
+            runtime.jobs.cancel(context.id)
 
         after_two_commits(monkeypatch, cancel)
-        job = engine.jobs.submit(merging.KIND, "lab", arguments=WANTED)
-        assert end_of(engine, job).state == "cancelled"
-        here = state_of(engine, "lab")
+        job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED)
+        assert end_of(runtime, job).state == "cancelled"
+        here = state_of(runtime.engine, "lab")
         assert here[: len(before)] == before
         assert [entry[0].id for entry in here[len(before) :]] == ["robot9000", "robot9001"]
-        assert engine.atlas.verify("lab").ok
+        assert runtime.engine.atlas.verify("lab").ok
 
 
 def test_a_full_disk_in_the_middle_leaves_the_map_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fill(_: Any) -> None:
         raise StorageFull("The disk is full.")
 
-    with engine_at(folder) as engine:
-        before = state_of(engine, "lab")
+    with runtime_at(folder) as runtime:
+        before = state_of(runtime.engine, "lab")
         after_two_commits(monkeypatch, fill)
-        failed = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:storage-full"
-        assert state_of(engine, "lab") == before
+        assert state_of(runtime.engine, "lab") == before
 
 
 def test_what_could_not_be_taken_out_again_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,50 +129,50 @@ def test_what_could_not_be_taken_out_again_is_told(folder: Path, monkeypatch: py
         monkeypatch.setattr(Transfer, "forget", refuse)
         raise StorageFull("The disk is full.")
 
-    with engine_at(folder) as engine:
+    with runtime_at(folder) as runtime:
         after_two_commits(monkeypatch, fill)
-        failed = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert failed.problem is not None and "remain" in failed.problem["detail"]
 
 
 @pytest.mark.parametrize("when", ["meanwhile", "while the service is stopped"])
 def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
-    with engine_at(folder) as engine:
-        before = state_of(engine, "lab")
+    with runtime_at(folder) as runtime:
+        before = state_of(runtime.engine, "lab")
 
         def vanish(_: Any) -> None:
             if when == "meanwhile":
-                engine.atlas.delete("hall")
+                runtime.engine.atlas.delete("hall")
             else:
-                engine.jobs.stop_soon()
+                runtime.jobs.stop_soon()
 
         after_two_commits(monkeypatch, vanish)
-        job = engine.jobs.submit(merging.KIND, "lab", arguments=WANTED)
+        job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED)
         until = time.monotonic() + 20
-        while not (engine.jobs.stopping or engine.jobs.get(job.id).ended) and time.monotonic() < until:
+        while not (runtime.jobs.stopping or runtime.jobs.get(job.id).ended) and time.monotonic() < until:
             time.sleep(0.01)
     if when != "meanwhile":
         import shutil
 
         shutil.rmtree(folder / "data" / "maps" / "hall")
-    with engine_at(folder) as engine:
-        failed = end_of(engine, job)
+    with runtime_at(folder) as runtime:
+        failed = end_of(runtime, job)
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:unknown-map"
-        assert state_of(engine, "lab") == before
+        assert state_of(runtime.engine, "lab") == before
 
 
 def test_the_map_itself_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(folder) as engine:
-        after_two_commits(monkeypatch, lambda _: engine.atlas.delete("lab"))
-        failed = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+    with runtime_at(folder) as runtime:
+        after_two_commits(monkeypatch, lambda _: runtime.engine.atlas.delete("lab"))
+        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:unknown-map", "nothing remains that came"
 
 
 def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(folder) as engine:
-        hall = engine.atlas.get("hall")
+    with runtime_at(folder) as runtime:
+        hall = runtime.engine.atlas.get("hall")
         (newer,) = enrolments(7000, 1, "h", "monday")
         last = f"h{1000 + COUNT}"
 
@@ -180,11 +181,11 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
             hall.forget("h1200")
 
         after_two_commits(monkeypatch, change)
-        done = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
         assert done.state == "succeeded"
-        lab = engine.atlas.get("lab")
-        assert lab.digest(last) == newer.digest and lab.transfer.picture(last) == b"newer"
-        assert engine.atlas.verify("lab").ok
+        lab = runtime.engine.atlas.get("lab")
+        assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
+        assert runtime.engine.atlas.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
 
 
@@ -192,46 +193,46 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
 def test_what_somebody_enrols_meanwhile_is_never_replaced(
     folder: Path, monkeypatch: pytest.MonkeyPatch, rule: str
 ) -> None:
-    with engine_at(folder) as engine:
-        lab, last = engine.atlas.get("lab"), f"h{1000 + COUNT}"
-        before = state_of(engine, "lab")
+    with runtime_at(folder) as runtime:
+        lab, last = runtime.engine.atlas.get("lab"), f"h{1000 + COUNT}"
+        before = state_of(runtime.engine, "lab")
         (own,) = enrolments(7000, 1, "h", "tuesday")
 
         def enrol(_: Any) -> None:
             lab.enrol([Enrolment(last, own.fields, own.descriptor, 5, own.digest, thumbnail=b"theirs")])
 
         after_two_commits(monkeypatch, enrol)
-        done = end_of(engine, engine.jobs.submit(merging.KIND, "lab", arguments=WANTED | {"on_conflict": rule}))
-        assert lab.digest(last) == own.digest and lab.transfer.picture(last) == b"theirs"
+        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED | {"on_conflict": rule}))
+        assert lab.digest(last) == own.digest and lab.picture(last) == b"theirs"
         if rule == "skip":
             assert done.state == "succeeded" and lab.count_places() == len(before) + COUNT
         else:
             assert done.problem is not None and done.problem["type"] == "urn:placerec:problem:merge-conflict"
-            here = state_of(engine, "lab")
+            here = state_of(runtime.engine, "lab")
             assert here[:-1] == before and here[-1][0].id == last
-        assert engine.atlas.verify("lab").ok
+        assert runtime.engine.atlas.verify("lab").ok
 
 
 @pytest.mark.parametrize("which", ["lab", "hall"])
 def test_it_does_not_go_on_into_another_map_of_the_same_id(
     folder: Path, monkeypatch: pytest.MonkeyPatch, which: str
 ) -> None:
-    with engine_at(folder) as engine:
-        before = state_of(engine, "lab")
-        maps = {name: born(engine.atlas.get(name)) for name in ("lab", "hall")}
-        after_two_commits(monkeypatch, lambda _: engine.jobs.stop_soon())
-        job = engine.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
+    with runtime_at(folder) as runtime:
+        before = state_of(runtime.engine, "lab")
+        maps = {name: creation_time(runtime.engine.atlas.get(name)) for name in ("lab", "hall")}
+        after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
+        job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
         until = time.monotonic() + 20
-        while not engine.jobs.stopping and time.monotonic() < until:
+        while not runtime.jobs.stopping and time.monotonic() < until:
             time.sleep(0.01)
     atlas = Atlas(folder / "data")
     atlas.delete(which)
     atlas.create(which, ENCODER, 8).enrol(enrolments(8000, 3, "n", "monday"))
     atlas.close()
-    with engine_at(folder) as engine:
-        failed = end_of(engine, job)
+    with runtime_at(folder) as runtime:
+        failed = end_of(runtime, job)
         assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
         if which == "hall":
-            assert state_of(engine, "lab") == before, "what came of the map that was deleted is taken out again"
+            assert state_of(runtime.engine, "lab") == before, "what came of the map that was deleted is taken out again"
         else:
-            assert [entry[0].id for entry in state_of(engine, "lab")] == ["n8000", "n8001", "n8002"]
+            assert [entry[0].id for entry in state_of(runtime.engine, "lab")] == ["n8000", "n8001", "n8002"]

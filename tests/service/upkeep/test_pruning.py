@@ -9,9 +9,11 @@ import pytest
 
 from core.storage import MapSettings
 from core.storage.transfer import Transfer
-from service.jobs.jobs import JobInterrupted
+from service.engine.engine import Engine
+from service.jobs.context import JobInterrupted
 from service.upkeep import pruning
-from tests.service.engines import ENCODER, end_of, engine_at, enrolments
+from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
+from tests.service.upkeep.upkeeping import wait_until
 
 GOING = ("l1", "l3", "l5")
 
@@ -19,11 +21,11 @@ GOING = ("l1", "l3", "l5")
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A map of eight places; what is to go is settled, for nothing can be encoded here."""
-    with engine_at(tmp_path) as engine:
-        engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
+    with runtime_at(tmp_path) as runtime:
+        runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
     planned = 0
 
-    def plan(engine: Any, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
+    def plan(engine: Engine, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
         nonlocal planned
         planned += 1
         assert planned == 1, "a second plan would thin what was thinned"
@@ -41,24 +43,23 @@ def test_a_kill_around_the_commit(folder: Path, monkeypatch: pytest.MonkeyPatch,
     def broken_off(self: Transfer, frames: dict[str, bytes]) -> int:
         if when == "after it went":
             forget(self, frames)
-        engine.jobs.stop_soon()
+        runtime.jobs.stop_soon()
         raise JobInterrupted
 
-    with engine_at(folder) as engine, monkeypatch.context() as broken:
+    with runtime_at(folder) as runtime, monkeypatch.context() as broken:
         broken.setattr(Transfer, "forget", broken_off)
-        job = engine.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False})
-        while not engine.jobs.stopping:
-            pass
-    with engine_at(folder) as engine:
-        done = end_of(engine, job)
+        job = runtime.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False})
+        wait_until(lambda: runtime.jobs.stopping)
+    with runtime_at(folder) as runtime:
+        done = end_of(runtime, job)
         assert (done.state, done.attempt, done.result) == ("succeeded", 2, {"removed": 3, "places_after": 5})
-        left = [place.id for place in engine.atlas.get("lab").transfer.outline()]
+        left = [place.id for place in runtime.engine.atlas.get("lab").transfer.outline()]
         assert left == ["l0", "l2", "l4", "l6", "l7"]
 
 
 def test_a_place_that_shows_something_else_by_now_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with engine_at(folder) as engine:
-        lab = engine.atlas.get("lab")
+    with runtime_at(folder) as runtime:
+        lab = runtime.engine.atlas.get("lab")
         plan = pruning._plan
 
         def and_then(*arguments: Any) -> Any:
@@ -68,6 +69,6 @@ def test_a_place_that_shows_something_else_by_now_stays(folder: Path, monkeypatc
             return found
 
         monkeypatch.setattr(pruning, "_plan", and_then)
-        done = end_of(engine, engine.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False}))
+        done = end_of(runtime, runtime.jobs.submit(pruning.KIND, "lab", arguments={"dry_run": False}))
         assert done.result == {"removed": 3, "places_after": 6}
         assert "l3" in [place.id for place in lab.transfer.outline()]

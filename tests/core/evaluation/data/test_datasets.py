@@ -8,14 +8,14 @@ import pytest
 
 from core.errors import InvalidGroundTruth, InvalidTraverse
 from core.evaluation.data.datasets import DATASETS, Dataset, find_dataset, groups, open_dataset
-from tests.core.evaluation.lookup import write_pictures
+from tests.core.evaluation.lookup import write_images
 
 EVAL = Path(__file__).parents[5] / "shared/datasets/eval"
 
 
 def made(folder: Path, dataset: Dataset, references: int, queries: int) -> Path:
-    write_pictures(folder / dataset.references[0], range(references))
-    write_pictures(folder / dataset.queries[0], range(queries))
+    write_images(folder / dataset.references[0], range(references))
+    write_images(folder / dataset.queries[0], range(queries))
     return folder
 
 
@@ -82,7 +82,7 @@ def test_reduced_references_need_the_thesis_traverses(tmp_path: Path) -> None:
 def test_a_missing_folder_is_named(tmp_path: Path, dataset: Dataset) -> None:
     with pytest.raises(InvalidTraverse, match=re.escape(str(tmp_path / dataset.references[0]))):
         open_dataset(dataset, tmp_path)
-    write_pictures(tmp_path / dataset.references[0], range(3))
+    write_images(tmp_path / dataset.references[0], range(3))
     with pytest.raises(InvalidTraverse, match="its queries are expected in the folder") as caught:
         open_dataset(dataset, tmp_path)
     assert str(tmp_path / dataset.queries[0]) in str(caught.value)

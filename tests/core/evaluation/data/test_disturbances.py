@@ -24,7 +24,7 @@ def by_name(name: str) -> Disturbance:
 
 
 @pytest.mark.parametrize("disturbance", DISTURBANCES, ids=lambda disturbance: disturbance.name)
-def test_levels_rise_and_change_the_picture_more_and_more(disturbance: Disturbance) -> None:
+def test_levels_rise_and_change_the_image_more_and_more(disturbance: Disturbance) -> None:
     pixels = scene(3, 160, 120)
     levels = disturbance.levels
     assert list(levels) == sorted(set(levels))
@@ -37,7 +37,7 @@ def test_levels_rise_and_change_the_picture_more_and_more(disturbance: Disturban
 
 
 @pytest.mark.parametrize("disturbance", DISTURBANCES, ids=lambda disturbance: disturbance.name)
-def test_a_seed_and_a_number_give_one_picture(disturbance: Disturbance) -> None:
+def test_a_seed_and_a_number_give_one_image(disturbance: Disturbance) -> None:
     pixels, level = scene(3, 80, 60), disturbance.levels[2]
     once, again = disturbance.changed(pixels, level, 5, 7), disturbance.changed(pixels, level, 5, 7)
     assert np.array_equal(once, again)
@@ -94,4 +94,4 @@ def test_an_occlusion_covers_its_share(level: float) -> None:
         assert covered.mean() == pytest.approx(level / 100, abs=0.02)
         rows, columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
         assert covered[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all()  # one box
-    assert pixels.max() == 10  # the picture itself stays
+    assert pixels.max() == 10  # the image itself stays

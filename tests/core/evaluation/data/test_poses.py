@@ -97,7 +97,7 @@ def test_a_list_that_lacks_something_is_refused(tmp_path: Path, text: str, messa
         read_poses(paths)
 
 
-def test_pictures_without_any_pose_are_refused(tmp_path: Path) -> None:
+def test_images_without_any_pose_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidGroundTruth, match=r"c\.jpg has no pose"):
         read_poses(images(tmp_path, "c.jpg"))
     with pytest.raises(InvalidGroundTruth, match="has no pose"):

@@ -3,19 +3,16 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.metrics import auc, precision_recall_curve, roc_auc_score
 
 from core.evaluation.protocol.figures import (
     ALL_RIGHT,
     NO_NEGATIVES,
     NO_POSITIVES,
     NONE_RIGHT,
-    auc_pr,
-    auc_roc,
     extended_precision,
     one_class,
-    recall_at,
     recall_at_full_precision,
+    recall_at_k,
     summarize,
 )
 from core.evaluation.protocol.outcomes import Outcome
@@ -24,58 +21,13 @@ from core.evaluation.protocol.outcomes import Outcome
 LABELLED = st.lists(st.tuples(st.integers(-3, 3).map(lambda n: n / 4), st.booleans()), min_size=1, max_size=40)
 
 
-def test_auc_pr_by_hand() -> None:
-    # Best first: right, wrong, right.  (recall, precision): (0, 1), (1/2, 1), (1/2, 1/2), (1, 2/3).
-    # Trapezoids: 1/2 · 1 + 0 + 1/2 · (1/2 + 2/3) / 2 = 0.5 + 7/24.
-    assert auc_pr([0.9, 0.5, 0.1], [True, False, True]) == pytest.approx(0.5 + 7 / 24)
-    # Average precision would be 1/2 + 1/2 · 2/3 = 5/6; the trapezoid lies below it here.
-    assert auc_pr([0.9, 0.5, 0.1], [True, False, True]) < 5 / 6
-
-
-def test_equal_scores_are_accepted_together() -> None:
-    # One point for both: (0, 1), (1, 1/2).
-    assert auc_pr([0.4, 0.4], [True, False]) == pytest.approx(0.75)
-    assert auc_pr([0.4, 0.4], [False, True]) == pytest.approx(0.75)
-
-
-def test_auc_pr_with_one_class() -> None:
-    assert auc_pr([0.4, 0.9, 0.1], [True, True, True]) == 1.0
-    assert auc_pr([0.4, 0.9, 0.1], [False, False, False]) == 0.0
-    assert auc_pr([0.4], [True]) == 1.0
-
-
-@given(LABELLED)
-def test_auc_pr_is_that_of_scikit_learn(labelled: list[tuple[float, bool]]) -> None:
-    scores, matched = zip(*labelled, strict=True)
-    if any(matched):  # without one the library's curve is made up
-        precision, recall, _ = precision_recall_curve(matched, scores)
-        assert auc_pr(scores, matched) == pytest.approx(auc(recall, precision))
-
-
-def test_auc_roc_by_hand() -> None:
-    # Positives 0.9, 0.5, 0.2 against negatives 0.5, 0.1: 2 + 1.5 + 1 of 6 pairs.
-    assert auc_roc([0.9, 0.5, 0.5, 0.1, 0.2], [True, True, False, False, True]) == pytest.approx(4.5 / 6)
-
-
-def test_auc_roc_needs_both_kinds() -> None:
-    assert auc_roc([0.3, 0.4], [True, True]) is None
-    assert auc_roc([0.3, 0.4], [False, False]) is None
-
-
-@given(LABELLED)
-def test_auc_roc_is_that_of_scikit_learn(labelled: list[tuple[float, bool]]) -> None:
-    scores, positive = zip(*labelled, strict=True)
-    if len(set(positive)) == 2:
-        assert auc_roc(scores, positive) == pytest.approx(roc_auc_score(positive, scores))
-
-
 def test_recall_leaves_true_negatives_out() -> None:
     ranks = [1, 2, 6, 11, None, None]
     outcomes = [Outcome(0, 0.5, rank == 1, rank) for rank in ranks]
-    assert recall_at(outcomes, 1) == 1 / 4
-    assert recall_at(outcomes, 5) == 2 / 4
-    assert recall_at(outcomes, 10) == 3 / 4
-    assert recall_at(outcomes[4:], 1) is None
+    assert recall_at_k(outcomes, 1) == 1 / 4
+    assert recall_at_k(outcomes, 5) == 2 / 4
+    assert recall_at_k(outcomes, 10) == 3 / 4
+    assert recall_at_k(outcomes[4:], 1) is None
 
 
 def test_recall_at_full_precision_is_strict() -> None:

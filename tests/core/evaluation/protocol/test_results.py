@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sklearn.metrics import auc, precision_recall_curve
 
 from core.errors import InvalidResults
-from core.evaluation.protocol.figures import auc_pr
 from core.evaluation.protocol.outcomes import Outcome
-from core.evaluation.protocol.results import NOT_IN_FILE, read_results, results_csv, summarize_results
+from core.evaluation.protocol.results import NOT_IN_FILE, read_results, read_similarity, results_csv, summarize_results
+from core.judgement.curves import auc_pr
 
 SCORES = st.one_of(
     st.integers(-3, 3).map(lambda n: n / 4),  # few different values, so that ties are common
@@ -62,17 +61,13 @@ def test_what_is_written_is_read_back(outcomes: list[Outcome]) -> None:
 
 
 @given(OUTCOMES, st.booleans())
-def test_the_area_is_that_of_scikit_learn(outcomes: list[Outcome], header: bool) -> None:
-    """Random data, ties and one class: the curve and the trapezoid, computed apart from the code under test."""
+def test_the_figures_are_those_of_the_outcomes(outcomes: list[Outcome], header: bool) -> None:
+    """Random data, ties and one class, with and without a header."""
     rows = results_csv(outcomes).splitlines(keepends=True)
     with tempfile.TemporaryDirectory() as folder:
         figures = summarize_results("saved", read_results(saved(Path(folder), "".join(rows if header else rows[1:]))))
     matched = [outcome.matched for outcome in outcomes]
-    if any(matched):
-        precision, recall, _ = precision_recall_curve(matched, [outcome.score for outcome in outcomes])
-        assert figures.auc_pr == pytest.approx(auc(recall, precision), abs=1e-6)
-    else:
-        assert figures.auc_pr == 0.0
+    assert figures.auc_pr == pytest.approx(auc_pr([outcome.score for outcome in outcomes], matched), abs=1e-6)
     assert figures.one_class == ("all right" if all(matched) else None if any(matched) else "none right")
     assert ("auc_pr" in figures.notes) == (len(set(matched)) == 1)
     assert (figures.right, figures.queries) == (sum(matched), len(matched))
@@ -127,3 +122,74 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
         read_results(path)
     with pytest.raises(InvalidResults, match="cannot be read"):
         read_results(tmp_path / "missing.csv")
+
+
+# Similarity files
+
+
+MATRIX = np.array([[0.1, 0.9, 0.3], [0.7, 0.2, 0.4]])
+
+
+def saved_matrix(folder: Path, array: np.ndarray) -> Path:
+    path = folder / "matrix.npy"
+    np.save(path, array)
+    return path
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.float16])
+def test_rows_are_queries(tmp_path: Path, kind: type) -> None:
+    scores = read_similarity(saved_matrix(tmp_path, MATRIX.astype(kind)))
+    assert scores.dtype == np.float64
+    assert np.allclose(scores, MATRIX, atol=1e-3)
+
+
+def test_scores_are_not_rounded(tmp_path: Path) -> None:
+    close = np.array([[1 - 2e-9, 1 - 1e-9]])
+    assert read_similarity(saved_matrix(tmp_path, close)).tolist() == close.tolist()
+
+
+def test_rows_are_references_where_that_is_said(tmp_path: Path) -> None:
+    scores = read_similarity(saved_matrix(tmp_path, MATRIX.T), transposed=True)
+    assert scores.shape == (2, 3) and scores.flags.c_contiguous
+    assert np.allclose(scores, MATRIX)
+
+
+def test_integers_are_scores_too(tmp_path: Path) -> None:
+    assert read_similarity(saved_matrix(tmp_path, np.array([[3, 1]]))).tolist() == [[3.0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros(3), "no matrix"),
+        (np.zeros((2, 2, 2)), "no matrix"),
+        (np.zeros((0, 2)), "no matrix"),
+        (np.array([["a", "b"]]), "not similarities"),
+        (np.array([[1j]]), "not similarities"),
+        (np.array([[0.1, np.nan]]), "not finite"),
+        (np.array([[0.1, np.inf]]), "not finite"),
+    ],
+)
+def test_what_is_no_matrix_of_scores_is_refused(tmp_path: Path, array: np.ndarray, message: str) -> None:
+    with pytest.raises(InvalidResults, match=message):
+        read_similarity(saved_matrix(tmp_path, array))
+
+
+def test_a_pickled_array_is_never_read(tmp_path: Path) -> None:
+    path = saved_matrix(tmp_path, np.array([[1.0, {}]], dtype=object))
+    with pytest.raises(InvalidResults, match="save the matrix alone"):
+        read_similarity(path)
+
+
+def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidResults, match="cannot be read"):
+        read_similarity(tmp_path / "missing.npy")
+    (tmp_path / "text.npy").write_text("0.1,0.2")
+    with pytest.raises(InvalidResults, match="not a plain"):
+        read_similarity(tmp_path / "text.npy")
+    (tmp_path / "empty.npy").write_bytes(b"")
+    with pytest.raises(InvalidResults):
+        read_similarity(tmp_path / "empty.npy")
+    np.savez(tmp_path / "many.npz", a=MATRIX)
+    with pytest.raises(InvalidResults, match="no matrix"):
+        read_similarity(tmp_path / "many.npz")

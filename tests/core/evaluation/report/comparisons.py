@@ -18,14 +18,14 @@ from core.frames.traverses import Truth, tolerance_truth
 TIMES: dict[str, float | None] = {"forward": 4.25, "regions": None, "vlad": None, "match": 0.5}
 
 
-def write_pictures(folder: Path, count: int, names: Sequence[str] = ()) -> list[Path]:
+def write_images(folder: Path, count: int, names: Sequence[str] = ()) -> list[Path]:
     """PNG files of 48 x 36 pixels, each of another colour."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / (names[index] if index < len(names) else f"{index:03}.png") for index in range(count)]
     for index, path in enumerate(paths):
-        picture = np.full((36, 48, 3), (40 * index % 256, 90, 200 - 10 * index % 200), np.uint8)
-        picture[:18, :24] = 255
-        path.write_bytes(cv2.imencode(".png", picture)[1].tobytes())
+        image = np.full((36, 48, 3), (40 * index % 256, 90, 200 - 10 * index % 200), np.uint8)
+        image[:18, :24] = 255
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
     return paths
 
 
@@ -59,8 +59,8 @@ def make_comparison(
     runs.sort(key=lambda run: -run.evaluation.auc_pr)
     return Comparison(
         "a data set",
-        write_pictures(folder / "references", count),
-        write_pictures(folder / "queries", count),
+        write_images(folder / "references", count),
+        write_images(folder / "queries", count),
         chosen,
         truth,
         runs,

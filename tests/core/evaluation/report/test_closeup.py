@@ -3,15 +3,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from core.evaluation.report.closeup import closeup
-from core.evaluation.report.pictures import Pictures
 from core.evaluation.report.theme import Cast
+from core.evaluation.report.thumbnails import Thumbnails
 from tests.core.evaluation.report.comparisons import make_comparison, read_page
 
 
 def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, kept=range(6), noise=4.0)
     run = comparison.runs[0]
-    made = closeup(comparison, run, Cast([run]).runs[0], "stem", Pictures())
+    made = closeup(comparison, run, Cast([run]).runs[0], "stem", Thumbnails())
     page = read_page(made.html)
     cells = [int(cell.text) for cell in page.named("td")]
     mean, full = run.evaluation.thresholds
@@ -34,7 +34,7 @@ def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
 def test_system_is_described(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     run = comparison.runs[0]
-    html = closeup(comparison, run, Cast([run]).runs[0], "stem", Pictures()).html
+    html = closeup(comparison, run, Cast([run]).runs[0], "stem", Thumbnails()).html
     page = read_page(html)
     assert "Somebody, 2020." in html
     names, values = ([one.text for one in page.named(tag)] for tag in ("dt", "dd"))

@@ -51,12 +51,12 @@ def test_plot_is_drawn_on_both_papers() -> None:
     sheet = Sheet("Title", width=200, height=150)
     plot = render("name", "what it shows", sheet, paint)
     for data, theme in ((plot.light, LIGHT), (plot.dark, DARK)):
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert picture is not None
-        assert picture.shape == (150 * SHARPNESS, 200 * SHARPNESS, 3)
-        assert tuple(picture[0, 0, ::-1]) == rgb(theme.paper)
-        assert tuple(picture[-1, -1, ::-1]) == rgb(theme.paper)
-        assert (picture == np.array(rgb(theme.hues[0]))[::-1]).all(axis=2).sum() > 100
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        assert image.shape == (150 * SHARPNESS, 200 * SHARPNESS, 3)
+        assert tuple(image[0, 0, ::-1]) == rgb(theme.paper)
+        assert tuple(image[-1, -1, ::-1]) == rgb(theme.paper)
+        assert (image == np.array(rgb(theme.hues[0]))[::-1]).all(axis=2).sum() > 100
 
 
 def test_settings_of_the_machine_change_nothing() -> None:
@@ -76,9 +76,9 @@ def test_full_color_keeps_all_colours() -> None:
         axes.imshow(np.dstack([ramp, ramp, 255 - ramp]))
 
     plot = render("name", "", sheet, paint_ramp)
-    picture = cv2.imdecode(np.frombuffer(plot.light, np.uint8), cv2.IMREAD_COLOR)
-    assert picture is not None
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 256
+    image = cv2.imdecode(np.frombuffer(plot.light, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 256
 
 
 def test_names_at_line_ends_do_not_overlap() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from core.evaluation.report.gallery import MOST_BOXES, case, gallery, wrong_first
-from core.evaluation.report.pictures import Pictures
+from core.evaluation.report.thumbnails import Thumbnails
 from tests.core.evaluation.report.comparisons import make_comparison, make_run, outcome, read_page
 
 
@@ -41,17 +41,17 @@ def test_which_true_reference_is_shown(tmp_path: Path) -> None:
 def test_full_page_says_what_it_leaves_out(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     run = comparison.runs[0]
-    empty = gallery(comparison, run, Pictures(budget=0), None, most=4)
+    empty = gallery(comparison, run, Thumbnails(budget=0), None, most=4)
     assert "are left out, to keep the page small" in empty
     assert "<svg" not in empty
-    small = read_page(gallery(comparison, run, Pictures(budget=1), None, most=4))
+    small = read_page(gallery(comparison, run, Thumbnails(budget=1), None, most=4))
     assert len(small.named("article")) == 1
 
 
 def test_number_of_cases_and_of_boxes_is_bounded(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, noise=6.0, count=30)
     boxes = [(0.0, 0.0, 1.0, (place + 1) / 100) for place in range(100)]
-    page = read_page(gallery(comparison, comparison.runs[0], Pictures(), lambda path: boxes, most=4))
+    page = read_page(gallery(comparison, comparison.runs[0], Thumbnails(), lambda path: boxes, most=4))
     articles = page.named("article")
     assert [article.attributes["class"] for article in articles] == ["case wrong"] * 4 + ["case right"] * 2
     assert len(page.named("rect")) == 18 * MOST_BOXES

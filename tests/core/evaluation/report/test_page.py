@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 from dataclasses import dataclass, replace
@@ -9,11 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from core.errors import StorageFailure
+from core.errors import StorageFailure, StorageFull
 from core.evaluation import Comparison, ScalePoint, SeverityCurve
 from core.evaluation.report import write_report
+from core.evaluation.report.page import script, stylesheet, write_files
+from core.evaluation.report.theme import DARK, LIGHT
 from core.frames.traverses import tolerance_truth
-from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_pictures
+from tests.core.evaluation.report.comparisons import Page, make_comparison, make_run, read_page, write_images
 
 
 def page_of(folder: Path, comparison: Comparison) -> tuple[str, Page]:
@@ -81,7 +84,7 @@ def test_page_refers_to_nothing_outside_itself(written: Written) -> None:
     assert not re.search(r"https?:|//\w", re.sub(r"data:[\w/;,+=-]*", "", html))
 
 
-def test_every_picture_has_a_text(written: Written) -> None:
+def test_every_image_has_a_text(written: Written) -> None:
     page = written.page
     images = page.named("img")
     assert images
@@ -117,9 +120,9 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
     ]
     for name in names:
         if name.endswith(".png"):
-            picture = cv2.imread(str(written.folder / name))
-            assert picture is not None, name
-            assert picture.std() > 5, f"{name} is blank"
+            image = cv2.imread(str(written.folder / name))
+            assert image is not None, name
+            assert image.std() > 5, f"{name} is blank"
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:
@@ -129,7 +132,7 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     hostile = replace(
         comparison,
         name=evil,
-        queries=write_pictures(tmp_path / "hostile", 8, names),
+        queries=write_images(tmp_path / "hostile", 8, names),
         notes=[evil],
         runs=[make_run(evil, comparison.runs[0].scores, comparison.kept, comparison.truth, title=evil)],
         severity=[SeverityCurve(evil, evil, [0.0, 1.0], evil, [0.9, 0.5], [0.8, 0.3])],
@@ -234,12 +237,12 @@ def test_regions_are_drawn_for_the_run_that_they_are_of(tmp_path: Path) -> None:
     assert ["regions of interest" in section.text for section in sections] == [False, True]
 
 
-def test_pictures_that_are_gone_leave_their_names(tmp_path: Path) -> None:
+def test_images_that_are_gone_leave_their_names(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1)
     comparison.queries[3].unlink()
     without = replace(comparison, references=[])
     _, page = page_of(tmp_path / "report", without)
-    assert sum(article.text.count("no picture") for article in page.named("article")) >= len(page.named("article")) * 2
+    assert sum(article.text.count("no image") for article in page.named("article")) >= len(page.named("article")) * 2
 
 
 def test_same_comparison_same_bytes(tmp_path: Path, written: Written) -> None:
@@ -268,3 +271,66 @@ def test_folder_that_cannot_be_made(tmp_path: Path) -> None:
 def test_no_run_no_report(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one run"):
         write_report(tmp_path / "report", replace(make_comparison(tmp_path), runs=[]))
+
+
+# How it looks
+
+
+def test_every_colour_that_is_used_is_defined_for_both_themes() -> None:
+    rules = stylesheet()
+    used = set(re.findall(r"var\((--[\w-]+)\)", rules)) - {"--size"}  # set on each bar
+    light, dark = (set(re.findall(r"(--[\w-]+):", part)) for part in rules.split("@media", 1)[:2])
+    assert used <= light | dark
+    assert rules.count(LIGHT.paper) >= 1
+    assert rules.index("prefers-color-scheme: dark") < rules.index(DARK.paper)
+    for name in ("paper", "ink", "muted", "rule", "tp", "fp", "tn", "fn", "tint", *(f"hue-{i}" for i in range(8))):
+        assert rules.count(f"--{name}:") == 2, name
+
+
+def test_neither_can_end_its_element() -> None:
+    assert "</" not in stylesheet()
+    assert "</" not in script()
+    assert script().startswith('"use strict"')
+
+
+# Its files
+
+
+def test_files_are_replaced_and_others_stay(tmp_path: Path) -> None:
+    (tmp_path / "index.html").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        "index.html": b"new",
+        "notes.txt": b"mine",
+        "pr.png": b"png",
+    }
+
+
+@pytest.mark.parametrize(
+    ("number", "error", "sentence"),
+    [(errno.ENOSPC, StorageFull, "The disk is full"), (errno.EACCES, StorageFailure, "cannot be written")],
+)
+def test_failed_write_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, error: type[Exception], sentence: str
+) -> None:
+    (tmp_path / "index.html").write_text("old")
+    write = Path.write_bytes
+
+    def fail(path: Path, data: bytes) -> int:
+        if data == b"new":
+            write(path, data[:1])
+            raise OSError(number, os.strerror(number))
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(error, match=sentence):
+        write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"index.html": "old"}
+
+
+def test_failed_rename_leaves_no_temporary_file(tmp_path: Path) -> None:
+    (tmp_path / "index.html").mkdir()
+    with pytest.raises(StorageFailure):
+        write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["index.html", "pr.png"]

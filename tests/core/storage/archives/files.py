@@ -22,11 +22,11 @@ Parts = dict[str, bytes]
 
 def exported(map_: Map, folder: Path) -> bytes:
     """The whole file of a map."""
-    playback = map_.capturing.into(folder)
+    export = map_.exporter.into(folder)
     try:
-        return playback.read(0, playback.size)
+        return export.read(0, export.size)
     finally:
-        playback.discard()
+        export.discard()
 
 
 def parts_of(content: bytes) -> tuple[dict[str, Any], Parts]:

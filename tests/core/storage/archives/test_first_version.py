@@ -43,7 +43,7 @@ def test_a_file_of_version_1(tmp_path: Path, precision: str) -> None:
         rows = np.array(found.rows_of([place_id]))
         shown["descriptor"] = snapshot.descriptors_at(rows)[0].tolist()
         shown["local"] = snapshot.locals_at(rows)[0].tolist()
-        digest, picture = found.digest(place_id), found.transfer.picture(place_id)
+        digest, picture = found.digest(place_id), found.picture(place_id)
         shown["digest"] = digest and digest.hex()
         shown["picture_text"] = picture and picture.decode()
         assert {name: shown[name] for name in known} == known

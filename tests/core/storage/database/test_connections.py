@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from core.disk.files import Damage
 from core.storage.database.connections import Database, DatabaseClosed, connect
 from core.storage.database.schema import migrate
-from core.storage.files.disk import Damage
 
 
 @pytest.fixture
@@ -115,12 +115,12 @@ def test_closing_waits_for_reads_under_way_and_refuses_others(database: Database
         pass
 
 
-def test_settling_empties_the_log(database: Database, path: Path) -> None:
+def test_the_log_can_be_emptied(database: Database, path: Path) -> None:
     log = path.with_name("map.sqlite-wal")
     with database.transaction() as connection:
         connection.execute(ADD, ("a",))
     assert log.stat().st_size > 0
-    database.settle()
+    database.empty_log()
     assert log.stat().st_size == 0
     with database.reading() as connection:
         assert count(connection) == 2

@@ -62,7 +62,7 @@ def check(found: Map, expected: dict[str, Any]) -> None:
         wanted = descriptor_of(known["picture_of"])
         np.testing.assert_array_equal(snapshot.descriptors_at(rows)[0], wanted)
         assert snapshot.search(wanted)[0][0] == rows[0]
-        picture = found.transfer.picture(place_id)
+        picture = found.picture(place_id)
         kind = known["picture"]
         assert picture == (None if kind == "none" else f"{kind} of {known['picture_of']}".encode())
     sequences = [summary.model_dump(mode="json") for summary in found.sequences(None, 100)[0]]

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from core.disk.files import Damage
 from core.errors import DataDirectoryTooNew
 from core.storage.database.schema import MIGRATIONS, check_schema, migrate
-from core.storage.files.disk import Damage
 
 LATER = (
     *MIGRATIONS,

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from core.disk.files import Damage
 from core.storage.database.connections import FILE
 from core.storage.database.write_ahead_log import check_log
-from core.storage.files.disk import Damage
 
 FRAME = 24 + 4096
 

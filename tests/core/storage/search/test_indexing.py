@@ -290,7 +290,7 @@ def test_a_disk_that_is_full_for_codes_leaves_the_map_serving(
     again.close()
 
 
-def test_damage_on_the_shelf_takes_the_map_out_of_service(atlas: Atlas, directory: Path, folder: Path) -> None:
+def test_damage_on_disk_takes_the_map_out_of_service(atlas: Atlas, directory: Path, folder: Path) -> None:
     make(atlas, index="compact")
     atlas.create("hall", ENCODER, 16, local_shape=(0, 0)).enrol([frame("h", local_shape=(0, 0))])
     settled(atlas.get("lab"))

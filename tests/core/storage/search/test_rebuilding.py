@@ -15,7 +15,6 @@ from core.errors import UnknownMap
 from core.index import Coder
 from core.storage import Atlas
 from core.storage.search import indexing, rebuilding, recall, snapshot
-from core.storage.search.reindexing import rebuild
 from tests.core.storage.frames import frame
 from tests.core.storage.search.test_indexing import DIMENSION, PLACES, ROWS, finds, make, settled
 
@@ -64,7 +63,7 @@ def test_all_is_made_anew_beside_what_serves(atlas: Atlas, directory: Path, tier
             assert finds(lab, "late")
         told.append((done, total))
 
-    status = rebuild(lab, progress)
+    status = lab.rebuild_index(progress)
     assert status.tier == tier and status.rows_indexed == lab.snapshot().rows == 2 * PLACES + 1
     assert told[0] == (0, 2 * PLACES) and max(done for done, _ in told) == 2 * PLACES + 1
     now = lab.snapshot()
@@ -93,7 +92,7 @@ def test_one_that_is_broken_off_leaves_all_as_it_was(atlas: Atlas, directory: Pa
             raise Cancelled
 
     with pytest.raises(Cancelled):
-        rebuild(lab, cancel)
+        lab.rebuild_index(cancel)
     settled(lab)
     now = lab.snapshot()
     assert now.table is served.table and now.lists is served.lists
@@ -104,7 +103,7 @@ def test_one_that_is_broken_off_leaves_all_as_it_was(atlas: Atlas, directory: Pa
 
 def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = make(atlas)
-    assert rebuild(lab, silent).tier == "exact"
+    assert lab.rebuild_index(silent).tier == "exact"
     lab.edit({"index": "compact"})
     settled(lab)
     reached, gone = threading.Event(), threading.Event()
@@ -120,7 +119,7 @@ def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: py
 
     def work() -> None:
         try:
-            rebuild(lab, silent)
+            lab.rebuild_index(silent)
         except Exception as error:
             failed.append(error)
 
@@ -195,6 +194,6 @@ def test_what_comes_while_lists_are_made_is_encoded_before_the_lock_is_taken(atl
         if begun.count(0) == 2 and done == 0:  # codes begin, lists begin
             lab.enrol([frame(f"late{i}", dimension=DIMENSION) for i in range(20)])
 
-    made = rebuilding.remade(lab.snapshot, True, progress)
+    made = rebuilding.rebuilt(lab.snapshot, True, progress)
     assert len(made.table) == lab.snapshot().rows == PLACES + 20
     assert made.lists is not None and made.lists.rows == PLACES

@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 
 from core.storage import Snapshot
 from core.storage.search import snapshot as module
-from core.storage.search.segment import flat_index, vectors
-from core.storage.search.snapshot import Spot
+from core.storage.search.segment import Location, flat_index, vectors
 from tests.core.storage.frames import descriptor_of, local_of
 
 DIMENSION, ROWS, SHAPE = 8, 4, (2, 3)
 
 
-def spot(row: int, kind: int = 1) -> Spot:
-    return Spot(kind, (float(row), 0.5, -1.0), row % 3, row)
+def spot(row: int, kind: int = 1) -> Location:
+    return Location(kind, (float(row), 0.5, -1.0), row % 3, row)
 
 
 def descriptors(count: int, start: int = 0) -> list[NDArray[np.float32]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from core.storage import Atlas, Map, MapSettings
-from core.storage.search.parallel import threads
+from core.storage.search.snapshot import threads
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 REPOSITORY = Path(__file__).parents[4]

@@ -185,7 +185,7 @@ def test_systems_that_learn_say_from_what(placerec: Placerec, traverses: tuple[P
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{seed}.jpg").write_bytes(jpeg(seed + 10))
     other, _ = evaluated(placerec, traverses, tmp_path, *words, "--training", lessons)
-    assert other["trained_on"] == "6 pictures of lessons"
+    assert other["trained_on"] == "6 images of lessons"
     assert other["encoder"] != own["encoder"]
 
 

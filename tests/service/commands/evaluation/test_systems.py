@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from core.baselines.catalogue import systems
+from core.baselines.registry import systems
 from core.evaluation.data.datasets import DATASETS
 from core.method.catalogue import EncoderCatalogue
 from service.commands.evaluation.systems import build_systems, parse_weights
@@ -60,4 +60,4 @@ def test_missing_weights_are_told_in_a_sentence_before_anything_runs(placerec: P
     said = placerec("evaluate", *both, "--encoder", "netvlad", "--weights", "netvlad=no.mat", status=1)
     assert "there is no file no.mat" in said.stderr
     idle = placerec("evaluate", *both, "--weights", "netvlad=no.mat", status=2)
-    assert "--encoder does not ask for" in idle.stderr.replace("\n", " ").replace("│", "").replace("  ", " ")
+    assert "--encoder does not name" in idle.stderr.replace("\n", " ").replace("│", "").replace("  ", " ")

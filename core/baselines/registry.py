@@ -1,0 +1,103 @@
+"""Every system that can be compared, by name: the encoders installed here and the systems of the literature.
+
+To add a system, add a row to ``BASELINES``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from core.baselines import (
+    attentive_attention,
+    calc,
+    context_flexible_attention,
+    convnets,
+    cross_region,
+    fabmap,
+    fix_context,
+    hog,
+    netvlad,
+    pooling,
+    seqslam,
+)
+from core.baselines.encoders import EncoderSystem, about_encoder
+from core.baselines.system import About, Resources, System
+from core.errors import InvalidModel, MissingWeights, UnknownEncoder
+from core.method.catalogue import EncoderCatalogue
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """One row: what a system is, known without reading a weight, and how it is built, once per evaluation."""
+
+    about: About
+    build: Callable[[About, Resources], System]
+
+
+BASELINES: tuple[Baseline, ...] = (
+    Baseline(cross_region.VLAD, cross_region.build_vlad),
+    Baseline(cross_region.BOW_10K, cross_region.build_bow),
+    Baseline(cross_region.BOW_2_6K, cross_region.build_bow),
+    Baseline(pooling.RMAC, pooling.pooled(pooling.rmac, pooling.LATE)),
+    Baseline(cross_region.RMAC_MUTUAL, cross_region.build_rmac_mutual),
+    Baseline(pooling.SPP, pooling.pooled(pooling.spatial_pyramid_pool, pooling.LATE)),
+    Baseline(pooling.SUM_POOL, pooling.pooled(pooling.sum_pool, pooling.LATE)),
+    Baseline(pooling.MAX_POOL, pooling.pooled(pooling.max_pool, pooling.LATE)),
+    Baseline(pooling.CROSS_POOL, pooling.pooled(pooling.cross_pool, pooling.EARLY, pooling.LATE)),
+    Baseline(pooling.WHOLE, pooling.pooled(pooling.flatten, pooling.LATE)),
+    Baseline(hog.ABOUT, hog.build),
+    Baseline(seqslam.ABOUT, seqslam.build),
+    Baseline(fabmap.ABOUT, fabmap.build),
+    Baseline(netvlad.ABOUT, netvlad.build),
+    Baseline(convnets.ALEXNET, convnets.build_alexnet),
+    Baseline(convnets.AMOSNET, convnets.build_pyramid),
+    Baseline(convnets.HYBRIDNET, convnets.build_pyramid),
+    Baseline(convnets.PLACES365, convnets.build_places365),
+    Baseline(calc.ABOUT, calc.build),
+    Baseline(fix_context.ABOUT, fix_context.build),
+    Baseline(attentive_attention.ABOUT, attentive_attention.build),
+    Baseline(context_flexible_attention.ABOUT, context_flexible_attention.build),
+)
+"""The systems of other authors, in the order in which they are listed."""
+
+
+def systems(models: EncoderCatalogue) -> list[About]:
+    """All systems that ``build`` knows, without reading weights: installed encoders, the default first, then others."""
+    own = [about_encoder(summary) for summary in sorted(models.describe(), key=lambda summary: not summary.default)]
+    return own + [baseline.about for baseline in BASELINES]
+
+
+def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -> System:
+    """Make a system ready to describe frames, or to be trained first if it is ``Trainable``.
+
+    Args:
+        name: of a system, or the name or identity of an installed encoder.
+        weights: the file that the system needs; for a system that runs on the packaged network,
+            another network file to run on.
+
+    Raises:
+        MissingWeights: it needs a file and none was given, or there is no such file.
+        UnknownEncoder: nothing has this name; the text lists the names that exist.
+        InvalidModel: a file cannot be used.
+    """
+    baseline = next((baseline for baseline in BASELINES if baseline.about.name == name), None)
+    if baseline is None:
+        return _encoder(name, models, weights)
+    if weights is not None and not weights.is_file():
+        raise MissingWeights(f"{name}: there is no file {weights}.")
+    if weights is None and baseline.about.weights is not None:
+        raise MissingWeights(f"{name} needs --weights {name}=FILE, {baseline.about.weights.rstrip('.')}.")
+    return baseline.build(baseline.about, Resources(models, weights))
+
+
+def _encoder(name: str, models: EncoderCatalogue, weights: Path | None) -> System:
+    summaries = {summary.name: summary for summary in models.describe()}
+    summary = summaries.get(name.partition("@")[0])
+    if summary is None:
+        known = [*summaries, *(baseline.about.name for baseline in BASELINES)]
+        raise UnknownEncoder(f"no system {name[:80]!r} is known; there are {', '.join(known)}.")
+    if weights is not None:
+        raise InvalidModel(f"{summary.name} is an installed encoder and takes no file of weights.")
+    return EncoderSystem(models.get(name), about_encoder(summary))

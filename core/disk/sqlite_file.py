@@ -1,0 +1,212 @@
+"""SQLite files: how they are opened, created, checked and brought to the newest version of their tables.
+
+A file names who wrote it by its ``application_id`` (0 where a kind of file has none) and the version of its tables by
+its ``user_version``.  A new or older file gets the newest tables in one transaction, so that a crash leaves it either
+as it was or complete.
+"""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+from core.disk.files import Damage
+
+log = logging.getLogger(__name__)
+
+Mode = Literal["ro", "rw", "rwc"]
+"""Read only; read and write; the same and create the file if it is missing."""
+
+DURABLE: Mapping[str, str | int] = {"journal_mode": "WAL", "synchronous": "FULL", "trusted_schema": "OFF"}
+"""Settings with which a COMMIT returns when SQLite's log is synced, and readers never wait for the writer."""
+
+
+class NotOurs(Damage):
+    """The file is a database, but of another program or of another kind."""
+
+
+class TooNew(Exception):
+    """A later version of placerec wrote the file."""
+
+    def __init__(self, version: int) -> None:
+        super().__init__(f"the file is of schema {version}")
+        self.version = version
+
+
+def connect(
+    path: Path, mode: Mode = "rw", settings: Mapping[str, str | int] = DURABLE, timeout: float = 30
+) -> sqlite3.Connection:
+    """A connection without implicit transactions; any thread may use it, one at a time.
+
+    Args:
+        settings: pragmas to set, in this order.
+        timeout: seconds to wait for another process's lock.
+
+    Raises:
+        sqlite3.Error: the file is missing (unless ``mode`` is ``rwc``) or cannot be read.
+    """
+    address = f"{path.absolute().as_uri()}?mode={mode}"
+    connection = sqlite3.connect(address, uri=True, timeout=timeout, isolation_level=None, check_same_thread=False)
+    try:
+        for name, value in settings.items():
+            connection.execute(f"PRAGMA {name} = {value}")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    """Execute all statements of the block or none; they are committed when it ends without an error."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        with suppress(sqlite3.Error):  # the first error is the one to report
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+        raise
+
+
+@dataclass(frozen=True)
+class Schema:
+    """The tables of one kind of file, and how a file with older tables gets the newest ones.
+
+    application_id: names the kind of file; 0 for kinds that have none.
+    version: of the newest tables.
+    create: statements that make the newest tables in an empty file.
+    migrations: by a version, the statements that lead from it to the next one.
+    """
+
+    application_id: int
+    version: int
+    create: Sequence[str]
+    migrations: Mapping[int, Sequence[str]] = field(default_factory=dict)
+
+    def migrate(self, connection: sqlite3.Connection, create: bool = False) -> int:
+        """Bring a file to the newest version in one transaction.
+
+        Args:
+            create: make the tables if the file is empty.
+
+        Returns:
+            By how many versions the file advanced.
+
+        Raises:
+            NotOurs: the file is of another kind, or empty without ``create``.
+            TooNew: a later version of placerec wrote it.
+            sqlite3.Error: a statement failed; the file is as it was.
+        """
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        (owner,) = connection.execute("PRAGMA application_id").fetchone()
+        query = "SELECT count(*) FROM sqlite_schema"
+        if create and (version, owner) == (0, 0) and connection.execute(query).fetchone() == (0,):
+            statements = list(self.create)
+        elif version < 1 or owner != self.application_id:
+            raise NotOurs("it is a database, but not one of placerec's")
+        elif version > self.version:
+            raise TooNew(version)
+        else:
+            statements = [one for older in range(version, self.version) for one in self.migrations[older]]
+        if version < self.version:
+            with transaction(connection):
+                for statement in statements:
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA application_id = {self.application_id}")
+                connection.execute(f"PRAGMA user_version = {self.version}")
+        return self.version - version
+
+
+@dataclass(frozen=True)
+class SqliteFile:
+    """A small database in the data directory.
+
+    settings, timeout: as for :func:`connect`.
+    checks: queries that must succeed when the file is opened.
+    check_whole: let SQLite check all of the file when it is opened (``quick_check``).
+    """
+
+    path: Path
+    schema: Schema
+    settings: Mapping[str, str | int] = field(default_factory=lambda: DURABLE)
+    checks: Sequence[str] = ()
+    check_whole: bool = True
+    timeout: float = 30
+
+    def open(self, create: bool = True) -> sqlite3.Connection:
+        """A connection to the file, which is checked and brought to its newest version.
+
+        Args:
+            create: make the file if it is missing or empty, and see that it can be written to.
+
+        Raises:
+            Damage: the file is damaged, or NotOurs.
+            TooNew: a later version of placerec wrote it.
+            OSError, sqlite3.OperationalError: the disk refuses.
+        """
+        try:
+            connection = connect(self.path, "rwc" if create else "rw", self.settings, self.timeout)
+            try:
+                self.schema.migrate(connection, create)
+                if self.check_whole:
+                    for (line,) in connection.execute("PRAGMA quick_check").fetchall():
+                        if line != "ok":
+                            raise Damage(line)
+                for query in self.checks:
+                    connection.execute(query).fetchall()
+                if create:
+                    expect_writable(connection)
+            except BaseException:
+                connection.close()
+                raise
+        except UnicodeDecodeError as error:
+            raise Damage("its text is damaged") from error
+        except sqlite3.DatabaseError as error:
+            message = str(error)
+            if isinstance(error, sqlite3.OperationalError) and "no such" not in message and "decode" not in message:
+                raise  # the disk refuses, which says nothing about the file
+            raise Damage(message) from error
+        return connection
+
+    def put_aside(self, reason: Exception) -> Path:
+        """Rename a damaged file, so that a new one can be made in its place; returns its new path.
+
+        Raises:
+            OSError: the disk refuses.
+        """
+        aside = self.path.with_name(f"{self.path.name}.damaged-{datetime.now(UTC):%Y%m%dT%H%M%S}")
+        log.error("%s cannot be read and is put aside as %s: %s", self.path, aside.name, reason)
+        self.path.rename(aside)
+        for suffix in ("-wal", "-shm"):
+            self.path.with_name(self.path.name + suffix).unlink(missing_ok=True)
+        return aside
+
+    def open_or_replace(self) -> sqlite3.Connection:
+        """A connection to the file; a damaged, foreign or too new one is put aside first and made anew.
+
+        Raises:
+            OSError, sqlite3.OperationalError: the disk refuses.
+        """
+        try:
+            return self.open()
+        except (Damage, TooNew) as error:
+            self.put_aside(error)
+            return self.open()
+
+
+def expect_writable(connection: sqlite3.Connection) -> None:
+    """Raise sqlite3.OperationalError if the file cannot be written to.
+
+    SQLite silently opens a file read-only where writing is refused, and would keep it so when the refusal is over.
+    """
+    query = "SELECT name FROM sqlite_schema WHERE type = 'table' AND name NOT LIKE 'sqlite_%' LIMIT 1"
+    for (table,) in connection.execute(query).fetchall():
+        connection.execute(f'DELETE FROM "{table}" WHERE false')

@@ -1,0 +1,359 @@
+"""Calibrations: how a curve, a threshold and a margin are fitted from trials, for an encoder or for one map.
+
+A calibration says when an answer is believed (see ``verdict.py``).  An encoder ships with one, fitted here from frames
+that were kept out of its training (:func:`fit_encoder_calibration`).  A map may get one of its own, fitted from
+queries whose true place is known (:func:`fit_map_calibration`).  In both, the curve and the margin come from the
+trials; the threshold follows from what it is to achieve.
+
+The figures reported with a map's calibration are cross-validated: the frames are cut into blocks in the order in
+which they were taken, and each block is judged by a calibration fitted to the other blocks, so that no frame
+influences its own judgement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from core.errors import CalibrationImpossible
+from core.frames.preprocessing import Pixels
+from core.judgement.curves import auc_pr, auc_roc, falling
+from core.judgement.probability import Curve, fit_curve
+from core.judgement.reliability import Reliability, Share, reliability, wilson
+from core.judgement.trials import Flags, Trial, Trials, Values, gathered, joined
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Whereabouts
+
+Scores = NDArray[np.float32]
+
+LOST_BY_MARGIN = 0.02
+"""The margin turns at most this share of the right answers into ambiguous ones."""
+
+FALSE_ACCEPTS = 0.10
+"""The threshold of an encoder's calibration accepts at most this share of the unknown places."""
+
+SMALLEST_DEVIATION = 1e-6
+"""Lower bound of the background's standard deviation, in units of the score; identical frames would give zero."""
+
+FEWEST_OUTCOMES = 10
+"""A map's calibration needs at least this many right and this many wrong answers."""
+
+LEAST_AREA = 0.6
+"""Least area under the ROC of right against wrong answers; below it the decision value hardly separates them."""
+
+BLOCKS = 5
+"""Blocks of the cross-validation."""
+
+MOST_POINTS = 101
+"""A reported curve has at most this many points."""
+
+
+def second_look(pixels: Pixels) -> Pixels:
+    """Imitate a second visit: the frame shifted by 8 % of its width, darker and with less contrast.
+
+    Args:
+        pixels: uint8 [H, W, 3].
+
+    Returns:
+        uint8 [H, W, 3].
+    """
+    height, width = pixels.shape[:2]
+    aside = pixels[:, round(0.08 * width) :]
+    darker = cv2.convertScaleAbs(aside, alpha=0.75, beta=6)
+    return np.asarray(cv2.resize(darker, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def fit_encoder_calibration(unknown: Scores, known: Scores, neighbours: int, source: str) -> Calibration:
+    """Fit a calibration for an encoder to n frames in the order in which they were taken.
+
+    Every frame is a query twice: as it is, against the frames that are not its neighbours (an unknown place), and as
+    a second look (:func:`second_look`), against all frames (a known place).  Real second visits differ by more than
+    a second look does, so the probabilities come out too high.  The packaged encoders are calibrated on real second
+    visits; a map that matters deserves a calibration of its own (:func:`fit_map_calibration`).
+
+    Args:
+        unknown: float32 [n, n], the scores of the frames against each other.
+        known: float32 [n, n], row i holds the scores of frame i's second look against all frames.
+        neighbours: frames at most this many positions apart may show the same place.
+        source: recorded in the calibration.
+
+    Raises:
+        ValueError: the frames are so few that all are neighbours of each other.
+    """
+    n = len(unknown)
+    index = np.arange(n)
+    apart = np.abs(index[:, None] - index[None, :]) > neighbours
+    if not apart.any():
+        raise ValueError(f"{n} frames are too few to calibrate on")
+    unrelated = unknown[apart]
+    start = Calibration(
+        source=source,
+        threshold=0.0,
+        margin=0.0,
+        background_mean=float(unrelated.mean()),
+        background_deviation=max(SMALLEST_DEVIATION, float(unrelated.std())),
+        decision="leading",
+        frames=n,
+    )
+    same_place = Neighborhood(radius=0.0, frames=neighbours)
+    strangers = gathered(
+        Trial(_judged(unknown[i], np.flatnonzero(apart[i]), start, same_place), False, False, i)
+        for i in range(n)
+        if apart[i].any()
+    )
+    looks = gathered(
+        Trial(_judged(known[i], index, start, same_place), True, bool(np.argmax(known[i]) == i), i) for i in range(n)
+    )
+    threshold = _just_above(np.quantile(strangers.decision, 1 - FALSE_ACCEPTS, method="higher"))
+    margin = _margin(looks.margin[looks.right & (looks.decision >= threshold)], "linear")
+    trials = joined([strangers, looks], same_frames=True)
+    try:
+        curve = fit_curve(trials.decision, trials.right)
+    except ValueError:  # the frames are all alike: no probability can be told
+        curve = None
+    return start.model_copy(update={"threshold": threshold, "margin": margin, "curve": curve})
+
+
+def _judged(
+    scores: Scores, places: NDArray[np.int64], calibration: Calibration, neighborhood: Neighborhood
+) -> Judgement:
+    """The judgement of one query against a map of the frames ``places``."""
+    order = places[np.argsort(-scores[places], kind="stable")]
+    zeros = np.zeros(len(order), np.int64)
+    frames = Whereabouts(zeros.astype(np.int8), np.zeros((len(order), 3)), zeros.astype(np.int32), order)
+    return judge(scores[order], frames, calibration, neighborhood)
+
+
+def _just_above(decision: float) -> float:
+    """The lowest threshold that rejects a decision value; one equal to the threshold would be accepted."""
+    return float(np.nextafter(decision, np.inf))
+
+
+def _margin(margins: Values, method: Literal["linear", "lower"]) -> float:
+    """The margin that loses the share LOST_BY_MARGIN of right answers, given their leads over their best rivals."""
+    finite = margins[np.isfinite(margins)]
+    return max(0.0, float(np.quantile(finite, LOST_BY_MARGIN, method=method))) if len(finite) else 0.0
+
+
+Rule = Literal["precision", "false_accept_rate", "mean_of_negatives"]
+
+
+class Target(BaseModel):
+    """What the threshold is to reach.
+
+    ``precision``: so many of the answers believed are right.  ``false_accept_rate``: at most so many of the frames of
+    places that the map lacks are believed.  ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over
+    the frames of places that the map lacks; it has no value.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rule: Rule
+    value: float | None = Field(default=None, gt=0, lt=1)
+
+    @model_validator(mode="after")
+    def _a_value_where_one_belongs(self) -> Target:
+        if (self.value is None) != (self.rule == "mean_of_negatives"):
+            raise ValueError("a value between 0 and 1 belongs to precision and to false_accept_rate, and to them only")
+        return self
+
+
+class Point(BaseModel):
+    """What one threshold on the decision value does, on all frames; the margin is not applied."""
+
+    threshold: float
+    precision: float = Field(description="Right ones among the answers believed.")
+    recall: float = Field(description="Right answers believed, of the frames whose place is in the map.")
+    false_accept_rate: float | None = Field(description="Believed, of the frames whose place is not; null without any.")
+
+
+class Held(BaseModel):
+    """What the verdicts did with frames that had no part in the threshold by which they were judged."""
+
+    precision: Share = Field(description="Right ones among the recognized.")
+    recall: Share = Field(description="Recognized and right, of the frames whose place is in the map.")
+    false_accept_rate: Share = Field(description="Recognized, of the frames whose place is not.")
+    reliability: Reliability = Field(description="Of the probabilities.")
+
+
+class Measurement(BaseModel):
+    """What was measured in making a calibration."""
+
+    frames: int = Field(description="Frames that were asked.")
+    trials: int = Field(description="Queries: a frame is asked of the map with its place and of the map without it.")
+    known: int = Field(description="Queries whose place was in the map.")
+    unknown: int = Field(description="Queries whose place was not.")
+    right: int = Field(description="Queries whose best match was right.")
+    auc_pr: float = Field(description="Under the precision-recall curve; recall over right matches only.")
+    auc_roc: float | None = Field(description="Queries with their place in the map against those without.")
+    auc_roc_right: float = Field(description="Right answers against all others.")
+    cross_validated: Held
+    points: list[Point] = Field(description="The precision-recall and ROC curves, by rising threshold.")
+
+
+@dataclass(frozen=True)
+class FittedCalibration:
+    """A calibration fitted to trials on a map, and what was measured while fitting it."""
+
+    calibration: Calibration
+    measurement: Measurement
+
+
+def fit_map_calibration(trials: Trials, base: Calibration, target: Target, source: str) -> FittedCalibration:
+    """Fit a calibration to the trials on one map.
+
+    Args:
+        trials: judged with ``base``, whose background and kind of decision value are kept.
+        target: what the threshold is to achieve.
+        source: recorded in the calibration.
+
+    Raises:
+        CalibrationImpossible: there are too few trials, the decision value hardly separates right from wrong
+            answers, or no threshold reaches the target; the text says which.
+    """
+    _check(trials, target)
+    calibration = _fitted(trials, base, target)
+    frames = len(np.unique(trials.frame))
+    known, right = trials.known, trials.right
+    points = curve_points(trials.decision, known, right)
+    measurement = Measurement(
+        frames=frames,
+        trials=len(trials),
+        known=int(known.sum()),
+        unknown=int((~known).sum()),
+        right=int(right.sum()),
+        auc_pr=auc_pr(trials.decision, right),
+        auc_roc=auc_roc(trials.decision, known),
+        auc_roc_right=auc_roc(trials.decision, right) or 0.0,
+        cross_validated=cross_validated(trials, base, target),
+        points=_thinned(points),
+    )
+    return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement)
+
+
+def blocks_of(frame: NDArray[np.int64], count: int = BLOCKS) -> list[Flags]:
+    """Cut the trials into ``count`` blocks of consecutive frames, bool [n] each; fewer if there are fewer frames."""
+    frames = np.unique(frame)
+    runs = np.array_split(frames, min(count, len(frames)))
+    return [np.isin(frame, run) for run in runs]
+
+
+def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
+    """Judge each block by a calibration fitted to the other blocks.
+
+    Raises:
+        CalibrationImpossible: the blocks besides one do not suffice for a calibration.
+    """
+    recognized, probabilities = np.zeros(len(trials), np.bool_), np.zeros(len(trials))
+    for block in blocks_of(trials.frame):
+        calibration = _fitted(trials.take(~block), base, target)
+        held = trials.take(block)
+        recognized[block], probabilities[block] = held.recognized(calibration), held.probabilities(calibration)
+    return held_figures(trials, recognized, probabilities)
+
+
+def held_figures(trials: Trials, recognized: Flags, probabilities: Values) -> Held:
+    """The figures of verdicts, bool [n], and probabilities, float64 [n], of n trials."""
+    passed, known = recognized & trials.right, trials.known
+    return Held(
+        precision=wilson(int(passed.sum()), int(recognized.sum())),
+        recall=wilson(int(passed.sum()), int(known.sum())),
+        false_accept_rate=wilson(int((recognized & ~known).sum()), int((~known).sum())),
+        reliability=reliability(probabilities, trials.right),
+    )
+
+
+def curve_points(decision: Values, known: Flags, right: Flags) -> list[Point]:
+    """The effect of every threshold that makes a difference, by rising threshold.
+
+    Args:
+        decision: float64 [n].
+        known, right: bool [n].
+    """
+    order, ends = falling(decision)
+    passed, rights = ends + 1, np.cumsum(right[order])[ends]
+    strangers, unknown = np.cumsum(~known[order])[ends], int((~known).sum())
+    return [
+        Point(
+            threshold=float(decision[order][end]),
+            precision=float(rights[i] / passed[i]),
+            recall=float(rights[i] / max(1, int(known.sum()))),
+            false_accept_rate=float(strangers[i] / unknown) if unknown else None,
+        )
+        for i, end in enumerate(ends)
+    ][::-1]
+
+
+def _check(trials: Trials, target: Target) -> None:
+    right, wrong = int(trials.right.sum()), int((~trials.right).sum())
+    if min(right, wrong) < FEWEST_OUTCOMES:
+        raise CalibrationImpossible(
+            f"A calibration rests on at least {FEWEST_OUTCOMES} right and as many wrong answers; "
+            f"here {right} are right and {wrong} wrong. Give more frames, of known and of unknown places."
+        )
+    strangers = int((~trials.known).sum())
+    if target.rule != "precision" and strangers < FEWEST_OUTCOMES:
+        raise CalibrationImpossible(
+            f"This rule rests on at least {FEWEST_OUTCOMES} frames of places that the map lacks; here are {strangers}."
+        )
+    area = auc_roc(trials.decision, trials.right) or 0.0
+    if area < LEAST_AREA:
+        raise CalibrationImpossible(
+            f"On this map right answers can hardly be told from wrong ones: the area under the ROC is {area:.2f}, "
+            f"at least {LEAST_AREA} is needed. Other places, or another encoder, may do."
+        )
+
+
+def _fitted(trials: Trials, base: Calibration, target: Target) -> Calibration:
+    """Fit curve, margin and threshold."""
+    try:
+        curve = fit_curve(trials.decision, trials.right)
+    except ValueError as error:
+        raise CalibrationImpossible(f"No probability can be told: {error}.") from error
+    margin, threshold = _margin(trials.margin[trials.right], "lower"), _threshold(trials, curve, target)
+    return base.model_copy(update={"curve": curve, "margin": margin, "threshold": threshold})
+
+
+def _threshold(trials: Trials, curve: Curve, target: Target) -> float:
+    """The lowest threshold that reaches the target without the margin, which makes the verdicts stricter still."""
+    if target.rule == "precision":
+        assert target.value is not None
+        return _for_precision(trials, curve, target.value)
+    strangers = np.sort(trials.decision[~trials.known])[::-1]
+    if not len(strangers):
+        raise CalibrationImpossible("A part of the frames has none of a place that the map lacks; mix them.")
+    if target.rule == "mean_of_negatives":
+        return float(strangers.mean())
+    assert target.value is not None
+    return _just_above(strangers[int(target.value * len(strangers))])
+
+
+def _for_precision(trials: Trials, curve: Curve, wanted: float) -> float:
+    """The lowest decision value above which the wanted share of answers is right, as counted and as the curve expects.
+
+    Counts alone depend on chance in a few frames: of many thresholds, some look better than they are.
+    """
+    order = np.argsort(-trials.decision, kind="stable")
+    passed = np.arange(1, len(trials) + 1)
+    counted = np.cumsum(trials.right[order]) / passed
+    expected = np.cumsum(curve.probabilities(trials.decision[order])) / passed
+    last = np.append(np.diff(trials.decision[order]) != 0, True)
+    reached = np.flatnonzero((counted >= wanted) & (expected >= wanted) & last)
+    if not len(reached):
+        best = float(np.minimum(counted, expected)[last].max())
+        raise CalibrationImpossible(
+            f"No threshold lets {wanted:.1%} of the answers believed be right: the best that {len(trials)} answers "
+            f"can promise is {best:.1%}. More frames promise more, where all that is believed is right."
+        )
+    return float(trials.decision[order][reached[-1]])
+
+
+def _thinned(points: list[Point]) -> list[Point]:
+    """At most MOST_POINTS of the points, evenly spread, with the first and the last."""
+    chosen = np.unique(np.linspace(0, len(points) - 1, min(MOST_POINTS, len(points))).round().astype(int))
+    return [points[index] for index in chosen]

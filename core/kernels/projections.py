@@ -1,0 +1,51 @@
+"""The compiled loops of ``core.method.projection``, and the quantisation of what they give."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def squared_length(feature):  # type: ignore[no-untyped-def]
+    """|f|² of f, float32 [K]."""
+    square = np.float32(0)
+    for k in range(len(feature)):
+        square += feature[k] * feature[k]
+    return square
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def finish_row(products, square, shift, projected):  # type: ignore[no-untyped-def]
+    """Put f W / |f| - m W at unit length into ``projected``; zeros where f is zero.
+
+    Args:
+        products: f W, float32 [d].
+        square: |f|².
+        shift: m W, float32 [d].
+        projected: float32 [values], values <= d.
+    """
+    inverse = np.float32(1) / np.sqrt(square) if square > 0 else np.float32(0)
+    square = np.float32(0)
+    for d in range(len(projected)):
+        value = products[d] * inverse - shift[d]
+        projected[d] = value
+        square += value * value
+    again = np.float32(1) / np.sqrt(square) if square > 0 and inverse > 0 else np.float32(0)
+    for d in range(len(projected)):
+        projected[d] *= again
+
+
+@numba.njit(cache=True, nogil=True)
+def finish_rows(products, features, shift, projected):  # type: ignore[no-untyped-def]
+    """The same for each row: float32 [n, d], [n, K] and [d] to float32 [n, values]."""
+    for i in range(len(features)):
+        finish_row(products[i], squared_length(features[i]), shift, projected[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def quantize(values, factor, made):  # type: ignore[no-untyped-def]
+    """Put values times a factor, rounded and cut off at ±127, into ``made``; float32 [C, n] to int8 [C, n]."""
+    for c in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            made[c, i] = np.int8(min(127.0, max(-127.0, np.rint(values[c, i] * factor))))

@@ -1,0 +1,250 @@
+"""Place recognition as an algorithm: from a picture to an answer, and from a picture to a place of a map.
+
+    answer = recognize(map_, picture, encoder)          # decode, encode, search, agree, judge
+    place = enrol(map_, "p7", picture, encoder)         # decode, encode, store
+
+The service takes the same steps.  It decodes and encodes the frames of several requests together, and then calls
+:func:`locate` and :func:`describe`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from core.errors import NoRegions
+from core.frames.images import decode, encode_thumbnail
+from core.frames.masks import Mask
+from core.frames.preprocessing import Pixels
+from core.judgement.position import PoseEstimate, estimate_pose
+from core.judgement.priors import log_odds_per_score
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.method.encoder import Encoder, Encoding
+from core.places import Place, PlaceFields
+from core.recognition.selection import Selection
+from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
+from core.storage import Enrolment, Map
+
+ATTEMPTS = 3
+"""How often a query is searched for if places that it finds are deleted in the meantime."""
+
+THUMBNAIL_SIDE = 320
+"""The longer side of a thumbnail, in pixels."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer to one query.
+
+    judgement: the verdict, with the values that it rests on.
+    matches: score and place of the best matches, best first; at most k.
+    weights: the prior weight of each match, in (0, 1]; None if the query had no prior.
+    calibration: the calibration by which the query was judged.
+    search: milliseconds spent on both stages of the search, the judgement and the look-up of the places; for several
+        queries that were searched for together, the mean.
+    pose: the estimated pose of the query, from the poses of the best match and its neighbours; None if they have none.
+    encoding: the encoded query.
+    candidates: the best places of the ranking; the matches are the first of them.
+    """
+
+    judgement: Judgement
+    matches: list[tuple[float, Place]]
+    weights: list[float] | None
+    calibration: Calibration
+    search: float
+    pose: PoseEstimate | None
+    encoding: Encoding
+    candidates: Candidates
+
+    @property
+    def place(self) -> Place | None:
+        """The place that the query shows if the verdict is ``recognized``, else None."""
+        return self.matches[0][1] if self.judgement.verdict == "recognized" else None
+
+    @property
+    def probability(self) -> float | None:
+        """The probability that the best match is right; None if there is no match or the calibration has no curve."""
+        return self.judgement.probability
+
+
+def recognize(
+    map_: Map,
+    picture: bytes,
+    encoder: Encoder,
+    k: int = 5,
+    selection: Selection | None = None,
+    camera: str | None = None,
+) -> Answer:
+    """Find where a picture was taken.
+
+    Args:
+        picture: the bytes of a JPEG, PNG or WebP file.
+        encoder: the map's encoder (``EncoderCatalogue().get(map_.record.encoder)``).
+        k: how many matches to list.
+        selection: what is known of the place; None: nothing.
+        camera: the name of the map's camera that took the picture, whose mask is applied; None: no mask.
+
+    Raises:
+        InvalidImage: the picture cannot be decoded.
+        NoRegions: the picture is blank, or nearly so.
+        UnknownCamera: the map has no such camera.
+        StorageFailure: the map's files cannot be read.
+    """
+    pixels = decode(picture)  # uint8 [H, W, 3]
+    encoding = encoder.encode(pixels, _mask(map_, camera))  # descriptor float32 [D], local descriptors int8 [C, L]
+    if len(encoding.regions) == 0:
+        raise NoRegions("The picture has no region of interest: it is blank, or nearly so.")
+    (answer,) = locate(map_, encoder, [encoding], k, selection)
+    return answer
+
+
+def enrol(
+    map_: Map,
+    place_id: str,
+    picture: bytes,
+    encoder: Encoder,
+    fields: PlaceFields | None = None,
+) -> Place:
+    """Store a picture as a place of a map.  When this returns, the place is on disk and every later search finds it.
+
+    Args:
+        place_id: the id of the place; an existing place of this id is replaced.
+        picture: the bytes of a JPEG, PNG or WebP file.
+        encoder: the map's encoder.
+        fields: pose, time, sequence, camera and metadata of the place.
+
+    Raises:
+        InvalidImage: the picture cannot be decoded.
+        NoRegions: the picture is blank, or nearly so.
+        UnknownCamera: the map has no such camera.
+        StorageFull, StorageFailure: the disk is full or refuses; nothing was stored.
+    """
+    fields = fields or PlaceFields()
+    mask = _mask(map_, fields.camera)
+    pixels = decode(picture)
+    encoding = encoder.encode(pixels, mask)
+    digest = frame_digest(hashlib.sha256(picture).digest(), mask)
+    ((place, _change),) = map_.enrol([describe(map_, place_id, fields, picture, digest, pixels, encoding)])
+    return place
+
+
+def _mask(map_: Map, camera: str | None) -> Mask | None:
+    return None if camera is None else map_.cameras.mask(camera)
+
+
+def frame_digest(sha256: bytes, mask: Mask | None) -> bytes:
+    """The digest by which a map recognizes a frame that it has already encoded: of its file and, if any, its mask.
+
+    Args:
+        sha256: the digest of the file, 32 bytes.
+
+    Returns:
+        32 bytes.
+    """
+    return sha256 if mask is None else hashlib.sha256(sha256 + mask.digest.encode()).digest()
+
+
+def describe(
+    map_: Map,
+    place_id: str,
+    fields: PlaceFields,
+    picture: bytes | None,
+    digest: bytes,
+    pixels: Pixels,
+    encoding: Encoding,
+    thumbnail_side: int = THUMBNAIL_SIDE,
+) -> Enrolment:
+    """The record that a map stores of an encoded frame: its descriptors, fields, and the picture that the map keeps.
+
+    Args:
+        picture: the bytes of the file; only needed if the map keeps images.
+        digest: the frame's ``frame_digest``.
+        pixels: uint8 [H, W, 3], BGR.
+        thumbnail_side: the longer side of the thumbnail, in pixels.
+
+    Raises:
+        NoRegions: the frame is blank, or nearly so.
+    """
+    if len(encoding.regions) == 0:
+        raise NoRegions("The frame has no region of interest: it is blank, or nearly so.")
+    keep = map_.record.keep
+    return Enrolment(
+        id=place_id,
+        fields=fields,
+        descriptor=encoding.descriptor,
+        local=encoding.local,
+        regions=len(encoding.regions),
+        digest=digest,
+        thumbnail=encode_thumbnail(pixels, thumbnail_side) if keep == "thumbnail" else None,
+        image=picture if keep == "image" else None,
+    )
+
+
+def locate(
+    map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
+) -> list[Answer]:
+    """Search a map for queries that are encoded already, and judge each.
+
+    Args:
+        encoder: the map's encoder.
+        encodings: the queries, encoded by it, each with at least one region; at least one query.
+        k: how many matches to list.
+        selection: what is known of the places; None: nothing.
+
+    Returns:
+        One answer for each query, in order.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    began = time.perf_counter()
+    ranked = rank_places(map_, encoder, encodings, selection)  # both stages of the search
+    answers = [
+        _answer(map_, encoder, encoding, candidates, k, selection)
+        for encoding, candidates in zip(encodings, ranked, strict=True)
+    ]
+    milliseconds = 1e3 * (time.perf_counter() - began) / len(encodings)
+    return [replace(answer, search=milliseconds) for answer in answers]
+
+
+def _answer(
+    map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, k: int, selection: Selection | None
+) -> Answer:
+    """Look up the best places and judge the query; search again if one of them was deleted since the search."""
+    attempt = 1
+    while None in (places := _places(map_, candidates, k)) and attempt < ATTEMPTS:
+        (candidates,) = rank_places(map_, encoder, [encoding], selection)
+        attempt += 1
+    if None in places:  # places are being deleted all the time: go on without those that are gone
+        present = np.ones(len(candidates.rows), np.bool_)
+        present[: len(places)] = [place is not None for place in places]
+        candidates = candidates.take(np.flatnonzero(present))
+    return _judge(map_, encoder, encoding, candidates, [place for place in places if place is not None])
+
+
+def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
+    return map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
+
+
+def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, places: list[Place]) -> Answer:
+    """The verdict on a query by its candidates, of which ``places`` are the best."""
+    calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
+    judgement = judge(
+        candidates.ordered,
+        candidates.whereabouts,
+        calibration,
+        neighborhood,
+        candidates.examined,
+        candidates.is_part,
+    )
+    matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
+    if matches:
+        judgement = replace(judgement, score=matches[0][0])
+    log_odds = log_odds_per_score(calibration, encoder.candidates > 0) * candidates.ordered.astype(np.float64)
+    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
+    weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates)

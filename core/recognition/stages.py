@@ -1,0 +1,237 @@
+"""The two stages of a search.
+
+The first stage ranks all places of a map by the inner product of their descriptors with the query's (equation 3.12).
+The second stage compares the best places of that ranking with the query cell by cell.
+
+Where frames were taken densely, or the robot stood still, the neighbours of one place can fill the whole list of
+candidates.  If the second stage compared only these, a similar place elsewhere would keep its low first score, the
+best place would always have a large lead, and no answer would ever be ambiguous.  So the second stage goes on past the
+neighbours of the best place until it has compared a few other places, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.judgement.priors import Values, weighed
+from core.judgement.verdict import TOP_PLACES, Calibration, completed
+from core.method.agreement import Cells
+from core.method.encoder import Encoder, Encoding
+from core.places import Neighborhood, Whereabouts
+from core.recognition.selection import WHOLE_MAP, SearchScope, Selection
+from core.storage import Map, Ranking, Snapshot
+
+Array = NDArray[np.float32]
+Positions = NDArray[np.int64]
+
+ROUNDS = 3
+"""How often the other places are counted: one that is compared may become the best and have neighbours of its own."""
+
+HEAD = 500
+"""How many places of a ranking the second stage and the judgement see, unless too few are other than the best place."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The best places of a ranking after the second stage.
+
+    rows: int64 [n], rows of the snapshot, best first.
+    scores: float32 [n], the scores after both stages.
+    whereabouts: the poses and sequences of these places.
+    examined: bool [n], which of them the second stage has compared with the query.
+    weights: float64 [n], the log prior of each place; None if the query had no prior.
+    ordered: float32 [n], the values by which the places are ordered: the scores, changed by the prior.
+    is_part: whether the map has further places whose scores are not known.
+    places: the number of places in the map, including those that the query may not find.
+    """
+
+    rows: Positions
+    scores: Array
+    whereabouts: Whereabouts
+    examined: NDArray[np.bool_]
+    weights: Values | None
+    ordered: Array
+    is_part: bool
+    places: int
+
+    def take(self, kept: Positions) -> Candidates:
+        """The candidates at some positions, int64 [m]."""
+        return replace(
+            self,
+            rows=self.rows[kept],
+            scores=self.scores[kept],
+            whereabouts=self.whereabouts.take(kept),
+            examined=self.examined[kept],
+            weights=None if self.weights is None else self.weights[kept],
+            ordered=self.ordered[kept],
+        )
+
+
+def calibration_of(map_: Map, encoder: Encoder) -> Calibration:
+    """The map's own calibration or, if it has none, its encoder's."""
+    return completed(map_.record.calibration, encoder.calibration, encoder.candidates > 0)
+
+
+def neighborhood_of(map_: Map) -> Neighborhood:
+    """Which places count as the same place in a map, by distance or position in the sequence."""
+    return Neighborhood(map_.record.same_place_radius, map_.record.same_place_frames)
+
+
+def rank_places(
+    map_: Map, encoder: Encoder, encodings: Sequence[Encoding], selection: Selection | None = None
+) -> list[Candidates]:
+    """Both stages of the search for several queries, in one snapshot of a map.
+
+    Args:
+        encoder: the map's encoder.
+        encodings: the queries, encoded by it, each with at least one region; at least one query.
+        selection: what is known of the places; None: nothing.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    snapshot = map_.snapshot()
+    scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
+    rankings = search(snapshot, np.stack([encoding.descriptor for encoding in encodings]), scope)
+    return [
+        agree(map_, encoder, snapshot, encoding.local, ranking, scope)
+        for encoding, ranking in zip(encodings, rankings, strict=True)
+    ]
+
+
+def search(snapshot: Snapshot, descriptors: Array, scope: SearchScope = WHOLE_MAP) -> list[Ranking]:
+    """The first stage: rank the places of a map by the inner products of descriptors (equation 3.12).
+
+    A large map returns only its best places, among which a place that a prior favours may be missing.  So the places
+    that the prior favours are searched a second time alone, and the rankings are merged.
+
+    Args:
+        descriptors: the queries, float32 [B, D].
+        scope: the places that may be found, and their prior weights.
+
+    Returns:
+        For each query rows, int64 [n], and inner products, float32 [n], best first.
+    """
+    rankings = snapshot.search_batch(descriptors, scope.allowed)
+    favoured = scope.favoured
+    if favoured is None or len(rankings[0][0]) >= len(snapshot):
+        return rankings
+    more = snapshot.search_batch(descriptors, favoured)
+    return [_merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
+
+
+def _merged(a: Ranking, b: Ranking) -> Ranking:
+    rows, first = np.unique(np.concatenate([a[0], b[0]]), return_index=True)
+    products = np.concatenate([a[1], b[1]])[first]
+    order = np.argsort(-products, kind="stable")
+    return rows[order], products[order]
+
+
+def agree(
+    map_: Map, encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking, scope: SearchScope = WHOLE_MAP
+) -> Candidates:
+    """The second stage: apply the prior, then compare the best places of a ranking with the query cell by cell.
+
+    Args:
+        local: the query's local descriptors, int8 [C, L].
+        ranking: the result of :func:`search`, rows int64 [n] and inner products float32 [n].
+        scope: the scope of that search.
+
+    Returns:
+        The first ``HEAD`` places of the ranking if a verdict needs no more, else all of them.
+
+    Raises:
+        StorageFailure: local descriptors cannot be read from disk.
+    """
+    calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
+    by_all = not encoder.candidates and calibration.decision != "leading" and not snapshot.coded
+    scores = encoder.scores_from_inner_products(ranking[1])
+    rows, ordered, weights = ranking[0], scores, None
+    if scope.weights is not None:
+        weights = scope.weights[rows]
+        ordered = weighed(scores, weights, calibration, encoder.candidates > 0)
+        order = np.argsort(-ordered, kind="stable")
+        rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]
+
+    def gains(positions: Positions) -> Array:
+        return encoder.agreement(local, snapshot.locals_in_place(rows[positions]))
+
+    for length in (len(rows) if by_all else HEAD, len(rows)):
+        places = snapshot.whereabouts_at(rows[:length])
+        found = examine(ordered[:length], places, neighborhood, encoder.candidates, gains)
+        order = found.order
+        candidates = Candidates(
+            rows[order],
+            scores[order] + (found.scores - ordered[order]),
+            places.take(order),
+            found.examined,
+            None if weights is None else weights[order],
+            found.scores,
+            snapshot.coded > 0,
+            len(snapshot),
+        )
+        if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
+            break
+    return candidates
+
+
+def _is_enough(candidates: Candidates, neighborhood: Neighborhood, has_second_stage: bool) -> bool:
+    """Whether the candidates have as many places other than the best place as a verdict considers."""
+    others = ~candidates.whereabouts.near(0, neighborhood)
+    return int((others & candidates.examined if has_second_stage else others).sum()) >= TOP_PLACES
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A ranking of n places after the second stage.
+
+    order: int64 [n], positions in the first stage's ranking, best first; equal scores keep their order.
+    scores: float32 [n], in the new order.
+    examined: bool [n], which places, in the new order, were compared with the query.
+    """
+
+    order: Positions
+    scores: Array
+    examined: NDArray[np.bool_]
+
+
+def examine(
+    scores: Array,
+    whereabouts: Whereabouts,
+    neighborhood: Neighborhood,
+    candidates: int,
+    gains: Callable[[Positions], Array],
+    others: int = TOP_PLACES,
+) -> Examined:
+    """Raise the scores of the best places of a ranking by the gains of the second stage.
+
+    It examines the first ``candidates`` places.  As long as fewer than ``others`` of the examined places are other than
+    the best place, it then examines the best of the places that are.
+
+    Args:
+        scores: float32 [n], the scores of the first stage, best first.
+        whereabouts: the poses and sequences of the n places.
+        neighborhood: which places count as the same place.
+        candidates: how many places the encoder's second stage examines; 0 if the encoder has no second stage.
+        gains: returns what the second stage adds to the scores at positions in the ranking, int64 [k] to float32 [k],
+            at least 0.
+        others: how many of the examined places have to be other than the best place, if the map has so many.
+    """
+    raised = scores.copy()
+    done = np.zeros(len(scores), np.bool_)
+    ahead = np.arange(min(candidates, len(scores)))
+    for _ in range(ROUNDS):
+        if not len(ahead):
+            break
+        raised[ahead] += gains(ahead)
+        done[ahead] = True
+        best = int(np.flatnonzero(done)[np.argmax(raised[done])])
+        elsewhere = ~whereabouts.near(best, neighborhood)
+        missing = max(0, others - int((done & elsewhere).sum()))
+        ahead = np.flatnonzero(elsewhere & ~done)[:missing]
+    order = np.argsort(-raised, kind="stable")
+    return Examined(order, raised[order], done[order])

@@ -1,0 +1,148 @@
+"""What lives while the application runs: the engine, and beside it the jobs, sessions, transfers and upkeep of maps."""
+
+from __future__ import annotations
+
+import logging
+import time
+from contextlib import ExitStack, suppress
+from functools import partial
+
+from anyio import CapacityLimiter, to_thread
+from starlette.datastructures import State
+
+from core.errors import PlacerecError
+from service.engine.engine import Engine
+from service.errors.faults import NotReady
+from service.jobs.jobs import Jobs
+from service.maps import calibration, storage_jobs
+from service.maps.exports import Exports
+from service.maps.imports import Imports
+from service.places import bulk_enrolment
+from service.places.batch_order import BatchOrder
+from service.places.staging import Staging
+from service.queries.pictures import ExplanationPictures
+from service.queries.statistics import QueryStatistics
+from service.sessions.sessions import Sessions
+from service.settings import Settings, unknown_variables
+from service.telemetry.metrics import Metrics
+from service.upkeep import merging, pruning, reencoding
+from service.worker_threads import in_thread
+
+DISK_CHECK_SECONDS = 1.0
+"""The disk is tried at most this often; a readiness probe that comes sooner gets the last result."""
+
+log = logging.getLogger("placerec.runtime")
+
+
+class Runtime:
+    """Everything that the routes work with, made when the application starts.
+
+    Raises:
+        DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
+    """
+
+    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+        self.settings = settings
+        with ExitStack() as opened:
+            self.engine = Engine(settings, metrics)
+            opened.callback(self.engine.close)
+            self.jobs = Jobs(
+                settings.data_dir,
+                settings.job_workers,
+                settings.job_queue,
+                settings.job_history,
+                settings.job_watchers,
+            )
+            opened.callback(self.jobs.close, 0.0)
+            self.sessions = Sessions(settings)
+            opened.pop_all()
+        self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
+        self.batch_order = BatchOrder()
+        self.statistics = QueryStatistics.of_engine(self.engine)
+        self.explanation_pictures = ExplanationPictures()
+        self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
+        self.health_examinations = CapacityLimiter(1)  # each is a long search
+        self.stopping = False
+        """Whether the service is about to stop, so that it is no longer ready for new requests."""
+        self._disk_state, self._disk_checked = "ok", 0.0
+        self._register_jobs()
+
+    def _register_jobs(self) -> None:
+        """Name the kinds of jobs that can be taken up again after a restart; ``imports`` has named its own."""
+        engine, staging, register = self.engine, self.staging, self.jobs.register
+        register(reencoding.KIND, partial(reencoding.reencode, engine))
+        register(pruning.KIND, partial(pruning.prune, engine))
+        register(merging.KIND, partial(merging.merge, engine))
+        register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
+        register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
+        register(calibration.KIND, partial(calibration.calibrate, engine))
+        register(
+            bulk_enrolment.KIND,
+            partial(bulk_enrolment.enrol_staged, engine, staging),
+            partial(bulk_enrolment.discard, staging),
+        )
+
+    def publish(self, state: State) -> None:
+        """Hand the parts to the routes, which find them by name (``service.http.dependencies.FromState``)."""
+        state.runtime = self
+        state.engine, state.jobs, state.sessions = self.engine, self.jobs, self.sessions
+        state.staging, state.batch_order = self.staging, self.batch_order
+        state.statistics, state.explanation_pictures = self.statistics, self.explanation_pictures
+        state.health_examinations = self.health_examinations
+        state.exports, state.imports = self.exports, self.imports
+
+    def start(self) -> None:
+        """Begin to load the default encoder and take up jobs; call it from the event loop, which goes on meanwhile."""
+        for name in unknown_variables():
+            log.warning("the environment sets %s, which is no setting", name)
+        self.engine.start()
+        self._clear_away()
+        self.statistics.start()
+        self.exports.clean()
+        self.imports.clean()
+        self.jobs.start()
+
+    def _clear_away(self) -> None:
+        """Remove what no job will finish."""
+        open_ = [job.arguments for job in self.jobs.all() if not job.ended]
+        unfinished = {arguments.get("to") for arguments in open_}
+        self.staging.clean({arguments["form"] for arguments in open_ if "form" in arguments})
+        for map_id in self.engine.atlas.unlisted():
+            if map_id not in unfinished:
+                with suppress(PlacerecError):  # the next start tries again
+                    self.engine.atlas.abandon(map_id)
+
+    async def close(self) -> None:
+        """Finish what runs and give the data directory back."""
+        self.engine.stop_loading()
+        await self.exports.close()
+        # Jobs stop first, for they need the encoder and the maps.
+        await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
+        await to_thread.run_sync(self.statistics.close)
+        await to_thread.run_sync(self.sessions.close)
+        await to_thread.run_sync(self.engine.close)
+
+    async def check_readiness(self) -> dict[str, str]:
+        """The outcome of each check, all of them "ok".
+
+        Raises:
+            NotReady: at least one is not.
+        """
+        now = time.monotonic()
+        if now - self._disk_checked > DISK_CHECK_SECONDS:
+            self._disk_checked = now
+            self._disk_state = await in_thread(self._check_disk)
+        checks = {"encoder": self.engine.encoder_state, "maps": "ok", "disk": self._disk_state}
+        if self.stopping:
+            checks["service"] = "it is stopping"
+        bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
+        if bad:
+            raise NotReady(f"Not ready: {'; '.join(bad)}", checks)
+        return checks
+
+    def _check_disk(self) -> str:
+        try:
+            self.engine.atlas.check_writable()
+        except PlacerecError as error:
+            return str(error)
+        return "ok"

@@ -1,0 +1,154 @@
+"""Loop closure: locate a frame in a map and, if its place is unknown, enrol it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Query, Request
+from starlette.responses import Response
+
+from core import errors
+from core.places import Place, check_place_id
+from core.recognition.recognition import Answer, locate
+from core.recognition.selection import Selection
+from core.storage import Map
+from service.engine.engine import Engine, camera_mask
+from service.engine.microbatches import Encoded
+from service.errors.faults import (
+    EncoderNotInstalled,
+    PlaceTaken,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation
+from service.http.dependencies import (
+    DeadlineDep,
+    EngineDep,
+    MapId,
+    frame_for_map,
+    milliseconds_since,
+    rounded,
+    single_values,
+    started,
+)
+from service.http.openapi import frame_body
+from service.http.uploads import parse_metadata
+from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
+from service.places.schemas import PlaceView
+from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_answer
+from service.queries.parameters import ClosureParameters
+from service.queries.schemas import ClosureAnswer
+from service.worker_threads import in_thread
+
+
+@dataclass(frozen=True)
+class Closure:
+    """The result of a loop closure.
+
+    answer: the answer of the map before the frame was enrolled.
+    enrolled: the frame's own place; None if the frame shows, or may show, another place.
+    created: whether the place was created by this request.
+    """
+
+    answer: Answer
+    enrolled: Place | None
+    created: bool
+
+
+def close_loop(
+    engine: Engine, map_: Map, frame: FrameToEnrol, encoded: Encoded, k: int, selection: Selection | None
+) -> Closure:
+    """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
+
+    The map is locked meanwhile: if two frames of one new place arrive together, the second finds the first.  A
+    repeated request gets the same answer as the first one, because its own place is left out of the search.
+
+    Args:
+        encoded: the frame, encoded; it has regions.
+        k: how many matches to list.
+        selection: what is known of the place; None: nothing.
+
+    Raises:
+        PlaceTaken: a place of the frame's id exists, and has another frame.
+        StorageFull, StorageFailure: nothing was enrolled.
+    """
+    digest = digest_of(frame)
+    enrolment = describe_frame(engine, map_, frame, digest, encoded)
+    with engine.writing(map_.record.id):
+        known = map_.digest(frame.id)
+        if known is not None and known != digest:
+            raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
+        if known is not None:
+            selection = replace(selection or Selection(), excluded=frame.id)
+        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
+        if known is not None:
+            return Closure(answer, map_.place(frame.id), created=False)
+        if answer.judgement.verdict != "unknown":
+            return Closure(answer, None, created=False)
+        ((place, _),) = map_.enrol([enrolment])
+        return Closure(answer, place, created=True)
+
+
+router = APIRouter(
+    prefix="/v1/maps/{map}",
+    tags=["queries"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(
+        errors.UnknownCamera,
+        errors.WrongEncoder,
+        PlaceTaken,
+        UnsupportedMediaType,
+        errors.StorageFull,
+        QueueFull,
+        EncoderNotInstalled,
+    ),
+)
+
+
+@router.post(
+    "/query:enrol",
+    openapi_extra=frame_body(ClosureParameters),
+    responses={201: {"model": ClosureAnswer, "description": "Nobody knew the frame; it is a place now."}},
+)
+async def query_or_enrol(
+    map_id: MapId,
+    options: Annotated[ClosureParameters, Query()],
+    request: Request,
+    response: Response,
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    deadline: DeadlineDep,
+) -> ClosureAnswer:
+    """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
+
+    Of two robots that send the same new place together one enrols it, and the other finds it. A request can be
+    repeated until it succeeds: the same frame under the same id is looked for among the other places, and not enrolled
+    again. `exclude_frames` and `exclude_seconds` keep a robot from finding what it has just enrolled. A frame without
+    regions is not enrolled.
+    """
+    map_, data, options = await frame_for_map(request, engine, map_id, options)
+    selection = options.selection()
+    check_place_id(options.id)
+    metadata = {} if options.metadata is None else parse_metadata(options.metadata)
+    fields = options.fields(metadata, engine.settings)
+    mask = await camera_mask(map_, options.camera)
+    with engine.queue.place():
+        encoded = await engine.encode_for(map_, data, deadline, mask)
+    enrolled: Place | None = None
+    change: Literal["created", "unchanged"] | None = None
+    if len(encoded.encoding.regions) == 0:
+        answer = blank_answer(map_, encoded)
+    else:
+        frame = FrameToEnrol(options.id, fields, data, mask)
+        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection)
+        answer = answer_of(encoded, closure.answer)
+        enrolled = closure.enrolled
+        if enrolled is not None:
+            change = "created" if closure.created else "unchanged"
+    count_answer(engine, statistics, map_, answer)
+    response.status_code = 201 if change == "created" else 200
+    request.state.noted = {"map": map_id, "verdict": answer.verdict, "change": change}
+    answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
+    shown = None if enrolled is None else PlaceView.of(enrolled)
+    return ClosureAnswer(**answer.__dict__, change=change, enrolled=shown)

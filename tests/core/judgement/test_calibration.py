@@ -1,0 +1,247 @@
+"""Calibrations of encoders, from made-up scores, and of maps, from trials drawn from a known law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.errors import CalibrationImpossible
+from core.judgement.calibration import (
+    BLOCKS,
+    MOST_POINTS,
+    Target,
+    blocks_of,
+    cross_validated,
+    curve_points,
+    fit_encoder_calibration,
+    fit_map_calibration,
+    second_look,
+)
+from core.judgement.probability import Curve
+from core.judgement.trials import Trials, joined
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.places import Neighborhood, Whereabouts
+
+BASE = Calibration(
+    source="encoder-default", threshold=0.09, margin=0.004, background_mean=0.07, background_deviation=0.01
+)
+LAW = Curve(slope=60, intercept=-6)
+PRECISE = Target(rule="precision", value=0.95)
+
+
+def drawn(frames: int, law: Curve = LAW, seed: int = 0) -> Trials:
+    """Each frame asked with its place and without; a known one is right by the law, an unknown one never."""
+    generator = np.random.default_rng(seed)
+    decision = np.concatenate([generator.gamma(6, 0.025, frames), generator.gamma(3, 0.012, frames)])
+    known = np.arange(2 * frames) < frames
+    right = known & (generator.random(2 * frames) < law.probabilities(decision))
+    frame = np.tile(np.arange(frames), 2)
+    return Trials(decision, np.full(2 * frames, np.inf), known, right, frame)
+
+
+def test_what_is_found_is_what_it_was_made_of() -> None:
+    trials = drawn(3000)
+    found = fit_map_calibration(trials, BASE, PRECISE, "sequence:tuesday")
+    assert (found.calibration.source, found.calibration.frames) == ("sequence:tuesday", 3000)
+    assert found.calibration.background_mean == BASE.background_mean
+    passed = trials.take(trials.recognized(found.calibration))
+    assert 0.945 <= passed.right.mean() <= 0.96  # no stricter than it need be
+    held = found.measurement.cross_validated
+    assert held.precision.value == pytest.approx(0.95, abs=0.02)
+    assert held.precision.low < 0.95 < held.precision.high
+    assert held.reliability.ece < 0.03
+    assert (found.measurement.known, found.measurement.unknown) == (3000, 3000)
+
+
+def test_a_threshold_for_a_false_accept_rate_keeps_it() -> None:
+    trials = drawn(500)
+    for wanted in (0.01, 0.1, 0.5):
+        found = fit_map_calibration(trials, BASE, Target(rule="false_accept_rate", value=wanted), "map")
+        accepted = trials.recognized(found.calibration)[~trials.known].mean()
+        assert wanted - 0.005 <= accepted <= wanted
+
+
+def test_the_rule_of_the_thesis_is_the_mean_of_the_negatives() -> None:
+    trials = drawn(100)
+    found = fit_map_calibration(trials, BASE, Target(rule="mean_of_negatives"), "map")
+    assert found.calibration.threshold == pytest.approx(trials.decision[~trials.known].mean())
+
+
+def test_close_rivals_are_not_let_through() -> None:
+    trials = drawn(400)
+    margin = np.where(trials.right, np.linspace(0.001, 0.1, len(trials)), 0.0)
+    found = fit_map_calibration(
+        Trials(trials.decision, margin, trials.known, trials.right, trials.frame), BASE, PRECISE, "map"
+    ).calibration
+    assert 0 < found.margin < 0.01
+    lost = (margin[trials.right] < found.margin).mean()
+    assert lost <= 0.02 + 1e-9
+
+
+def test_no_frame_has_a_say_in_its_own_judgement() -> None:
+    """Outcomes of one block turned round: the others' judgements hear of it, those of the block itself do not."""
+    trials = drawn(200)
+    block = blocks_of(trials.frame)[0]
+    held = cross_validated(trials, BASE, Target(rule="mean_of_negatives"))
+    assert len(blocks_of(trials.frame)) == BLOCKS
+    assert set(trials.frame[block]) == set(range(40)), "both trials of a frame are in one block, frames consecutive"
+    calibration = fit_map_calibration(trials.take(~block), BASE, Target(rule="mean_of_negatives"), "x").calibration
+    expected = trials.take(block).recognized(calibration).sum()
+    others = sum(
+        trials.take(b)
+        .recognized(fit_map_calibration(trials.take(~b), BASE, Target(rule="mean_of_negatives"), "x").calibration)
+        .sum()
+        for b in blocks_of(trials.frame)[1:]
+    )
+    assert held.precision.of == expected + others
+
+
+@pytest.mark.parametrize("frames", [0, 1, 5, 9])
+def test_too_few_frames_are_refused(frames: int) -> None:
+    with pytest.raises(CalibrationImpossible, match="at least 10 right"):
+        fit_map_calibration(drawn(frames), BASE, PRECISE, "map")
+
+
+def test_a_map_whose_answers_tell_nothing_is_refused() -> None:
+    trials = drawn(300)
+    noise = np.random.default_rng(1).random(len(trials))
+    with pytest.raises(CalibrationImpossible, match="hardly be told"):
+        fit_map_calibration(
+            Trials(noise, trials.margin, trials.known, trials.right, trials.frame), BASE, PRECISE, "map"
+        )
+
+
+def test_a_target_out_of_reach_says_what_is_within() -> None:
+    generator = np.random.default_rng(3)
+    decision = np.concatenate([generator.normal(0.12, 0.02, 200), generator.normal(0.10, 0.02, 200)])
+    known = np.arange(400) < 200
+    wrong_at_the_top = known.copy()
+    wrong_at_the_top[np.argsort(-decision)[:6]] = False
+    trials = Trials(decision, np.full(400, np.inf), known, wrong_at_the_top, np.tile(np.arange(200), 2))
+    with pytest.raises(CalibrationImpossible, match=r"99\.9% .* best that"):
+        fit_map_calibration(trials, BASE, Target(rule="precision", value=0.999), "map")
+
+
+def test_a_rate_of_false_accepts_needs_unknown_places() -> None:
+    trials = drawn(300)
+    known = trials.take(trials.known)
+    with pytest.raises(CalibrationImpossible, match="places that the map lacks"):
+        fit_map_calibration(known, BASE, Target(rule="false_accept_rate", value=0.1), "map")
+
+
+@pytest.mark.parametrize(("rule", "value"), [("precision", None), ("mean_of_negatives", 0.5), ("precision", 1.0)])
+def test_targets_that_make_no_sense(rule: str, value: float | None) -> None:
+    with pytest.raises(ValueError):
+        Target.model_validate({"rule": rule, "value": value})
+
+
+def tied(n: int = 400, seed: int = 5) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    generator = np.random.default_rng(seed)
+    decision = np.round(generator.random(n), 2)
+    return decision, generator.random(n) < decision
+
+
+def test_the_points_say_what_each_threshold_does() -> None:
+    decision, right = tied()
+    known = right | (np.arange(400) % 3 == 0)
+    points = curve_points(decision, known, right)
+    assert [point.threshold for point in points] == sorted(set(decision.tolist()))
+    for point in points[::10]:
+        passed = decision >= point.threshold
+        assert point.precision == pytest.approx(right[passed].mean())
+        assert point.recall == pytest.approx(right[passed].sum() / known.sum())
+        assert point.false_accept_rate == pytest.approx(passed[~known].mean())
+
+
+def test_a_long_curve_is_told_in_few_points() -> None:
+    points = fit_map_calibration(drawn(1000), BASE, PRECISE, "map").measurement.points
+    assert len(points) == MOST_POINTS
+    assert points[0].false_accept_rate == 1.0
+
+
+def test_trials_of_other_frames_are_numbered_on() -> None:
+    one, other = drawn(20), drawn(30)
+    assert len(np.unique(joined([one, other]).frame)) == 50
+    assert len(np.unique(joined([one, one], same_frames=True).frame)) == 20
+
+
+N = 60
+
+
+def made_up(seed: int = 0) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Unrelated frames score about 0.1 ± 0.02; neighbours 0.5, the frame itself 1; second looks a little less."""
+    random = np.random.default_rng(seed)
+    unknown = random.normal(0.1, 0.02, (N, N)).astype(np.float32)
+    unknown = (unknown + unknown.T) / np.sqrt(2)
+    unknown += np.float32(0.1 - unknown.mean())
+    known = unknown.copy()
+    near = np.abs(np.subtract.outer(np.arange(N), np.arange(N))) <= 2
+    unknown[near], known[near] = 0.5, 0.4
+    np.fill_diagonal(unknown, 1.0)
+    np.fill_diagonal(known, 0.6)
+    return unknown, known
+
+
+def test_the_background_is_that_of_frames_that_are_apart() -> None:
+    unknown, known = made_up()
+    apart = np.abs(np.subtract.outer(np.arange(N), np.arange(N))) > 2
+    made = fit_encoder_calibration(unknown, known, 2, "encoder-default")
+    assert made.background_mean == pytest.approx(float(unknown[apart].mean()))
+    assert made.background_deviation == pytest.approx(float(unknown[apart].std()))
+    assert made.source == "encoder-default"
+
+
+def judged(scores: NDArray[np.float32], places: NDArray[np.intp], calibration: Calibration) -> Judgement:
+    """The judgement of one query against a map of the frames ``places``."""
+    order = places[np.argsort(-scores[places], kind="stable")]
+    n = len(order)
+    frames = Whereabouts(np.zeros(n, np.int8), np.zeros((n, 3)), np.zeros(n, np.int32), order)
+    return judge(scores[order], frames, calibration, Neighborhood(radius=0.0, frames=2))
+
+
+def test_few_strangers_are_recognized_and_all_second_looks() -> None:
+    unknown, known = made_up()
+    made = fit_encoder_calibration(unknown, known, 2, "encoder-default")
+    everywhere = np.arange(N)
+    strangers = [judged(unknown[i], everywhere[np.abs(everywhere - i) > 2], made).verdict for i in range(N)]
+    unknowns = strangers.count("unknown")
+    assert 0.85 * N <= unknowns < N  # the threshold is not higher than it need be
+    # The margin is the smallest lead but for 2 %: of 60 looks the one or two closest become ambiguous.
+    looks = [judged(known[i], everywhere, made).verdict for i in range(N)]
+    assert looks.count("recognized") >= 0.95 * N
+    assert "unknown" not in looks
+    assert 0.35 < made.margin < 0.5
+
+
+def test_frames_that_are_all_alike() -> None:
+    alike = np.ones((12, 12), np.float32)
+    made = fit_encoder_calibration(alike, alike, 2, "encoder-default")
+    assert made.background_deviation > 0
+    assert np.isfinite(made.threshold)
+    assert made.margin == 0.0
+
+
+def test_too_few_frames() -> None:
+    with pytest.raises(ValueError, match="too few"):
+        fit_encoder_calibration(np.ones((3, 3), np.float32), np.ones((3, 3), np.float32), 2, "encoder-default")
+
+
+@pytest.mark.parametrize("shape", [(16, 16, 3), (120, 160, 3)])
+def test_a_second_look_is_another_picture_of_the_same_size(shape: tuple[int, int, int]) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    again = second_look(pixels)
+    assert again.shape == shape
+    assert again.dtype == np.uint8
+    assert again.mean() < pixels.mean()
+
+
+def test_the_curve_is_sure_of_second_looks_and_not_of_strangers() -> None:
+    unknown, known = made_up()
+    made = fit_encoder_calibration(unknown, known, 2, "encoder-default")
+    assert made.curve is not None
+    assert (made.decision, made.frames) == ("leading", N)
+    looks = [judged(known[i], np.arange(N), made).probability for i in range(N)]
+    strangers = [judged(unknown[i], np.flatnonzero(np.abs(np.arange(N) - i) > 2), made).probability for i in range(N)]
+    assert np.median(np.array(looks, float)) > 0.9
+    assert np.median(np.array(strangers, float)) < 0.1

@@ -1,0 +1,214 @@
+"""Search and second stage on a real map with a real encoder; no HTTP."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.errors import NoRegions, UnknownCamera
+from core.frames.images import decode, encode_png
+from core.judgement.verdict import TOP_PLACES
+from core.method.catalogue import EncoderCatalogue
+from core.method.encoder import Encoder, Encoding
+from core.places import PlaceFields, Pose
+from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
+from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
+from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
+from tests.service.scenes import jpeg, scene, seen_again
+
+PLACES = 8
+CANDIDATES = SECOND_STAGE.candidates
+EXAMINED = max(CANDIDATES, 1 + TOP_PLACES)
+"""The best one and enough others to hold it against; all places are places of their own here."""
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
+    folder = tmp_path_factory.mktemp("models")
+    install_two_stage_encoder(folder)
+    return EncoderCatalogue(folder).get(TWO_STAGES)
+
+
+@pytest.fixture(scope="module")
+def seen(encoder: Encoder) -> list[Encoding]:
+    """Of the places p0, p1 …"""
+    return [encoder.encode(scene(seed)) for seed in range(PLACES)]
+
+
+@pytest.fixture(scope="module")
+def query(encoder: Encoder) -> Encoding:
+    """Of the place p3, seen again."""
+    return encoder.encode(seen_again(scene(3)))
+
+
+@pytest.fixture
+def lab(tmp_path: Path, encoder: Encoder, seen: list[Encoding]) -> Iterator[Map]:
+    """A map of all places, ten metres apart, over several segments."""
+    atlas = Atlas(tmp_path, rows_per_segment=3)
+    lab = atlas.create("lab", encoder.identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
+    lab.enrol([enrolment(f"p{i}", encoding) for i, encoding in enumerate(seen)])
+    yield lab
+    atlas.close()
+
+
+def enrolment(place_id: str, encoding: Encoding) -> Enrolment:
+    content = encoding.descriptor.tobytes() + encoding.local.tobytes()
+    return Enrolment(
+        id=place_id,
+        fields=PlaceFields(pose=Pose(x=10 * float(place_id[1:]), y=0)),
+        descriptor=encoding.descriptor,
+        local=encoding.local,
+        regions=len(encoding.regions),
+        digest=hashlib.sha256(content).digest(),
+    )
+
+
+def first_stage(encoder: Encoder, places: list[Encoding], query: Encoding) -> dict[str, float]:
+    """Score by id, of the descriptors alone."""
+    products = np.stack([place.descriptor for place in places]) @ query.descriptor
+    return {f"p{i}": float(score) for i, score in enumerate(encoder.scores_from_inner_products(products))}
+
+
+def both_stages(encoder: Encoder, places: list[Encoding], query: Encoding) -> dict[str, float]:
+    """Score by id, best first: one place after the other."""
+    scores = first_stage(encoder, places, query)
+    for place_id in sorted(scores, key=lambda name: -scores[name])[:EXAMINED]:
+        scores[place_id] += float(encoder.agreement(query.local, places[int(place_id[1:])].local[np.newaxis])[0])
+    return dict(sorted(scores.items(), key=lambda item: -item[1]))
+
+
+def assert_matches(matches: list[tuple[float, str]], expected: dict[str, float]) -> None:
+    assert [place_id for _, place_id in matches] == list(expected)
+    np.testing.assert_allclose([score for score, _ in matches], list(expected.values()), atol=1e-5)
+
+
+def found(lab: Map, encoder: Encoder, query: Encoding, k: int = PLACES) -> list[tuple[float, str]]:
+    (located,) = locate(lab, encoder, [query], k)
+    assert located.search > 0
+    assert located.judgement.score == (located.matches[0][0] if located.matches else None)
+    return [(score, place.id) for score, place in located.matches]
+
+
+def test_the_first_few_gain_and_the_others_do_not(
+    lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding
+) -> None:
+    expected, without = both_stages(encoder, seen, query), first_stage(encoder, seen, query)
+    assert sum(expected[place_id] > without[place_id] for place_id in expected) == EXAMINED
+    assert_matches(found(lab, encoder, query), expected)
+    assert_matches(found(lab, encoder, query, k=2), dict(list(expected.items())[:2]))
+
+
+def test_many_queries_are_answered_as_each_alone(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
+    queries = [encoder.encode(seen_again(scene(seed))) for seed in (1, 5, 6)]
+    for one, located in zip(queries, locate(lab, encoder, queries, PLACES), strict=True):
+        matches = [(score, place.id) for score, place in located.matches]
+        assert_matches(matches, both_stages(encoder, seen, one))
+
+
+def test_what_agrees_cell_by_cell_comes_first_if_it_is_examined(
+    lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding
+) -> None:
+    """The third by its descriptor shows the very cells of the query, the first two show none of them."""
+    order = sorted(first_stage(encoder, seen, query).items(), key=lambda item: -item[1])
+    names = [place_id for place_id, _ in order]
+    places = list(seen)
+    for rank, place_id in enumerate(names):
+        local = query.local if rank in (EXAMINED - 1, EXAMINED) else np.zeros_like(query.local)
+        number = int(place_id[1:])
+        places[number] = replace(seen[number], local=local)
+        assert lab.enrol([enrolment(place_id, places[number])])[0][1] == "replaced"
+    matches = found(lab, encoder, query)
+    assert [place_id for _, place_id in matches] == [names[EXAMINED - 1], *names[: EXAMINED - 1], *names[EXAMINED:]]
+    assert_matches(matches, both_stages(encoder, places, query))
+    (itself,) = encoder.agreement(query.local, query.local[np.newaxis])
+    assert matches[0][0] == pytest.approx(order[EXAMINED - 1][1] + itself, abs=1e-5)
+    assert itself > 0.5 * SECOND_STAGE.share
+
+
+class Late:
+    """A map whose first snapshots are from before its last writes, as a search sees it under which places go."""
+
+    def __init__(self, lab: Map, stale: Snapshot, times: int) -> None:
+        self._lab, self._stale, self.left = lab, stale, times
+
+    def __call__(self) -> Snapshot:
+        self.left -= 1
+        return self._stale if self.left >= 0 else Map.snapshot(self._lab)
+
+
+def test_a_place_deleted_under_the_search_gives_way_to_the_next(
+    lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    best = next(iter(both_stages(encoder, seen, query)))
+    stale = lab.snapshot()
+    lab.forget(best)
+    monkeypatch.setattr(lab, "snapshot", Late(lab, stale, 1))
+    scores = first_stage(encoder, seen, query)
+    left = sorted((name for name in scores if name != best), key=lambda name: -scores[name])
+    # A place that was fourth before is among the first three now, and is examined as they are.
+    for place_id in left[:EXAMINED]:
+        scores[place_id] += float(encoder.agreement(query.local, seen[int(place_id[1:])].local[np.newaxis])[0])
+    expected = {name: scores[name] for name in sorted(left, key=lambda name: -scores[name])}
+    assert_matches(found(lab, encoder, query), expected)
+
+
+def test_a_place_given_another_frame_under_the_search_is_compared_by_that(
+    lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    best = next(iter(both_stages(encoder, seen, query)))
+    stale = lab.snapshot()
+    places = list(seen)
+    places[int(best[1:])] = encoder.encode(scene(77))
+    lab.enrol([enrolment(best, places[int(best[1:])])])
+    monkeypatch.setattr(lab, "snapshot", Late(lab, stale, 1))
+    assert_matches(found(lab, encoder, query), both_stages(encoder, places, query))
+
+
+def test_where_places_go_on_being_deleted_the_others_are_told(
+    lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = both_stages(encoder, seen, query)
+    best = next(iter(expected))
+    stale = lab.snapshot()
+    lab.forget(best)
+    late = Late(lab, stale, ATTEMPTS)
+    monkeypatch.setattr(lab, "snapshot", late)
+    matches = found(lab, encoder, query, k=4)
+    assert late.left == 0
+    assert_matches(matches, {name: expected[name] for name in list(expected)[1:4]})
+
+
+def test_an_empty_map(lab: Map, encoder: Encoder, query: Encoding) -> None:
+    for i in range(PLACES):
+        lab.forget(f"p{i}")
+    assert found(lab, encoder, query) == []
+
+
+def test_a_picture_is_enrolled_and_recognized(lab: Map, encoder: Encoder) -> None:
+    place = enrol(lab, "here", jpeg(40), encoder, PlaceFields(pose=Pose(x=500, y=0), metadata={"floor": 1}))
+    assert place.id == "here" and lab.place("here") == place and lab.count_places() == PLACES + 1
+    answer = recognize(lab, jpeg(40), encoder, k=2)
+    assert answer.matches[0][1] == place and len(answer.matches) == 2
+    assert answer.place == (place if answer.judgement.verdict == "recognized" else None)
+    (located,) = locate(lab, encoder, [encoder.encode(decode(jpeg(40)))], 2)
+    assert located.judgement == answer.judgement and located.matches == answer.matches
+
+
+def test_a_blank_picture_shows_no_place(lab: Map, encoder: Encoder) -> None:
+    blank = encode_png(np.zeros((64, 64, 3), np.uint8))
+    for attempt in (lambda: recognize(lab, blank, encoder), lambda: enrol(lab, "blank", blank, encoder)):
+        with pytest.raises(NoRegions, match="blank"):
+            attempt()
+    assert lab.count_places() == PLACES
+
+
+def test_a_camera_must_be_known(lab: Map, encoder: Encoder) -> None:
+    with pytest.raises(UnknownCamera):
+        recognize(lab, jpeg(40), encoder, camera="rear")
+    with pytest.raises(UnknownCamera):
+        enrol(lab, "here", jpeg(40), encoder, PlaceFields(camera="rear"))

@@ -1,0 +1,28 @@
+"""A map held against itself while it is written to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from core.recognition.self_queries import SelfQueries
+from core.storage import MapSettings
+from tests.service.engines import ENCODER, enrolments, runtime_at
+
+
+def test_a_place_that_is_listed_before_its_row_can_be_read_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    no_encoder: Any = None  # no score is asked for
+    with runtime_at(tmp_path) as runtime:
+        map_ = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
+        map_.enrol(enrolments(0, 5, "l", "monday"))
+        before = map_.snapshot()
+        map_.enrol(enrolments(5, 3, "l", "monday"))
+        assert len(SelfQueries(map_, no_encoder)) == 8
+        # As it is between the commit of places and the snapshot that has them.
+        monkeypatch.setattr(map_, "snapshot", lambda: before)
+        own = SelfQueries(map_, no_encoder)
+        assert [place.id for place in own.places] == [f"l{number}" for number in range(5)]

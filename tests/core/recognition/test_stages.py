@@ -1,0 +1,76 @@
+"""The second stage sees other places than the best one, however many neighbours that has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from core.judgement.verdict import Calibration, judge
+from core.places import Neighborhood, Whereabouts
+from core.recognition.stages import examine
+from tests.core.judgement.test_verdict import in_sequence
+
+SAME = Neighborhood(radius=5.0, frames=60)
+CALIBRATION = Calibration(
+    source="encoder-default", threshold=0.2, margin=0.02, background_mean=0.02, background_deviation=0.01
+)
+
+
+def crowd() -> tuple[NDArray[np.float32], Whereabouts, NDArray[np.float32]]:
+    """Fifty frames of one place, then its twin and other places; first scores falling, and what each would gain."""
+    scores = np.linspace(0.2, 0.1, 60).astype(np.float32)
+    gains = np.full(60, 0.05, np.float32)
+    gains[0], gains[50] = 0.4, 0.48  # the twin is as good
+    return scores, in_sequence(60, [*range(50), *range(1000, 2000, 100)]), gains
+
+
+def test_the_twin_of_a_place_with_many_neighbours_is_examined() -> None:
+    scores, places, gains = crowd()
+    found = examine(scores, places, SAME, 30, lambda rows: gains[rows])
+    assert found.examined.sum() == 35
+    judgement = judge(found.scores, places.take(found.order), CALIBRATION, SAME, found.examined)
+    assert judgement.verdict == "ambiguous"
+    assert judgement.margin is not None and judgement.margin < 0.02
+
+
+def test_without_it_the_answer_could_not_be_ambiguous() -> None:
+    scores, places, gains = crowd()
+    raised = scores.copy()
+    raised[:30] += gains[:30]
+    order = np.argsort(-raised, kind="stable")
+    judgement = judge(raised[order], places.take(order), CALIBRATION, SAME, 30)
+    assert judgement.verdict == "recognized"
+
+
+def test_candidates_that_are_other_places_are_enough() -> None:
+    scores = np.linspace(0.2, 0.1, 60).astype(np.float32)
+    asked: list[int] = []
+
+    def gains(rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        asked.extend(rows.tolist())
+        return np.full(len(rows), 0.1, np.float32)
+
+    found = examine(scores, in_sequence(60), Neighborhood(5.0, 3), 30, gains)
+    assert asked == list(range(30))
+    assert found.order.tolist() == list(range(60))
+    assert found.examined.tolist() == [True] * 30 + [False] * 30
+
+
+@pytest.mark.parametrize("n", [0, 1, 4])
+def test_maps_smaller_than_the_list(n: int) -> None:
+    found = examine(
+        np.linspace(0.2, 0.1, n).astype(np.float32),
+        in_sequence(n),
+        SAME,
+        30,
+        lambda rows: np.zeros(len(rows), np.float32),
+    )
+    assert len(found.order) == n and found.examined.all()
+
+
+def test_without_a_second_stage_nothing_is_examined() -> None:
+    scores, places, gains = crowd()
+    found = examine(scores, places, SAME, 0, lambda rows: gains[rows])
+    assert not found.examined.any()
+    assert np.array_equal(found.scores, scores)

@@ -1,0 +1,232 @@
+"""A moment of a map: whole, the same bytes whatever becomes of the map, in no writer's way."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.storage import Atlas, Map, MapSettings
+from core.storage.archives import exporter
+from core.storage.archives.exporter import Exporter
+from tests.core.storage.archives.files import exported, imported, parts_of
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
+from tests.core.storage.test_opening import flip
+
+
+def listed(map_: Map) -> list[object]:
+    return [map_.places(None, 100), map_.sequences(None, 100), map_.cameras.all(), map_.transfer.sequence_ends()]
+
+
+@pytest.mark.parametrize("precision", ["half", "compressed", "full"])
+def test_what_comes_back_is_what_was_there(
+    atlas: Atlas, tmp_path: Path, precision: str, request: pytest.FixtureRequest
+) -> None:
+    if precision == "half":
+        source = request.getfixturevalue("full")
+    else:
+        shape = (0, 0) if precision == "full" else LOCAL_SHAPE
+        source = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), shape, precision=precision)  # type: ignore[arg-type]
+        source.enrol([frame(f"p{i}", local_shape=shape) for i in range(6)])
+        source.forget("p2")
+    path = tmp_path / "lab.tar"
+    path.write_bytes(exported(source, tmp_path / "kept"))
+    other = Atlas(tmp_path / "other")
+    copy = imported(other, path, "lab", rows_per_segment=3)
+    assert copy.record == source.record and listed(copy) == listed(source)
+    for place in source.places(None, 100)[0]:
+        ours, theirs = (map_.snapshot() for map_ in (source, copy))
+        row, other_row = (np.array(map_.rows_of([place.id])) for map_ in (source, copy))
+        np.testing.assert_array_equal(ours.descriptors_at(row), theirs.descriptors_at(other_row))
+        np.testing.assert_array_equal(ours.locals_at(row), theirs.locals_at(other_row))
+        assert copy.digest(place.id) == source.digest(place.id)
+        assert copy.picture(place.id) == source.picture(place.id)
+    assert copy.verify().ok
+    # Written again it is the same file, to the last bit: nothing was lost, nothing added, no order changed.
+    assert exported(copy, tmp_path / "again") == path.read_bytes()
+    copy.enrol([frame("new", local_shape=copy.record.local_shape)])
+    assert copy.verify().ok
+    other.close()
+
+
+def test_any_range_at_any_time(full: Map, atlas: Atlas, tmp_path: Path) -> None:
+    export = full.exporter.into(tmp_path / "kept")
+    whole = export.read(0, export.size)
+    full.enrol([frame("p1", "another"), *(frame(f"later{i}") for i in range(9))])
+    full.forget("p2")
+    full.cameras.forget("rear")
+    assert export.read(0, 1 << 30) == whole
+    atlas.delete("lab")
+    for start in range(0, export.size, 311):
+        assert export.read(start, 401) == whole[start : start + 401]
+    assert export.read(export.size, 10) == b""
+    _, parts = parts_of(whole)
+    assert b"later" not in parts["places-000001.jsonl"]
+    export.discard()
+    assert not (tmp_path / "kept").exists()
+
+
+def test_rows_of_forgotten_places_are_left_behind(content: bytes) -> None:
+    manifest, parts = parts_of(content)
+    assert manifest["places"] == 9
+    assert stored_of("gone").astype("<f2").tobytes() not in content
+    assert len(parts["descriptors-000001.bin"]) == 9 * (2 * DIMENSION + 15)
+
+
+def test_segments_of_which_nothing_lives_any_more(full: Map, directory: Path, tmp_path: Path) -> None:
+    """Their files go: those that a moment was taken of before are still there for it, later ones do without."""
+    before = full.exporter.into(tmp_path / "before")
+    whole = before.read(0, before.size)
+    for name in ("p0", "p1", "p2"):  # the fourth of the first segment was replaced
+        full.forget(name)
+    full.enrol([frame("next")])
+    assert not (directory / "maps" / "lab" / "descriptors-000001.seg").exists()
+    assert before.read(0, before.size) == whole
+    path = tmp_path / "after.tar"
+    path.write_bytes(exported(full, tmp_path / "after"))
+    other = Atlas(tmp_path / "other")
+    copy = imported(other, path, "lab")
+    assert listed(copy) == listed(full) and copy.verify().ok
+    other.close()
+
+
+def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = exported(full, tmp_path / "whole")
+    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 4)
+    grouped = exported(full, tmp_path / "grouped")
+    manifest, parts = parts_of(grouped)
+    assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 6 + [1] * 3
+    joined = b"".join(data for name, data in parts.items() if name.startswith("descriptors-"))
+    assert joined == parts_of(whole)[1]["descriptors-000001.bin"]
+    path = tmp_path / "grouped.tar"
+    path.write_bytes(grouped)
+    other = Atlas(tmp_path / "other")
+    assert exported(imported(other, path, "lab"), tmp_path / "again") == grouped
+    other.close()
+
+
+def test_enrolment_goes_on_while_it_is_read(full: Map, tmp_path: Path) -> None:
+    """The other thread's write ends while the reading is held up in the middle."""
+    going, done = threading.Event(), threading.Event()
+
+    def enrol() -> None:
+        going.wait(10)
+        full.enrol([frame("meanwhile")])
+        done.set()
+
+    thread = threading.Thread(target=enrol)
+    thread.start()
+
+    def advance(_read: int) -> None:
+        going.set()
+        assert done.wait(10), "a write waits for an export"
+
+    export = full.exporter.into(tmp_path / "kept", advance)
+    thread.join()
+    assert export.manifest.places == 9 and len(full.snapshot()) == 10
+
+
+def test_a_map_that_is_deleted_does_not_wait_for_its_export(
+    full: Map, atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 2)
+    going = threading.Event()
+
+    def delete() -> None:
+        going.wait(10)
+        atlas.delete("lab")
+
+    thread = threading.Thread(target=delete)
+    thread.start()
+
+    def advance(_read: int) -> None:
+        going.set()
+        while full.is_open:
+            threading.Event().wait(0.001)
+
+    with pytest.raises(UnknownMap):
+        full.exporter.into(tmp_path / "kept", advance)
+    thread.join(10)
+    assert not thread.is_alive() and not (tmp_path / "kept").exists()
+
+
+def test_the_state_changes_with_every_write(full: Map) -> None:
+    seen = [full.exporter.state()]
+    for write in (
+        lambda: full.enrol([frame("z")]),
+        lambda: full.forget("z"),
+        lambda: full.cameras.put("rear", None),
+        lambda: full.edit({"description": "other"}),
+    ):
+        write()
+        seen.append(full.exporter.state())
+    assert len(set(map(id, seen))) == len(seen)
+    full.snapshot()
+    assert full.exporter.state() is seen[-1]
+
+
+def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(exporter, "_write_group", refuse)
+    with pytest.raises(StorageFull):
+        full.exporter.into(tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()
+    assert full.verify().ok
+
+
+def test_where_there_are_no_links_files_are_copied(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = exported(full, tmp_path / "linked")
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "link", refuse)
+    assert exported(full, tmp_path / "copied") == content
+
+
+def test_damage_is_found_and_not_exported(full: Map, directory: Path, tmp_path: Path) -> None:
+    export = full.exporter.into(tmp_path / "kept")
+    flip(directory / "maps" / "lab" / "descriptors-000001.seg", 4096 + 3)
+    with pytest.raises(StorageFailure, match="row 0 does not match its checksum"):
+        export.read(0, export.size)
+    with pytest.raises(MapQuarantined, match="row 0"):
+        full.exporter.into(tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, atlas: Atlas, tmp_path: Path) -> None:
+    atlas.close()
+    again = Atlas(directory)
+    found = again.find("lab")
+    assert found.exporter.state() is None
+    assert exported(found, tmp_path / "kept") and isinstance(found.exporter, Exporter)
+    again.close()
+    shutil.rmtree(directory)
+
+
+def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SQLite ends some transactions by itself, when the disk fails."""
+
+    def ended(connection: sqlite3.Connection) -> None:
+        connection.execute("ROLLBACK")
+        raise RuntimeError("the first of it")
+
+    monkeypatch.setattr(exporter, "read_layout", ended)
+    with pytest.raises(RuntimeError, match="the first of it"):
+        full.exporter.into(tmp_path / "kept")
+
+
+def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
+    with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
+        full.exporter.into(tmp_path / "kept")
+    assert not (tmp_path / "kept").exists()

@@ -1,0 +1,102 @@
+"""The commands of the documents, as they are written, against a real service."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+import core.recognition
+from tests.service.server import ROOT, Server
+
+BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+PYTHON = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+WRITTEN_ADDRESS = "http://127.0.0.1:8000"
+"""The address in the documents; the service under test listens on another port."""
+
+# A refusal by the service is an error of the document; curl alone would not see it as one.
+PRELUDE = 'curl() { command curl --fail-with-body --show-error "$@"; }\n'
+
+
+def commands(document: Path) -> str:
+    """All commands of a document; of the README those of the section that is run beside a service."""
+    text = document.read_text()
+    if document == ROOT / "README.md":
+        text = text.partition("\n## Five minutes")[2].partition("\n## ")[0]
+    return "\n".join(BLOCK.findall(text))
+
+
+PAGES = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) if commands(page)]
+OF_KEYS = ROOT / "docs" / "how-to" / "keys-and-tls.md"
+"""After its commands every request needs a key."""
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(ROOT).with_suffix("").as_posix()
+
+
+@pytest.mark.skipif(not hasattr(core.recognition, "recognize"), reason="core.recognition has no recognize yet")
+def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
+    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
+    (program,) = PYTHON.findall((ROOT / "README.md").read_text())
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    assert run([sys.executable, "-c", program], tmp_path, environment).startswith("recognized corridor ")
+
+
+def run(command: Sequence[str | Path], folder: Path, environment: Mapping[str, str]) -> str:
+    """What a command that has to succeed writes to standard output."""
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, f"{done.stderr[-3000:]}\n{done.stdout[-3000:]}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """The service of all pages but that which creates keys."""
+    service = Server(tmp_path_factory.mktemp("shared")).wait()
+    yield service
+    assert service.stop() == 0
+
+
+@pytest.mark.parametrize("document", [page for page in PAGES if page != OF_KEYS], ids=name_of)
+def test_the_commands_run_as_they_are_written(document: Path, shared: Server, tmp_path: Path) -> None:
+    try:
+        run_page(document, shared, tmp_path)
+    finally:
+        for item in shared.client.get("/v1/maps").json()["items"]:
+            shared.client.delete(f"/v1/maps/{item['id']}")
+
+
+def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path) -> None:
+    service = Server(tmp_path / "service").wait()
+    try:
+        run_page(OF_KEYS, service, tmp_path)
+    finally:
+        status = service.stop()
+    assert status == 0
+
+
+def run_page(document: Path, service: Server, folder: Path) -> None:
+    """Run all commands of a document in a folder with the examples and their pictures."""
+    here = folder / "here"
+    here.mkdir()
+    shutil.copytree(ROOT / "examples", here / "examples")
+    (here / ".venv").symlink_to(sys.prefix)
+    run([sys.executable, "examples/make_pictures.py", "pictures"], here, dict(os.environ))
+    root = str(service.client.base_url).rstrip("/")
+    environment = {
+        **os.environ,
+        "url": root,
+        "api": f"{root}/v1",
+        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
+    }
+    script = PRELUDE + commands(document).replace(WRITTEN_ADDRESS, root)
+    run(["bash", "-euxo", "pipefail", "-c", script], here, environment)

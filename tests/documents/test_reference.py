@@ -1,0 +1,26 @@
+"""The pages of docs/reference say what the code says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.documents.reference import FOLDER, PAGES
+from tests.service.server import Server
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_generated_page_is_up_to_date(name: str) -> None:
+    assert (FOLDER / name).read_text() == PAGES[name](), "run scripts/reference"
+
+
+def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
+    service = Server(tmp_path / "service").wait()
+    try:
+        series = re.findall(r"^# TYPE (placerec_\w+)", service.client.get("/metrics").text, re.MULTILINE)
+    finally:
+        assert service.stop() == 0
+    described = set(re.findall(r"`(placerec_\w+)`", (FOLDER / "metrics-and-logs.md").read_text()))
+    assert described == {name for name in series if not name.endswith("_created")}

@@ -1,0 +1,330 @@
+"""Random operations on the storage layer: each a JSON object that follows from the seed and the world before it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import lru_cache
+from random import Random
+from typing import Any
+
+import numpy as np
+
+from core.places import PlaceFields
+from core.storage import Enrolment, MapSettings
+from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
+from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, local_of
+from tests.durability.contents import sha
+from tests.durability.model import MapModel, Refused, Shown, World
+
+Operation = dict[str, Any]
+
+SEQUENCES = (None, None, "monday", "tuesday", "wednesday")
+PICTURES = 400
+LARGEST_MAP = 32
+MAPS = 3
+MASKS = (None, {"polygons": [[[0, 0], [1, 0], [1, 0.2]]]}, {"polygons": [[[0, 0.8], [1, 0.8], [1, 1], [0, 1]]]})
+
+DEFAULTS = MapSettings().model_dump(mode="json")
+
+
+def image_of(picture: str) -> bytes:
+    """The bytes of a picture: a few to some tens of thousands, depending on its name."""
+    length = 1 << (digest_of(picture)[0] % 16)
+    return (f"image of {picture} ".encode() * (1 + length // 12))[:length] + picture.encode()
+
+
+def thumbnail_of(picture: str) -> bytes:
+    """The bytes of its thumbnail."""
+    return f"thumbnail of {picture}".encode()
+
+
+@lru_cache(maxsize=4096)
+def shown(picture: str) -> Shown:
+    """What must be found of a place with this picture."""
+    real = descriptor_of(picture)[np.newaxis]
+    kept: tuple[Precision, ...] = ("full", "half", "compressed")
+    stored = {name: unpack_descriptors(pack_descriptors(real, name), name, DIMENSION) for name in kept}
+    cells = local_of(picture)[np.newaxis]
+    local = {name: unpack_local(pack_local(cells, name), name, LOCAL_SHAPE) for name in kept}
+    return Shown(
+        digest=hashlib.sha256(image_of(picture)).hexdigest(),
+        regions=len(picture),
+        thumbnail=sha(thumbnail_of(picture)),
+        image=sha(image_of(picture)),
+        descriptor={name: sha(vector[0].tobytes()) for name, vector in stored.items()},
+        local={name: sha(found[0].tobytes()) for name, found in local.items()},
+    )
+
+
+def enrolment(place_id: str, picture: str, fields: dict[str, Any]) -> Enrolment:
+    """A picture as it is enrolled; ``"blank"`` has no region."""
+    descriptor = np.zeros(DIMENSION, np.float32) if picture == "blank" else descriptor_of(picture)
+    return Enrolment(
+        place_id,
+        PlaceFields.model_validate(fields),
+        descriptor,
+        len(picture),
+        hashlib.sha256(image_of(picture)).digest(),
+        local_of(picture),
+        thumbnail_of(picture),
+        image_of(picture),
+    )
+
+
+# The model's side
+
+
+def apply(world: World, operation: Operation) -> Any:
+    """Change the world as the operation must; returns what its answer must be.
+
+    Raises:
+        Refused: it must be refused.
+    """
+    return _APPLIED[operation["do"]](world, operation)
+
+
+def _map(world: World, name: str) -> MapModel:
+    if name not in world or not world[name].listed:
+        raise Refused("UnknownMap")
+    return world[name]
+
+
+def _create(world: World, operation: Operation) -> None:
+    if operation["map"] in world:
+        raise Refused("MapExists")
+    settings = {**DEFAULTS, **operation["settings"]}
+    world[operation["map"]] = MapModel(settings, operation["precision"], not operation["unlisted"])
+
+
+def _enrol(world: World, operation: Operation) -> list[str]:
+    map_ = _map(world, operation["map"])
+    if any(item["picture"] == "blank" for item in operation["items"]):
+        raise Refused("NoRegions")
+    return [map_.enrol(item["id"], shown(item["picture"]), item["fields"]) for item in operation["items"]]
+
+
+def _adopt(world: World, operation: Operation) -> None:
+    source, target = _map(world, operation["from"]), world[operation["map"]]
+    for place_id, ordinal in operation["places"]:
+        target.adopt(place_id, source.places[place_id], ordinal)
+
+
+def _camera(world: World, operation: Operation) -> bool:
+    cameras = _map(world, operation["map"]).cameras
+    is_new = operation["name"] not in cameras
+    cameras[operation["name"]] = operation["mask"]
+    return is_new
+
+
+def _forget_camera(world: World, operation: Operation) -> None:
+    cameras = _map(world, operation["map"]).cameras
+    if operation["name"] not in cameras:
+        raise Refused("UnknownCamera")
+    del cameras[operation["name"]]
+
+
+def _forget_many(world: World, operation: Operation) -> int:
+    map_ = _map(world, operation["map"])
+    for place_id in operation["ids"]:
+        map_.forget(place_id)
+    return len(operation["ids"])
+
+
+def _delete(world: World, operation: Operation) -> None:
+    _map(world, operation["map"])
+    del world[operation["map"]]
+
+
+def _publish(world: World, operation: Operation) -> None:
+    if operation["map"] not in world or world[operation["map"]].listed:
+        raise Refused("UnknownMap")
+    world[operation["map"]].listed = True
+
+
+def _abandon(world: World, operation: Operation) -> None:
+    if operation["map"] in world and not world[operation["map"]].listed:
+        del world[operation["map"]]
+
+
+_APPLIED: dict[str, Callable[[World, Operation], Any]] = {
+    "create": _create,
+    "enrol": _enrol,
+    "set": lambda world, o: _map(world, o["map"]).set_fields(o["id"], o["fields"]),
+    "patch": lambda world, o: (_map(world, o["map"]).patch(o["id"], o["changes"]), None)[1],
+    "forget": lambda world, o: _map(world, o["map"]).forget(o["id"]),
+    "forget-sequence": lambda world, o: _map(world, o["map"]).forget_sequence(o["name"]),
+    "forget-many": _forget_many,
+    "edit": lambda world, o: _map(world, o["map"]).edit(o["changes"]),
+    "camera": _camera,
+    "forget-camera": _forget_camera,
+    "adopt": _adopt,
+    "delete": _delete,
+    "publish": _publish,
+    "abandon": _abandon,
+    "look": lambda world, o: None,
+    "reopen": lambda world, o: None,
+}
+
+
+# The choice
+
+
+def chosen(random: Random, world: World, prefix: str) -> Operation:
+    """The next operation of the worker whose maps' ids begin with ``prefix``."""
+    names = [f"{prefix}{number}" for number in range(MAPS)]
+    listed = [name for name in names if name in world and world[name].listed]
+    unlisted = [name for name in names if name in world and not world[name].listed]
+    free = [name for name in names if name not in world]
+    if free and (not listed or random.random() < 0.04):
+        return _new_map(random, random.choice(free), bool(listed) and random.random() < 0.4)
+    if unlisted and random.random() < 0.2:
+        return _with_unlisted(random, world, random.choice(unlisted), listed)
+    if random.random() < 0.01:
+        return {"do": "enrol", "map": free[0] if free else f"{prefix}none", "items": [_item(random, "p0")]}
+    name = random.choice(listed)
+    map_ = world[name]
+    if len(map_.places) > LARGEST_MAP and random.random() < 0.5:
+        return {"do": "delete", "map": name}
+    kinds = ("enrol", "enrol", "enrol", "batch", "batch", "fields", "patch", "forget", "sequence", "many", "edit",
+             "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
+    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 2, 3, 0.7, 4, 0.5)
+    kind = random.choices(kinds, weights)[0]
+    return _CHOSEN[kind](random, world, name, listed) or _batch(random, world, name, listed)
+
+
+def _new_map(random: Random, name: str, unlisted: bool) -> Operation:
+    settings = {
+        "keep": random.choice(["none", "thumbnail", "image"]),
+        "index": random.choice(["auto", "exact", "compact", "inverted"]),
+    }
+    precision = random.choice(["half", "half", "full", "compressed"])
+    return {"do": "create", "map": name, "settings": settings, "precision": precision, "unlisted": unlisted}
+
+
+def _with_unlisted(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    found = random.random()
+    if found < 0.6:
+        return _adopted(random, world, name, listed) or {"do": "publish", "map": name}
+    return {"do": "publish" if found < 0.9 else "abandon", "map": name}
+
+
+def _fields(random: Random) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    if random.random() < 0.6:
+        fields["pose"] = (
+            {"x": random.randrange(100), "y": random.random(), "heading": random.randrange(360)}
+            if random.random() < 0.7
+            else {"latitude": random.uniform(-80, 80), "longitude": random.uniform(-170, 170)}
+        )
+    if (sequence := random.choice(SEQUENCES)) is not None:
+        fields["sequence"] = sequence
+    if random.random() < 0.4:
+        fields["timestamp"] = f"2026-11-{random.randrange(1, 29):02}T10:00:{random.randrange(60):02}Z"
+    if random.random() < 0.2:
+        fields["camera"] = random.choice(["front", "rear"])
+    if random.random() < 0.5:
+        fields["metadata"] = {"floor": random.randrange(9), "note": "ü" * random.choice([0, 3, 20, 3000])}
+    return fields
+
+
+def _item(random: Random, place_id: str) -> dict[str, Any]:
+    return {"id": place_id, "picture": f"picture {random.randrange(PICTURES)}", "fields": _fields(random)}
+
+
+def _new_id(random: Random, map_: MapModel) -> str:
+    known = list(map_.places)
+    return random.choice(known) if known and random.random() < 0.2 else f"p{random.randrange(90)}"
+
+
+def _one(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    return {"do": "enrol", "map": name, "items": [_item(random, _new_id(random, world[name]))]}
+
+
+def _batch(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    items = [_item(random, _new_id(random, world[name])) for _ in range(random.randrange(2, 12))]
+    if random.random() < 0.05:
+        items.append({"id": "p0", "picture": "blank", "fields": {}})
+    return {"do": "enrol", "map": name, "items": items}
+
+
+def _any_id(random: Random, map_: MapModel) -> str:
+    return "nobody" if not map_.places or random.random() < 0.03 else random.choice(list(map_.places))
+
+
+def _fields_of(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    return {"do": "set", "map": name, "id": _any_id(random, world[name]), "fields": _fields(random)}
+
+
+def _patched(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    changes: dict[str, Any] = random.choice([
+        {"sequence": random.choice(["monday", "tuesday", None])},
+        {"pose": {"x": random.randrange(50), "y": 1, "latitude": None, "longitude": None}},
+        {"pose": None},
+        {"metadata": {"floor": None, "door": random.random() < 0.5}},
+        {"metadata": {"long": "x" * random.randrange(12_000)}},
+        {"timestamp": None, "metadata": None},
+    ])  # fmt: skip
+    return {"do": "patch", "map": name, "id": _any_id(random, world[name]), "changes": changes}
+
+
+def _forgotten(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    return {"do": "forget", "map": name, "id": _any_id(random, world[name])}
+
+
+def _sequence(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    return {"do": "forget-sequence", "map": name, "name": random.choice([one for one in SEQUENCES if one])}
+
+
+def _many(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    known = list(world[name].places)
+    return {"do": "forget-many", "map": name, "ids": random.sample(known, min(len(known), random.randrange(1, 6)))}
+
+
+def _edited(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    changes: dict[str, Any] = random.choice([
+        {"description": f"number {random.randrange(1000)}"},
+        {"keep": random.choice(["none", "thumbnail", "image"])},
+        {"same_place_radius": float(random.randrange(9)), "same_place_frames": random.randrange(9)},
+        {"index": random.choice(["exact", "compact", "inverted", "auto"])},
+        {"index": random.choice(["exact", "compact", "inverted"])},
+    ])  # fmt: skip
+    return {"do": "edit", "map": name, "changes": changes}
+
+
+def _cameras(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    camera = random.choice(["front", "rear", "side"])
+    if random.random() < 0.3:
+        return {"do": "forget-camera", "map": name, "name": camera}
+    return {"do": "camera", "map": name, "name": camera, "mask": random.choice(MASKS)}
+
+
+def _adopted(random: Random, world: World, name: str, listed: list[str]) -> Operation | None:
+    """Places of another map with the same precision, so that descriptors are taken over unchanged."""
+    precision = world[name].precision
+    sources = [one for one in listed if one != name and world[one].precision == precision and world[one].places]
+    if not sources or precision == "compressed":
+        return None
+    source = random.choice(sources)
+    known = list(world[source].places)
+    some = random.sample(known, min(len(known), random.randrange(1, 9)))
+    places = [[place_id, random.choice([None, random.randrange(200)])] for place_id in some]
+    return {"do": "adopt", "map": name, "from": source, "places": places}
+
+
+_Chosen = Callable[[Random, World, str, list[str]], Operation | None]
+_CHOSEN: dict[str, _Chosen] = {
+    "enrol": _one,
+    "batch": _batch,
+    "fields": _fields_of,
+    "patch": _patched,
+    "forget": _forgotten,
+    "sequence": _sequence,
+    "many": _many,
+    "edit": _edited,
+    "camera": _cameras,
+    "adopt": _adopted,
+    "delete": lambda random, world, name, listed: {"do": "delete", "map": name},
+    "look": lambda random, world, name, listed: {"do": "look", "map": name},
+    "reopen": lambda random, world, name, listed: {"do": "reopen"},
+}

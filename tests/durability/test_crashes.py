@@ -1,0 +1,70 @@
+"""A little of what ``scripts/soak`` does for hours: storage layer and service killed, and cut off from power."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.durability.model import Lost
+from tests.durability.server.kills import ServerKills
+from tests.durability.server.processes import ServerProcesses
+from tests.durability.storage import kill_points
+from tests.durability.storage.kills import WORKERS, StorageKills
+from tests.durability.storage.power_cuts import power
+from tests.durability.storage.processes import StorageProcesses
+from tests.syscalls import strace
+
+SEED = 1
+
+needs_strace = pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StorageProcesses]:
+    with StorageProcesses(tmp_path_factory.mktemp("processes")) as processes:
+        yield processes
+
+
+def test_storage_killed_at_random_moments_loses_nothing(tmp_path: Path) -> None:
+    with StorageProcesses(tmp_path, WORKERS) as processes:
+        tally = StorageKills(tmp_path, SEED).run(processes, 8)
+    assert tally.kills == 8
+    assert tally.operations > 40
+
+
+@needs_strace
+def test_storage_killed_at_calls_that_write_loses_nothing(tmp_path: Path, processes: StorageProcesses) -> None:
+    every = kill_points.points(processes, tmp_path, SEED)
+    assert len(every) > 300
+    met = [kill_points.kill_at(processes, tmp_path, SEED, point)[0] for point in Random(SEED).sample(every, 4)]
+    assert any(met)
+
+
+@needs_strace
+def test_storage_without_power_loses_nothing_that_was_acknowledged(tmp_path: Path, processes: StorageProcesses) -> None:
+    tally = power(processes, tmp_path, SEED, 20, 12)
+    assert tally.disks == 12
+    assert tally.syncs > 20
+
+
+@needs_strace
+def test_storage_that_does_not_sync_is_found_out(tmp_path: Path) -> None:
+    with StorageProcesses(tmp_path, unsynced="descriptors") as processes, pytest.raises(Lost, match="power cut"):
+        power(processes, tmp_path, SEED, 10, 40)
+
+
+@pytest.fixture(scope="module")
+def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcesses]:
+    with ServerProcesses(tmp_path_factory.mktemp("servers")) as servers:
+        yield servers
+
+
+def test_a_service_killed_while_clients_use_it_loses_nothing(
+    tmp_path: Path, processes: StorageProcesses, servers: ServerProcesses
+) -> None:
+    tally = ServerKills(tmp_path, SEED).run(processes, servers, 2)
+    assert tally.kills == 2
+    assert tally.operations >= 10

@@ -1,0 +1,48 @@
+"""No module runs what it reads: no pickles, no evaluated text, no archives unpacked as they come."""
+
+from __future__ import annotations
+
+import ast
+
+import pytest
+
+from tests.project.sources import FILES, FOLDERS, ROOT, forbidden_imports, syntax_of
+
+PICKLING = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
+
+
+def test_nothing_reads_a_pickle() -> None:
+    assert [line for folder in FOLDERS for line in forbidden_imports(folder, PICKLING | {"torch.load"})] == []
+    calls = []
+    for path in FILES:
+        for node in ast.walk(syntax_of(path)):
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in ("torch.load", "np.lib.format.read_array"):
+                calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")
+            if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
+                calls.append(f"{path.relative_to(ROOT)}:{node.lineno} allow_pickle")
+    assert calls == []
+
+
+RUNNING = {
+    "eval", "exec", "compile", "os.system", "os.popen", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "torch.load",
+    "torch.jit.load", "torch.hub.load", "torch.package.PackageImporter", "cv2.FileStorage", "tarfile.open",
+    "shutil.unpack_archive", "np.lib.format.read_array", "numpy.lib.format.read_array", "pandas.read_pickle",
+    "scipy.io.loadmat", "loadmat", "importlib.import_module", "__import__",
+}  # fmt: skip
+"""Calls by which bytes that were read could run, or be laid out as files."""
+
+
+@pytest.mark.parametrize("folder", ["core", "service", "training"])
+def test_nothing_runs_what_it_reads(folder: str) -> None:
+    """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""
+    calls = []
+    for path in FILES:
+        if not path.is_relative_to(ROOT / folder):
+            continue
+        for node in ast.walk(syntax_of(path)):
+            if isinstance(node, ast.Call):
+                name = ast.unparse(node.func)
+                shell = any(word.arg == "shell" for word in node.keywords)
+                if name in RUNNING or shell or name.endswith((".extractall", ".extract")):
+                    calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}")
+    assert calls == []

@@ -1,0 +1,138 @@
+"""What was answered is counted once, kept small, and lost only as far as is said."""
+
+from __future__ import annotations
+
+import sqlite3
+from datetime import date, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from core.upkeep.drift import Week
+from service.queries import statistics
+from service.queries.statistics import FILE, MOST_WEEKS, SPARE_PLACES, MapKey, QueryStatistics, _Counts
+
+LAB: MapKey = ("lab", "2026-11-20T09:00:00+00:00")
+HALL: MapKey = ("hall", "2026-11-20T09:00:00+00:00")
+
+
+class Maps:
+    """The maps that there are, as the counting sees them."""
+
+    def __init__(self) -> None:
+        self.sizes: dict[MapKey, int] | None = {LAB: 10, HALL: 10}
+        self.present = {f"p{n}" for n in range(10)}
+
+
+@pytest.fixture
+def maps() -> Maps:
+    return Maps()
+
+
+def counting(folder: Path, maps: Maps) -> QueryStatistics:
+    return QueryStatistics(folder, 3600, lambda: maps.sizes, lambda _: maps.present)
+
+
+def test_what_was_counted_is_read_over_a_restart(tmp_path: Path, maps: Maps) -> None:
+    first = counting(tmp_path, maps)
+    assert first.read(LAB).since is None and first.read(LAB).weeks == ()
+    for _ in range(3):
+        first.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    first.observe(LAB, "unknown", "p1", 0.1, 0.2)
+    first.observe(LAB, "unknown", None, None, None)
+    first.observe(HALL, "ambiguous", "p2", 0.4, 1.0)
+    first.close()
+    again = counting(tmp_path, maps)
+    found = again.read(LAB)
+    assert found.since is not None
+    assert {place: (count.best, count.recognized) for place, count in found.places.items()} == {"p1": (4, 3)}
+    (week,) = found.weeks
+    assert (week.queries, week.recognized, week.unknown, week.blank) == (5, 3, 2, 1)
+    assert week.mean_score() == pytest.approx(1.6 / 4) and week.bins[10] == 3 and week.bins[2] == 1
+    again.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    assert again.read(LAB).places["p1"].best == 5
+    again.close()
+
+
+@given(st.lists(st.tuples(st.sampled_from(["p1", "p2", None]), st.booleans()), max_size=40))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
+def test_when_it_is_written_does_not_matter(
+    tmp_path_factory: pytest.TempPathFactory, answers: list[tuple[str | None, bool]]
+) -> None:
+    maps, folder = Maps(), tmp_path_factory.mktemp("counted")
+    counted = counting(folder, maps)
+    for place, flush in answers:
+        counted.observe(LAB, "recognized" if place else "unknown", place, 0.5 if place else None, None)
+        if flush:
+            counted.flush()
+    found = counted.read(LAB)
+    for name in ("p1", "p2"):
+        expected = sum(place == name for place, _ in answers)
+        assert (found.places[name].best if name in found.places else 0) == expected
+    assert sum(week.queries for week in found.weeks) == len(answers)
+    counted.close()
+
+
+def test_a_deleted_map_is_forgotten_and_one_out_of_service_is_not(tmp_path: Path, maps: Maps) -> None:
+    counted = counting(tmp_path, maps)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    counted.flush()
+    maps.sizes = None  # some map is out of service: who knows which ones there are
+    counted.observe(HALL, "recognized", "p1", 0.5, 2.0)
+    assert counted.read(LAB).places
+    maps.sizes = {HALL: 10}
+    counted.observe(HALL, "recognized", "p1", 0.5, 2.0)
+    assert counted.read(LAB).places == {} and counted.read(HALL).places["p1"].best == 2
+    counted.close()
+
+
+def test_places_that_are_gone_are_not_kept_for_ever(tmp_path: Path, maps: Maps) -> None:
+    counted = counting(tmp_path, maps)
+    for n in range(10 + SPARE_PLACES + 5):
+        counted.observe(LAB, "recognized", f"p{n}", 0.5, 2.0)
+    assert set(counted.read(LAB).places) == maps.present
+    counted.close()
+
+
+def test_weeks_are_not_kept_for_ever(tmp_path: Path, maps: Maps) -> None:
+    counted = counting(tmp_path, maps)
+    monday = date(2020, 1, 6)
+    weeks = {m: Week.of(m, "unknown", 0.1, 0.1) for m in (monday + timedelta(weeks=n) for n in range(MOST_WEEKS + 9))}
+    counted._counts[LAB] = _Counts("2020-01-06T00:00:00+00:00", {}, weeks)
+    found = counted.read(LAB).weeks
+    assert [week.monday for week in found] == sorted(weeks)[9:]
+    counted.close()
+
+
+def test_memory_is_bounded_while_the_disk_refuses(tmp_path: Path, maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = counting(tmp_path, maps)
+    counted.flush()
+    monkeypatch.setattr(statistics, "MOST_WAITING", 20)
+
+    def refuse(*_: object) -> None:
+        raise sqlite3.OperationalError("disk I/O error")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(counted, "_write", refuse)
+        for n in range(30):
+            counted.observe(LAB, "recognized", f"p{n % 10}-{n}", 0.5, 2.0)
+            if n % 7 == 0:
+                with pytest.raises(Exception, match="disk"):
+                    counted.flush()
+        assert counted.lost == 10 and len(counted._counts[LAB].places) == 20
+        counted.observe(LAB, "recognized", "p0-0", 0.5, 2.0)  # one that waits already
+    found = counted.read(LAB)
+    assert len(found.places) == 20 and found.places["p0-0"].best == 2
+    assert sum(week.queries for week in found.weeks) == 31, "queries are all counted"
+    counted.close()
+
+
+def test_a_damaged_file_is_put_aside(tmp_path: Path, maps: Maps) -> None:
+    (tmp_path / FILE).write_bytes(b"no database at all" * 100)
+    counted = counting(tmp_path, maps)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    assert counted.read(LAB).places["p1"].best == 1
+    counted.close()
+    assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
