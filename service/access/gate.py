@@ -36,7 +36,7 @@ log = logging.getLogger("placerec.access")
 
 
 @dataclass(frozen=True)
-class Way:
+class Endpoint:
     """One method of one route, and the rule that applies to it."""
 
     method: str
@@ -46,7 +46,7 @@ class Way:
     rule: Rule
 
 
-def ways_of(routes: Iterable[BaseRoute]) -> list[Way]:
+def endpoints_of(routes: Iterable[BaseRoute]) -> list[Endpoint]:
     """Every method of every route of an application, in the order in which the routes are tried.
 
     Raises:
@@ -62,7 +62,7 @@ def ways_of(routes: Iterable[BaseRoute]) -> list[Way]:
             raise TypeError(f"access to {route.original_route!r} is not guarded")
         operation = route.name or ""
         rule = OPERATIONS.get(operation, UNLISTED)
-        found += [Way(method, route.path_format or "", route.path_regex, operation, rule) for method in methods]
+        found += [Endpoint(method, route.path_format or "", route.path_regex, operation, rule) for method in methods]
     return found
 
 
@@ -121,11 +121,11 @@ class Access:
     It sets ``principal`` in the request's state.
     """
 
-    def __init__(self, app: ASGIApp, gate: Gate, ways: list[Way], metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, gate: Gate, endpoints: list[Endpoint], metrics: Metrics) -> None:
         self.app, self.gate, self.metrics = app, gate, metrics
-        self._ways: dict[str, list[Way]] = {}
-        for way in ways:
-            self._ways.setdefault(way.method, []).append(way)
+        self._endpoints: dict[str, list[Endpoint]] = {}
+        for endpoint in endpoints:
+            self._endpoints.setdefault(endpoint.method, []).append(endpoint)
         self._refusals = Refusals()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -136,35 +136,35 @@ class Access:
         state = scope.setdefault("state", {})
         if "request_id" not in state:
             state["request_id"] = request_id(scope["headers"])
-        way, path = self._find(scope)
+        endpoint, path = self._find(scope)
         state["principal"] = NOBODY
         try:
-            self._admit(scope, way, path)
+            self._admit(scope, endpoint, path)
         except Fault as error:
-            await self._refuse(scope, receive, send, error, way, path)
+            await self._refuse(scope, receive, send, error, endpoint, path)
             return
-        asker = asker_of(state["principal"], way.operation if way else "unknown", state, address_of(scope))
+        asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
         ASKER.set(asker)  # also for requests that change nothing: they may start jobs
-        if way is not None and way.rule.changes:
+        if endpoint is not None and endpoint.rule.changes:
             await self._change(scope, receive, send, asker, path)
         else:
             await self.app(scope, receive, send)
 
-    def _find(self, scope: Scope) -> tuple[Way | None, Mapping[str, str]]:
+    def _find(self, scope: Scope) -> tuple[Endpoint | None, Mapping[str, str]]:
         method = scope["method"] if scope["type"] == "http" else WEBSOCKET
         path: str = scope["path"]
         root: str = scope.get("root_path", "")
         if root and path.startswith(root):
             path = path[len(root) :]
-        for way in self._ways.get(method, ()):
-            match = way.pattern.match(path)
+        for endpoint in self._endpoints.get(method, ()):
+            match = endpoint.pattern.match(path)
             if match is not None:
-                return way, match.groupdict()
+                return endpoint, match.groupdict()
         return None, {}
 
-    def _admit(self, scope: Scope, way: Way | None, path: Mapping[str, str]) -> None:
+    def _admit(self, scope: Scope, endpoint: Endpoint | None, path: Mapping[str, str]) -> None:
         state = scope["state"]
-        if way is not None and way.rule.role == "open":
+        if endpoint is not None and endpoint.rule.role == "open":
             with suppress(Fault):  # without a valid key it sees what everybody may see
                 state["principal"] = self.gate.identify(scope)
             return
@@ -172,9 +172,9 @@ class Access:
         if principal is OWNER:
             return
         self.gate.rates.admit(caller_of(scope))
-        if way is None:
+        if endpoint is None:
             return  # the router answers that there is no such path or method
-        rule = way.rule
+        rule = endpoint.rule
         if not covers(principal.role, rule.role):
             raise RoleTooLow(
                 f"The key {principal.name!r} has the role {principal.role}; this operation needs {rule.role}."
@@ -212,12 +212,18 @@ class Access:
             note_change(asker, path, state.get("noted", {}), status)
 
     async def _refuse(
-        self, scope: Scope, receive: Receive, send: Send, error: Fault, way: Way | None, path: Mapping[str, str]
+        self,
+        scope: Scope,
+        receive: Receive,
+        send: Send,
+        error: Fault,
+        endpoint: Endpoint | None,
+        path: Mapping[str, str],
     ) -> None:
         state = scope["state"]
         kind = KINDS[type(error)]
-        scope["route"] = way  # for the log and the metrics
-        asker = asker_of(state["principal"], way.operation if way else "unknown", state, address_of(scope))
+        scope["route"] = endpoint  # for the log and the metrics
+        asker = asker_of(state["principal"], endpoint.operation if endpoint else "unknown", state, address_of(scope))
         self._refusals.note(asker, path, kind.status, kind.slug)
         if scope["type"] == "websocket":
             self.metrics.problems.labels(kind.slug).inc()

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from service.access.audit import audit_file
-from service.access.gate import Access, Gate, warn_if_exposed, ways_of
+from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.access.rates import Rates
@@ -200,7 +200,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     app.state.gate = gate
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
-    app.add_middleware(Access, gate=gate, ways=ways_of(app.routes), metrics=metrics)
+    app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics)
     app.add_middleware(Telemetry, metrics=metrics)
     if chosen.root_path:
         app.add_middleware(Published, root_path=chosen.root_path)  # the outermost is added last

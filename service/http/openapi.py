@@ -142,57 +142,7 @@ def json_patch(changes: type[BaseModel]) -> dict[str, Any]:
     return {"requestBody": {"content": {"application/merge-patch+json": {"schema": schema}}}}
 
 
-def _complete(path: str, operation: dict[str, Any]) -> None:
-    responses = operation["responses"]
-    invalid = responses.get("422", {}).get("content", {}).get("application/json")
-    if invalid is not None:  # the framework's own format of validation errors, which is never sent
-        del responses["422"]["content"]["application/json"]
-        if not responses["422"]["content"]:
-            del responses["422"]
-    rule = OPERATIONS.get(operation["operationId"], UNLISTED)
-    _tell_access(operation, rule)
-    document_problems(responses, _common_problems(path, operation, rule), str)
-    tell_links(operation)
-    responses["default"] = {
-        "description": "Any other problem.",
-        "content": {MEDIA_TYPE: {"schema": {"$ref": COMPONENT + "Problem"}}},
-    }
-    for response in responses.values():
-        response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
-
-
-def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
-    """The application's OpenAPI document; it is made once and kept.
-
-    Args:
-        models: models of bodies that routes parse themselves, which the framework therefore does not find.
-    """
-    if app.openapi_schema is None:
-        made = get_openapi(
-            title=app.title,
-            version=app.version,
-            summary=app.summary,
-            description=app.description,
-            tags=app.openapi_tags,
-            routes=app.routes,
-        )
-        schemas = made["components"]["schemas"]
-        unseen: list[type[BaseModel]] = [Problem, *models]
-        for model in unseen:
-            described = model.model_json_schema(ref_template=COMPONENT + "{model}")
-            schemas.update(described.pop("$defs", {}))
-            schemas[model.__name__] = described
-        made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
-        made["components"]["examples"] = problem_examples()
-        made["components"]["securitySchemes"] = {"key": SECURITY_SCHEME}
-        for unused in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(unused, None)
-        for path, item in made["paths"].items():
-            for operation in item.values():
-                _complete(path, operation)
-        app.openapi_schema = made
-    return app.openapi_schema
-
+# Links (operations that can follow on an answer)
 
 _MAP = {"map": "$request.path.map"}
 _MADE_MAP = {"map": "$response.body#/id"}
@@ -250,3 +200,58 @@ def tell_links(operation: dict[str, Any]) -> None:
         operation["responses"][status]["links"] = {
             target: {"operationId": target, "parameters": parameters} for target, parameters in targets.items()
         }
+
+
+# The whole document
+
+
+def _complete(path: str, operation: dict[str, Any]) -> None:
+    responses = operation["responses"]
+    invalid = responses.get("422", {}).get("content", {}).get("application/json")
+    if invalid is not None:  # the framework's own format of validation errors, which is never sent
+        del responses["422"]["content"]["application/json"]
+        if not responses["422"]["content"]:
+            del responses["422"]
+    rule = OPERATIONS.get(operation["operationId"], UNLISTED)
+    _tell_access(operation, rule)
+    document_problems(responses, _common_problems(path, operation, rule), str)
+    tell_links(operation)
+    responses["default"] = {
+        "description": "Any other problem.",
+        "content": {MEDIA_TYPE: {"schema": {"$ref": COMPONENT + "Problem"}}},
+    }
+    for response in responses.values():
+        response.setdefault("headers", {})["X-Request-Id"] = {"$ref": "#/components/headers/X-Request-Id"}
+
+
+def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, Any]:
+    """The application's OpenAPI document; it is made once and kept.
+
+    Args:
+        models: models of bodies that routes parse themselves, which the framework therefore does not find.
+    """
+    if app.openapi_schema is None:
+        made = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=app.summary,
+            description=app.description,
+            tags=app.openapi_tags,
+            routes=app.routes,
+        )
+        schemas = made["components"]["schemas"]
+        unseen: list[type[BaseModel]] = [Problem, *models]
+        for model in unseen:
+            described = model.model_json_schema(ref_template=COMPONENT + "{model}")
+            schemas.update(described.pop("$defs", {}))
+            schemas[model.__name__] = described
+        made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
+        made["components"]["examples"] = problem_examples()
+        made["components"]["securitySchemes"] = {"key": SECURITY_SCHEME}
+        for unused in ("HTTPValidationError", "ValidationError"):
+            schemas.pop(unused, None)
+        for path, item in made["paths"].items():
+            for operation in item.values():
+                _complete(path, operation)
+        app.openapi_schema = made
+    return app.openapi_schema

@@ -1,4 +1,4 @@
-"""Who is let in: every way in, with every kind of key, in this process and over the wire."""
+"""Access control: every route with every kind of key, in this process and over the network."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from service.access.gate import WEBSOCKET, Way, ways_of
+from service.access.gate import WEBSOCKET, Endpoint, endpoints_of
 from service.access.keys import KeyStore
 from service.access.roles import OPERATIONS, covers
 from service.access.web_origins import is_loopback_host
@@ -36,12 +36,12 @@ def bearer(token: str) -> dict[str, str]:
     return {"Authorization": f"Bearer {token}"}
 
 
-def address(way: Way, **parts: str) -> str:
-    """A path of this way; a part that is not known here is called x."""
-    return re.sub(r"\{(\w+)(:\w+)?\}", lambda found: {**PARTS, **parts}.get(found[1], "x"), way.path)
+def address(endpoint: Endpoint, **parts: str) -> str:
+    """A path of this endpoint; unknown parameters become x."""
+    return re.sub(r"\{(\w+)(:\w+)?\}", lambda found: {**PARTS, **parts}.get(found[1], "x"), endpoint.path)
 
 
-# Every way in, in this process: what is refused never gets to an operation, so nothing needs to run
+# Every endpoint, in this process: a refused request never reaches its operation, so nothing needs to run
 
 
 @pytest.fixture
@@ -72,24 +72,26 @@ class NeverRead(httpx.AsyncByteStream):
 
 
 @pytest.mark.anyio
-async def test_every_way_in_asks_for_the_key_that_its_row_says(guarded: tuple[FastAPI, dict[str, str]]) -> None:
+async def test_every_endpoint_asks_for_the_key_that_its_row_says(guarded: tuple[FastAPI, dict[str, str]]) -> None:
     app, tokens = guarded
     async with asking(app) as client:
-        for way in ways_of(app.routes):
-            if way.method == WEBSOCKET:
+        for endpoint in endpoints_of(app.routes):
+            if endpoint.method == WEBSOCKET:
                 continue  # below, over the wire
-            if way.method == "HEAD":
-                assert (await client.head(address(way))).status_code == 401
+            if endpoint.method == "HEAD":
+                assert (await client.head(address(endpoint))).status_code == 401
                 continue
-            rule = way.rule
-            unread: dict[str, Any] = {} if way.method == "GET" else {"content": NeverRead()}
+            rule = endpoint.rule
+            unread: dict[str, Any] = {} if endpoint.method == "GET" else {"content": NeverRead()}
 
-            async def ask(token: str | None, way: Way = way, body: dict[str, Any] = unread) -> httpx.Response:
+            async def ask(
+                token: str | None, endpoint: Endpoint = endpoint, body: dict[str, Any] = unread
+            ) -> httpx.Response:
                 headers = {} if token is None else bearer(token)
-                return await client.request(way.method, address(way), headers=headers, **body)
+                return await client.request(endpoint.method, address(endpoint), headers=headers, **body)
 
             if rule.role == "open":
-                assert (await ask(None)).status_code != 401, way.operation
+                assert (await ask(None)).status_code != 401, endpoint.operation
                 continue
             refused = assert_problem(await ask(None), 401, "key-needed")
             assert "lab" not in refused["detail"]
@@ -103,9 +105,9 @@ async def test_every_way_in_asks_for_the_key_that_its_row_says(guarded: tuple[Fa
                     assert_problem(await ask(tokens[role]), 403, "role-too-low")
             if rule.maps == "all":
                 assert_problem(await ask(tokens["lab-admin"]), 403, "map-forbidden")
-            elif "{map}" in way.path:
+            elif "{map}" in endpoint.path:
                 there = await client.request(
-                    way.method, address(way, map="yard"), headers=bearer(tokens["lab-admin"]), **unread
+                    endpoint.method, address(endpoint, map="yard"), headers=bearer(tokens["lab-admin"]), **unread
                 )
                 assert_problem(there, 403, "map-forbidden")
 
@@ -161,7 +163,7 @@ async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> 
         await service.request("POST", "/v1/maps", json={"id": "lab"})
 
 
-# Web pages, where there are no keys
+# Web pages, while there are no keys
 
 
 @pytest.mark.parametrize(
@@ -183,7 +185,7 @@ async def test_whoever_opens_the_data_directory_needs_no_key(tmp_path: Path) -> 
         ({"Host": "localhost:8000", "Origin": "http://localhost:3000"}, 403),
     ],
 )
-def test_pages_of_elsewhere_are_refused_without_keys(
+def test_pages_of_other_sites_are_refused_without_keys(
     client: httpx.Client, headers: dict[str, str], status: int
 ) -> None:
     response = client.get("/v1/maps?limit=1", headers=headers)
@@ -194,7 +196,7 @@ def test_pages_of_elsewhere_are_refused_without_keys(
         assert client.get("/livez", headers=headers).status_code == 200
 
 
-def test_a_page_of_elsewhere_gets_no_stream(server: Server, traverse: str) -> None:
+def test_a_page_of_another_site_gets_no_stream(server: Server, traverse: str) -> None:
     there = f"ws://127.0.0.1:{server.port}/v1/maps/{traverse}/sessions/s-0/stream"
     with pytest.raises(InvalidStatus) as refused, connect(there, origin=Origin("http://evil.example")):
         pass

@@ -1,4 +1,4 @@
-"""The table of roles: every way into the application has its row, and every row its way."""
+"""The rules of the operations: every endpoint of the application has a rule, and every rule an endpoint."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from service.access.gate import Way, ways_of
+from service.access.gate import Endpoint, endpoints_of
 from service.access.roles import OPERATIONS, Role, Rule, covers
 from service.app.application import create_app
 from service.settings import Settings
@@ -17,8 +17,8 @@ READING = {"GET", "HEAD"}
 
 
 @pytest.fixture(scope="module")
-def ways() -> list[Way]:
-    return ways_of(create_app(Settings(host="127.0.0.1")).routes)
+def endpoints() -> list[Endpoint]:
+    return endpoints_of(create_app(Settings(host="127.0.0.1")).routes)
 
 
 @pytest.fixture(scope="module")
@@ -26,36 +26,40 @@ def described() -> dict[str, Any]:
     return create_app(Settings(host="127.0.0.1")).openapi()
 
 
-def test_every_route_has_a_row_and_every_row_a_route(ways: list[Way]) -> None:
-    there = {way.operation for way in ways}
+def test_every_route_has_a_row_and_every_row_a_route(endpoints: list[Endpoint]) -> None:
+    there = {endpoint.operation for endpoint in endpoints}
     assert there - set(OPERATIONS) == set(), "a route without a role: say in service/access/roles.py who may use it"
     assert set(OPERATIONS) - there == set(), "a role without a route"
-    assert {"WEBSOCKET", "GET", "POST", "PUT", "PATCH", "DELETE"} <= {way.method for way in ways}
+    assert {"WEBSOCKET", "GET", "POST", "PUT", "PATCH", "DELETE"} <= {endpoint.method for endpoint in endpoints}
 
 
-def test_no_two_operations_have_one_name(ways: list[Way]) -> None:
-    assert len({(way.method, way.path) for way in ways}) == len(ways)
-    paths = {way.operation: way.path for way in ways}
-    assert all(paths[way.operation] == way.path for way in ways), "the second would have the first one's role"
+def test_no_two_operations_have_one_name(endpoints: list[Endpoint]) -> None:
+    assert len({(endpoint.method, endpoint.path) for endpoint in endpoints}) == len(endpoints)
+    paths = {endpoint.operation: endpoint.path for endpoint in endpoints}
+    assert all(paths[endpoint.operation] == endpoint.path for endpoint in endpoints), (
+        "the second would have the first one's role"
+    )
 
 
 def test_what_is_open_to_all_is_named_here_too() -> None:
     assert {operation for operation, rule in OPERATIONS.items() if rule.role == "open"} == OPEN
 
 
-def test_a_route_below_a_map_is_held_to_it(ways: list[Way]) -> None:
-    for way in ways:
-        below = "{map}" in way.path
-        assert (way.rule.maps in ("path", "named")) >= below, f"{way.operation}: the map in its path is not looked at"
-        assert below or way.rule.maps != "path", f"{way.operation}: there is no map in its path"
-    stray = {way.path for way in ways if re.search(r"/maps/[^{]", way.path)}
+def test_a_route_below_a_map_is_held_to_it(endpoints: list[Endpoint]) -> None:
+    for endpoint in endpoints:
+        below = "{map}" in endpoint.path
+        assert (endpoint.rule.maps in ("path", "named")) >= below, (
+            f"{endpoint.operation}: the map in its path is not looked at"
+        )
+        assert below or endpoint.rule.maps != "path", f"{endpoint.operation}: there is no map in its path"
+    stray = {endpoint.path for endpoint in endpoints if re.search(r"/maps/[^{]", endpoint.path)}
     assert stray <= {"/v1/maps/import"}, "a path that looks like a map's"
 
 
-def test_whoever_only_queries_changes_nothing(ways: list[Way]) -> None:
-    for way in ways:
-        if way.rule.changes:
-            assert way.method not in READING and covers(way.rule.role, "enrol"), way.operation
+def test_whoever_only_queries_changes_nothing(endpoints: list[Endpoint]) -> None:
+    for endpoint in endpoints:
+        if endpoint.rule.changes:
+            assert endpoint.method not in READING and covers(endpoint.rule.role, "enrol"), endpoint.operation
 
 
 def test_roles_are_ordered() -> None:
@@ -72,15 +76,15 @@ def test_a_route_that_was_forgotten_needs_the_highest_role() -> None:
     def forgotten() -> None:
         """Nobody wrote down who may use it."""
 
-    (way,) = (way for way in ways_of(app.routes) if way.operation == "forgotten")
-    assert way.rule == Rule("admin", "all", changes=True)
+    (endpoint,) = (endpoint for endpoint in endpoints_of(app.routes) if endpoint.operation == "forgotten")
+    assert endpoint.rule == Rule("admin", "all", changes=True)
 
 
 def test_a_route_of_an_unknown_kind_does_not_slip_through() -> None:
     app = create_app(Settings(host="127.0.0.1"))
     app.mount("/files", create_app(Settings(host="127.0.0.1")))
     with pytest.raises(TypeError, match="not guarded"):
-        ways_of(app.routes)
+        endpoints_of(app.routes)
 
 
 def test_the_interface_says_what_each_operation_needs(described: dict[str, Any]) -> None:
