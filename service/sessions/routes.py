@@ -1,4 +1,4 @@
-"""Sessions: a robot's run as a belief over places, frame by frame."""
+"""Routes of sessions: create, list, read and delete, and send a frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from service.http.dependencies import (
 )
 from service.http.openapi import frame_body
 from service.queries.answers import StatisticsDep
-from service.sessions.frames import session_report, session_view, take_in
+from service.sessions.frames import process_frame, session_report, session_view
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView
 from service.sessions.sessions import Sessions
 from service.telemetry.requests import REQUEST_ID
@@ -138,11 +138,11 @@ async def send_frame(
     A frame that is answered with a problem was not taken in.
     """
     engine.queue.check_room()
-    session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # before the body is read
+    session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # fails before the body is read
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")
     given_id = given if REQUEST_ID.fullmatch(given) else None
-    answer = await take_in(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
+    answer = await process_frame(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "session": session_id, "verdict": answer.verdict}
     return answer

@@ -1,4 +1,4 @@
-"""Sessions: a robot's run, what is believed of it, and what is told beside each frame."""
+"""Sessions, beliefs and the parameters of a frame as JSON."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class NewSession(BaseModel):
         return self
 
     def run_options(self) -> RunOptions:
-        """The same for the belief."""
+        """The options of :class:`core.belief.Run`."""
         return RunOptions(self.filter, Stride(self.advance, self.backwards), self.lag, self.path_frames)
 
 
@@ -148,7 +148,7 @@ class FrameParameters(Parameters):
         return self
 
     def odometry(self) -> Odometry | None:
-        """The motion told; None if none is."""
+        """The odometry of the frame; None if it has none."""
         if self.forward is None:
             return None
         turn, spread = math.radians(self.turn or 0.0), math.radians(self.turn_deviation or 0.0)

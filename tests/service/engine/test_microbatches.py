@@ -364,8 +364,8 @@ def test_a_batch_over_http_shares_forward_passes(server: Server, traverse: str) 
 
 
 def test_bulk_does_not_keep_a_robot_waiting(server: Server, traverse: str, map_id: str, tmp_path: Path) -> None:
-    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(120)]
-    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(120)]
+    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(80)]
+    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(80)]
 
     def enrol() -> tuple[httpx.Response, float]:
         began = time.monotonic()

@@ -173,7 +173,7 @@ def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> No
 
 
 def test_a_server_at_work_is_alive_and_keeps_deadlines(server: Server) -> None:
-    slow = encoded(scene(1, 4000, 4000))
+    slow = encoded(scene(1, 3000, 3000))
     with ThreadPoolExecutor(4) as pool:
         heavy = [pool.submit(server.client.post, "/v1/encode", content=slow, headers=HEADERS) for _ in range(4)]
         slowest, late = 0.0, []

@@ -105,10 +105,6 @@ def files(first: int, count: int) -> dict[str, bytes]:
     return {f"f{number}": SMALL[number] for number in range(first, first + count)}
 
 
-def order(server: Server, map_id: str) -> list[str]:
-    return [item["id"] for item in server.client.get(f"/v1/maps/{map_id}/places?limit=1000").json()["items"]]
-
-
 def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map_id: str) -> None:
     answers: dict[str, httpx.Response] = {}
 
@@ -127,7 +123,7 @@ def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map
     for sender in senders:
         sender.join(60)
     assert {name: answer.status_code for name, answer in answers.items()} == {"a": 200, "b": 200, "c": 200}
-    assert order(server, map_id) == [f"p{number}" for number in range(24)]
+    assert list(server.places(map_id)) == [f"p{number}" for number in range(24)]
 
 
 def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
@@ -138,13 +134,13 @@ def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
     assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
     assert_problem(post(0, {"batch": "a", "encoder": "another"}), 409, "wrong-encoder")
     assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
-    assert order(server, map_id) == []
+    assert list(server.places(map_id)) == []
     # A frame that is bad fails alone: the batch as such is stored.
     places = [*numbered(0, 1), {"id": "bad", "file": "bad"}]
     first = send(server, map_id, places, {"f0": SMALL[0], "bad": b"none"}, params={"batch": "a"})
     assert [item["status"] for item in first.json()["items"]] == [201, 422]
     assert post(2, {"batch": "b", "after": "a"}).status_code == 200
-    assert order(server, map_id) == ["p0", "p2", "p3"]
+    assert list(server.places(map_id)) == ["p0", "p2", "p3"]
     # Sent once more, as after an answer that was lost, it changes nothing.
     again = post(2, {"batch": "b", "after": "a"})
     assert [item["change"] for item in again.json()["items"]] == ["unchanged", "unchanged"]

@@ -141,7 +141,7 @@ async def test_a_task_that_is_cancelled_writes_into_no_other_file(
 @pytest.mark.anyio
 async def test_forms_leave_room_for_the_maps(tmp_path: Path) -> None:
     free = shutil.disk_usage(tmp_path).free
-    with pytest.raises(StorageFull, match="and for the maps"):
+    with pytest.raises(StorageFull, match="beside the maps"):
         await received(Staging(tmp_path, 2 * free, reserve=free + (1 << 30)), body(one=b"1"))
     roomy = Staging(tmp_path, 2 * free, reserve=0)
     with pytest.raises(StorageFull, match="no room for"):

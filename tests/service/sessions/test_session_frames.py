@@ -17,7 +17,7 @@ from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.places.enrolment import FrameToEnrol, enrol
-from service.sessions.frames import take_in
+from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
 from service.sessions.sessions import Session
 from service.settings import Settings
@@ -55,7 +55,7 @@ async def walked(engine: Engine) -> Map:
 async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> SessionAnswer:
     options = FrameParameters(frame=number)
     parts = runtime.engine, runtime.sessions, runtime.statistics
-    return await take_in(*parts, map_, session, jpeg(number), options, deadline(), None)
+    return await process_frame(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
 @pytest.mark.parametrize("kind", ["bayes", "path"])

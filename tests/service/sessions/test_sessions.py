@@ -296,7 +296,7 @@ def test_what_was_charted_for_a_session_goes_with_it(tmp_path: Path) -> None:
         runtime.sessions.create(map_, NewSession())
         for number in range(4):
             runtime.sessions.delete(runtime.sessions.create(map_, NewSession(sequences=[f"s{number}"])))
-        assert len(runtime.sessions._charts) == 1 and runtime.sessions.count() == 1
+        assert len(runtime.sessions._graphs) == 1 and runtime.sessions.count() == 1
         runtime.sessions.close()
 
 
