@@ -130,7 +130,7 @@ class MicroBatches:
         self._robots: deque[QueuedFrame] = deque()
         self._bulk: deque[QueuedFrame] = deque()
         self._passed_over = 0  # batches since the encoder of the first bulk frame was used
-        self._robot_asked = -math.inf  # time.monotonic
+        self._last_robot_frame = -math.inf  # time.monotonic
         self._closed = False
         self._known: set[str] = set()  # identities of encoders that were loaded
         self._has_all = False  # the thread that uses all cores is busy
@@ -171,7 +171,7 @@ class MicroBatches:
                     self._bulk.append(frame)
                 else:
                     self._robots.append(frame)
-                    self._robot_asked = time.monotonic() if frame.from_robot else self._robot_asked
+                    self._last_robot_frame = time.monotonic() if frame.from_robot else self._last_robot_frame
             self._wake()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
@@ -282,7 +282,7 @@ class MicroBatches:
     def _first(self) -> tuple[QueuedFrame, int]:
         """The frame whose encoder is used next, and the largest size of its batch."""
         first = (self._robots or self._bulk)[0]
-        most_bulk = MOST_BULK if time.monotonic() - self._robot_asked < QUIET_SECONDS else MOST_FRAMES
+        most_bulk = MOST_BULK if time.monotonic() - self._last_robot_frame < QUIET_SECONDS else MOST_FRAMES
         if not self._bulk or self._bulk[0].identity == first.identity:
             self._passed_over = 0
             return first, MOST_FRAMES if self._robots else most_bulk

@@ -73,7 +73,7 @@ class Job:
     problem: why the job failed, as a problem object (RFC 9457).
     maps: the ids of the maps that the job uses, with the time at which each was created: a map of the same id that was
         created at another time is another map.
-    asker: who asked for it, as ``service.access.principals.Asker`` has it; for the audit trail.
+    asker: who submitted the job, as ``service.access.principals.Asker`` has it; for the audit trail.
     """
 
     number: int

@@ -28,14 +28,14 @@ _DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
 
 
 class FilterParameters(PlaceDescription):
-    """What is known of the frame: filters of what may be found, or soft priors on it."""
+    """What is known of the place: filters on the places that may be found, or soft priors."""
 
     radius: float | None = Field(
         default=None,
         ge=0,
         le=1e9,
         allow_inf_nan=False,
-        description="Metres: the place is within so many of the position given.",
+        description="Metres: the place lies within this distance of the given position.",
         examples=[25.0],
     )
     heading_tolerance: float | None = Field(
@@ -43,7 +43,7 @@ class FilterParameters(PlaceDescription):
         ge=0,
         le=180,
         allow_inf_nan=False,
-        description="Degrees: the place faces within so many of heading.",
+        description="Degrees: the heading of the place differs by at most this much from `heading`.",
     )
     bbox: str | None = Field(
         default=None,
@@ -54,7 +54,7 @@ class FilterParameters(PlaceDescription):
     sequences: str | None = Field(
         default=None,
         max_length=20_000,
-        description="Names of traverses, one of which has the place: separated by commas, or a JSON array of strings.",
+        description="The place belongs to one of these traverses: names separated by commas, or a JSON array of texts.",
         examples=["monday,tuesday"],
     )
     after: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or later.")
@@ -63,32 +63,33 @@ class FilterParameters(PlaceDescription):
         default=None,
         max_length=100_000,
         description="A JSON object: the place's metadata has these values under these keys, at its top level. Numbers "
-        f"are equal as numbers; texts have at most {LONGEST_INDEXED} characters.",
+        f"are compared as numbers; texts may have at most {LONGEST_INDEXED} characters.",
         examples=['{"floor": 2, "light": "day"}'],
     )
     soft: str | None = Field(
         default=None,
         max_length=200,
-        description=f"Which of {', '.join(KINDS)} are no filters but priors, which weigh the places; with commas.",
+        description=f"Which of {', '.join(KINDS)} are not filters but priors, which weigh the places; separated by "
+        "commas.",
         examples=["position,heading"],
     )
     prior_trust: float | None = Field(
         default=None,
         ge=0,
         lt=1,
-        description=f"How probable it is that what is soft is right; {TRUST} if left out. A place against which it "
-        "speaks loses odds down to 1 - prior_trust of them, never more.",
+        description=f"The probability that the soft parameters are right; {TRUST} if left out. The odds of a place "
+        "that contradicts them are multiplied by at least 1 - prior_trust.",
     )
     exclude_frames: int | None = Field(
-        default=None, ge=0, le=10**9, description="Leave out the last so many places of the frame's own sequence."
+        default=None, ge=0, le=10**9, description="Leave out so many of the last places of the frame's own sequence."
     )
     exclude_seconds: float | None = Field(
         default=None,
         ge=0,
         le=1e9,
         allow_inf_nan=False,
-        description="Leave out the places of the frame's own sequence less than so many seconds from its timestamp, "
-        "and those of it that have no timestamp.",
+        description="Leave out the places of the frame's own sequence that were taken within so many seconds of the "
+        "frame, or that have no timestamp.",
     )
 
     def position(self) -> Pose | None:

@@ -57,13 +57,13 @@ async def query_maps(
     principal: PrincipalDep,
     deadline: DeadlineDep,
 ) -> SeveralAnswer:
-    """Locate one moment's frames in several maps, ranked together by calibrated probability.
+    """Locate the frames of one moment in several maps; the matches are ranked together by calibrated probability.
 
-    A form with several file parts is one query of a rig: its cameras' evidence is added up place by place, so the
-    frames must be of one moment, and a blank one spoils nothing. A map that is damaged, unknown or lacks its encoder is
-    reported beside the others, which answer all the same. `place` is given only with the verdict `recognized`, which
-    needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
-    of another place.
+    A form with several file parts is one query of a rig: the evidence of its cameras is added up place by place, so
+    the frames must be of one moment; blank frames are ignored. A map that is damaged, unknown or lacks its encoder is
+    reported, and the other maps answer all the same. `place` is given only with the verdict `recognized`: the most
+    probable match is recognized in its own map, and no other map has a match of another place that is nearly as
+    probable.
     """
     engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
