@@ -1,4 +1,4 @@
-"""Many frames in one request: one that is bad fails alone."""
+"""Many frames in one request: a bad frame fails alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def send(server: Server, map_id: str, places: object, files: Mapping[str, bytes]
     return server.client.post(f"/v1/maps/{map_id}/places", data={"places": text}, files=parts, **options)
 
 
-def test_good_ones_are_stored_and_bad_ones_named(server: Server, map_id: str) -> None:
+def test_good_frames_are_stored_and_bad_ones_reported(server: Server, map_id: str) -> None:
     places: list[Any] = [
         {"id": "good-1", "file": "a", "x": 1, "y": 2, "heading": 3, "sequence": "s", "metadata": {"n": 1}},
         {"id": "cut", "file": "cut"},
@@ -107,7 +107,7 @@ def test_a_batch_can_be_repeated(server: Server, map_id: str) -> None:
         (json.dumps([{"id": f"p{n}", "file": "a"} for n in range(257)]), 422, "invalid-request"),
     ],
 )
-def test_a_batch_that_makes_no_sense(server: Server, map_id: str, places: str, status: int, slug: str) -> None:
+def test_malformed_batches_are_refused(server: Server, map_id: str, places: str, status: int, slug: str) -> None:
     assert_problem(send(server, map_id, places, {"a": jpeg(1)}), status, slug)
     assert set(server.places(map_id)) == set()
 
@@ -184,7 +184,7 @@ def test_many_queries_at_once(server: Server, traverse: str) -> None:
     assert_item_problem(items[4], 422, "not-an-image")
 
 
-def test_a_batch_of_queries_that_makes_no_sense(server: Server, traverse: str) -> None:
+def test_malformed_batches_of_queries_are_refused(server: Server, traverse: str) -> None:
     path = f"/v1/maps/{traverse}/query:batch"
     assert_problem(server.client.post(path, files={"k": (None, b"3")}), 422, "invalid-request")
     assert_problem(

@@ -43,7 +43,7 @@ def staged(server: Server) -> list[str]:
     return [path.name for path in folder.iterdir()] if folder.is_dir() else []
 
 
-def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> None:
+def test_a_form_becomes_a_job_and_bad_frames_fail_alone(server: Server) -> None:
     server.create_map("bulk", encoder=COARSE)
     listed = [
         {"id": "a", "file": "one", "x": 1, "y": 2, "sequence": "monday"},
@@ -82,7 +82,7 @@ def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> Non
     assert again["result"]["changes"] == {"unchanged": 2}, "the same again changes nothing"
 
 
-def test_what_makes_no_sense_is_refused_and_leaves_nothing(server: Server) -> None:
+def test_malformed_forms_are_refused_and_leave_nothing(server: Server) -> None:
     server.create_map("refusing", encoder=COARSE)
     one = {"one": jpeg(1)}
     assert_problem(sent(server, "refusing", **form(one, [])), 422, "invalid-request")

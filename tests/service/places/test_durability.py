@@ -1,4 +1,4 @@
-"""What was acknowledged is there: after SIGKILL, on a full disk, and by the trace of the system calls."""
+"""Acknowledged writes are kept: after SIGKILL, on a full disk, and by the trace of the system calls."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def check_full_disk(server: Server) -> dict[str, dict[str, Any]]:
     return kept
 
 
-def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path: Path) -> None:
     server = Server(tmp_path, wrapper=LIMITED).wait()
     kept = check_full_disk(server)
     server.kill()
@@ -187,7 +187,7 @@ def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path: Path) -> None
     assert server.stop() == 0
 
 
-def test_a_full_file_system_too(tmp_path: Path, small_disk: Path) -> None:
+def test_a_full_file_system_is_reported_and_nothing_is_half_written(tmp_path: Path, small_disk: Path) -> None:
     server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait()
     kept = check_full_disk(server)
     for name in list(kept)[:2]:
@@ -201,7 +201,7 @@ def test_a_full_file_system_too(tmp_path: Path, small_disk: Path) -> None:
 
 
 @pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
-def test_a_2xx_is_sent_after_all_that_was_written_for_it_is_synced(tmp_path: Path) -> None:
+def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
     trace, folder = tmp_path / "trace", tmp_path.resolve() / "server"
     server = Server(folder, wrapper=strace_arguments(trace)).wait()
     client = server.client

@@ -1,4 +1,4 @@
-"""A frame into a session, within the service: nothing is left of one that fails, nor of a session that was ended."""
+"""Frames of a session without HTTP: one that fails does not count, and a deleted session stays deleted."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> Se
 
 
 @pytest.mark.parametrize("kind", ["bayes", "path"])
-async def test_a_frame_whose_answer_fails_was_not_taken_in(
+async def test_a_frame_whose_answer_fails_does_not_count(
     runtime: Runtime, monkeypatch: pytest.MonkeyPatch, kind: Any
 ) -> None:
     map_ = await walked(runtime.engine)
@@ -89,7 +89,7 @@ async def test_a_frame_whose_answer_fails_was_not_taken_in(
     assert again.candidates[0].probability == pytest.approx(expected.candidates[0].probability, abs=1e-3)
 
 
-async def test_a_session_that_is_ended_during_a_frame_does_not_come_back(runtime: Runtime) -> None:
+async def test_a_session_deleted_during_a_frame_stays_deleted(runtime: Runtime) -> None:
     map_ = await walked(runtime.engine)
     session = runtime.sessions.create(map_, NewSession())
     await send(runtime, map_, session, 0)
