@@ -29,7 +29,7 @@ from service.jobs import routes as jobs
 from service.maps import calibration_routes, camera_routes, transfer_routes
 from service.maps import routes as maps
 from service.places import routes as places
-from service.queries import loop_closure, several_routes
+from service.queries import loop_closure, multi_map_routes
 from service.queries import routes as queries
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
@@ -77,7 +77,7 @@ ROUTERS = (
     camera_routes.router,
     calibration_routes.router,
     loop_closure.router,
-    several_routes.router,
+    multi_map_routes.router,
     sessions.router,
     stream_routes.router,
     queries.explanations,

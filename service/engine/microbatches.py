@@ -55,6 +55,7 @@ log = logging.getLogger("placerec.inference")
 class Encoded:
     """A frame, decoded and encoded.
 
+    encoder: the encoder that has encoded it.
     pixels: uint8 [H, W, 3], BGR.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward`` (its share of the pass), ``regions`` and
         ``vlad``.
@@ -80,13 +81,17 @@ AfterEncoding = Callable[[Sequence[Encoded]], Sequence[object]]
 class QueuedFrame:
     """One frame that waits for the encoder; cancel ``result`` to withdraw it.
 
-    data: the bytes of its file.
+    identity: the identity of the encoder.
+    data: the bytes of the frame's file.
+    mask: the part of the frame that is ignored.
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
     from_robot: whether it is a query, after which the robot will probably send the next one soon.
     after_encoding: is called in the encoder's thread with all frames of the batch that have an equal
         ``after_encoding``, if no other frame would have to wait for it: a search done there needs no change of threads.
         It must be hashable and take only milliseconds.
+    result: the encoded frame, or the error that kept it from being encoded.
+    queued: the ``time.perf_counter`` at which the frame began to wait.
     pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
     """
 

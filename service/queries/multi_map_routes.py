@@ -32,9 +32,9 @@ from service.http.uploads import FORM, check_part, media_type, read_frame, read_
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
+from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
-from service.queries.several import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.statistics import QueryStatistics
 
 router = APIRouter(
