@@ -135,7 +135,7 @@ class FilterParameters(PlaceDescription):
             found["bbox"] = parse_box(self.bbox)
         if self.after is not None or self.before is not None:
             if self.after is not None and self.before is not None and self.after > self.before:
-                raise InvalidRequest("after: it is later than before.")
+                raise InvalidRequest("after: the time is later than that of before.")
             after, before = (None if moment is None else microseconds(moment) for moment in (self.after, self.before))
             found["time"] = Period(after, before)
         return found
@@ -167,7 +167,7 @@ class FilterParameters(PlaceDescription):
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
             if self.prior_trust is not None:
-                raise InvalidRequest("prior_trust: it needs soft, which says what it is the trust in.")
+                raise InvalidRequest("prior_trust: it needs soft, which names the parameters to which it applies.")
             return set()
         names = set(self.soft.split(","))
         if unknown := sorted(names - set(KINDS)):

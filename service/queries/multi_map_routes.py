@@ -79,6 +79,7 @@ async def query_maps(
     recognized = together.best if together.verdict == "recognized" else None
     answers = [_map_answer(request, engine, report) for report in reports]
     for report in reports:
+        # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
         if report is recognized or len(reports) == 1:
             _count_for_health(engine, statistics, report)
     matches = _matches(reports, options.k)
@@ -182,7 +183,7 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
 
 
 def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
-    """Count an answer in the statistics of a map; of several maps only the one that recognized the place is counted."""
+    """Count an answer in the statistics of its map."""
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return

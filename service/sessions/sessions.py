@@ -44,8 +44,8 @@ CLOCKS_DIFFER = 1.0
 """Two clocks that differ by fewer seconds count as equal, so that the reported expiry of a session does not jitter."""
 
 EXPIRED = "No frame came for too long."
-MAP_GONE = "Its map was deleted; the one of that name now is another."
-STATE_LOST = "What it had come to believe was damaged on disk."
+MAP_GONE = "Its map was deleted; the map of that id is another one now."
+STATE_LOST = "Its saved belief was damaged on disk."
 
 log = logging.getLogger("placerec.sessions")
 
