@@ -120,31 +120,31 @@ def queries_from_traverse(
         CalibrationImpossible: the frames have no poses, and ``pairs`` is None.
     """
     members = _members(map_, sequence)
-    asked = members if pairs is None else list(pairs)
-    if strangers := sorted(set(asked) - set(members)):
+    queried = members if pairs is None else list(pairs)
+    if strangers := sorted(set(queried) - set(members)):
         raise UnknownPlace(f"The sequence {sequence[:128]!r} has no place {strangers[0][:128]!r}.")
     rows = _rows_of(map_, snapshot, members + [place for place in (pairs or {}).values() if place is not None])
     own = np.zeros(snapshot.rows, np.bool_)
     own[[rows[place] for place in members]] = True
     near = _SamePlace(snapshot, neighborhood_of(map_))
     if pairs is None:
-        asked = [place for place in asked if snapshot.whereabouts.kind[rows[place]] != NO_POSE]
-        if not asked:
+        queried = [place for place in queried if snapshot.whereabouts.kind[rows[place]] != NO_POSE]
+        if not queried:
             raise CalibrationImpossible(
                 f"The frames of the sequence {sequence[:128]!r} have no poses: state in pairs which places they show."
             )
-    asked = _spread(asked, most)
+    queried = _spread(queried, most)
     nothing = np.zeros(snapshot.rows, np.bool_)
 
     def made() -> Iterator[LabelledQuery]:
-        for place in asked:
+        for place in queried:
             row = rows[place]
             partner = row if pairs is None else (None if (shown := pairs[place]) is None else rows[shown])
             true = nothing if partner is None else near(partner) & ~own
             around = nothing if partner is None else near(partner, GUARD_FACTOR)
             yield LabelledQuery(*_stored(snapshot, row), true, own, around)
 
-    return LabelledQueries(len(asked), made(), snapshot.alive & ~own)
+    return LabelledQueries(len(queried), made(), snapshot.alive & ~own)
 
 
 def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQueries:
@@ -157,17 +157,17 @@ def queries_from_map(map_: Map, snapshot: Snapshot, most: int) -> LabelledQuerie
         most: the largest number of queries; they are spread evenly over the map.
     """
     near = _SamePlace(snapshot, neighborhood_of(map_))
-    asked = _spread(np.flatnonzero(snapshot.alive).tolist(), most)
+    queried = _spread(np.flatnonzero(snapshot.alive).tolist(), most)
 
     def made() -> Iterator[LabelledQuery]:
-        for row in asked:
+        for row in queried:
             same, itself = near(row), np.zeros(snapshot.rows, np.bool_)
             itself[row] = True
             inner = near(row, 0.5)
             absent = inner if (same & ~inner).any() else itself
             yield LabelledQuery(*_stored(snapshot, row), same & ~absent, absent, near(row, GUARD_FACTOR))
 
-    return LabelledQueries(len(asked), made())
+    return LabelledQueries(len(queried), made())
 
 
 def run_trials(

@@ -33,7 +33,7 @@ from service.maps import routes as maps
 from service.maps.schemas import CalibrationOrder
 from service.places import routes as places
 from service.places.parameters import BatchItem
-from service.queries import loop_closure, several_routes
+from service.queries import loop_closure, multi_map_routes
 from service.queries import routes as queries
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
@@ -81,7 +81,7 @@ ROUTERS = (
     camera_routes.router,
     calibration_routes.router,
     loop_closure.router,
-    several_routes.router,
+    multi_map_routes.router,
     sessions.router,
     stream_routes.router,
     queries.explanations,

@@ -56,6 +56,7 @@ log = logging.getLogger("placerec.inference")
 class Encoded:
     """A frame, decoded and encoded.
 
+    encoder: the encoder that has encoded it.
     pixels: uint8 [H, W, 3], BGR.
     milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward`` (its share of the pass), ``regions`` and
         ``vlad``.
@@ -81,13 +82,17 @@ AfterEncoding = Callable[[Sequence[Encoded]], Sequence[object]]
 class QueuedFrame:
     """One frame that waits for the encoder; cancel ``result`` to withdraw it.
 
-    data: the bytes of its file.
+    identity: the identity of the encoder.
+    data: the bytes of the frame's file.
+    mask: the part of the frame that is ignored.
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
     from_robot: whether it is a query, after which the robot will probably send the next one soon.
     after_encoding: is called in the encoder's thread with all frames of the batch that have an equal
         ``after_encoding``, if no other frame would have to wait for it: a search done there needs no change of threads.
         It must be hashable and take only milliseconds.
+    result: the encoded frame, or the error that kept it from being encoded.
+    queued: the ``time.perf_counter`` at which the frame began to wait.
     pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
     """
 
@@ -131,7 +136,7 @@ class MicroBatches:
         self._robots: deque[QueuedFrame] = deque()
         self._bulk: deque[QueuedFrame] = deque()
         self._passed_over = 0  # batches since the encoder of the first bulk frame was used
-        self._robot_asked = -math.inf  # time.monotonic
+        self._last_robot_frame = -math.inf  # time.monotonic
         self._closed = False
         self._known: set[str] = set()  # identities of encoders that were loaded
         self._has_all = False  # the thread that uses all cores is busy
@@ -172,7 +177,7 @@ class MicroBatches:
                     self._bulk.append(frame)
                 else:
                     self._robots.append(frame)
-                    self._robot_asked = time.monotonic() if frame.from_robot else self._robot_asked
+                    self._last_robot_frame = time.monotonic() if frame.from_robot else self._last_robot_frame
             self._wake()
 
     def call(self, work: Callable[[], Result]) -> Future[Result]:
@@ -283,7 +288,7 @@ class MicroBatches:
     def _first(self) -> tuple[QueuedFrame, int]:
         """The frame whose encoder is used next, and the largest size of its batch."""
         first = (self._robots or self._bulk)[0]
-        most_bulk = MOST_BULK if time.monotonic() - self._robot_asked < QUIET_SECONDS else MOST_FRAMES
+        most_bulk = MOST_BULK if time.monotonic() - self._last_robot_frame < QUIET_SECONDS else MOST_FRAMES
         if not self._bulk or self._bulk[0].identity == first.identity:
             self._passed_over = 0
             return first, MOST_FRAMES if self._robots else most_bulk

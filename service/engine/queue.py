@@ -160,7 +160,7 @@ class EncoderQueue:
                 waited: set[asyncio.Future[Any]] = {result, gone}
                 left = max(0.0, deadline.seconds_left())
                 await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
-            # A frame whose encoding has begun cannot be cancelled: the other frames of its batch need the pass.
+            # A frame whose encoding has begun is finished: dropping it would save nothing.
             if not result.done() and frame.result.cancel():
                 raise _gone() if gone is not None and gone.done() else deadline_exceeded()
             encoded = await result

@@ -67,8 +67,7 @@ async def encode(
 ) -> Response:
     """The descriptor of a frame, float32: base64 in JSON, or the bytes alone (`Accept: application/octet-stream`).
 
-    The bytes are little-endian; their encoder and the number of regions stand in the headers
-    `X-Encoder` and `X-Regions`.
+    The bytes are little-endian; the headers `X-Encoder` and `X-Regions` give the encoder and the number of regions.
     """
     engine.queue.check_room()
     frame = await read_frame(request, engine.settings)
@@ -157,8 +156,10 @@ async def regions(
 async def match(
     options: Annotated[MatchParameters, Query()], request: Request, engine: EngineDep, deadline: DeadlineDep
 ) -> Response:
-    """The score of two frames against each other: near 0 for unrelated ones, at most 1, which not even a frame and
-    itself reach where parts of it are plain."""
+    """The score of two frames: near 0 for unrelated frames, and at most 1.
+
+    A frame with plain parts does not reach 1 even against itself.
+    """
     engine.queue.check_room()
     first, second, fields = await read_pair(request, engine.settings)
     options = options.joined(fields)

@@ -23,7 +23,7 @@ class Descriptor(BaseModel):
 
 
 class Layer(BaseModel):
-    """One layer that regions come from."""
+    """A layer of the network from which regions come."""
 
     name: str
     rows: int
@@ -31,7 +31,7 @@ class Layer(BaseModel):
 
 
 class Box(BaseModel):
-    """Pixels of the upright frame; the whole frame is spread over the layer's cells."""
+    """A box in pixels of the upright frame, over which the cells of the layer are spread."""
 
     left: float
     top: float
@@ -56,21 +56,19 @@ class RegionsView(BaseModel):
     width: int
     height: int
     layers: list[Layer]
-    found: int = Field(description="Regions of the frame; the list may be limited.")
+    found: int = Field(description="How many regions the frame has; the list may have fewer.")
     regions: list[Region]
     milliseconds: Milliseconds
 
 
 class MatchScore(BaseModel):
-    """How alike two frames are."""
+    """How similar two frames are."""
 
-    score: float = Field(
-        description="As that of a query's match; with a second stage, as that of one that was examined."
-    )
+    score: float = Field(description="The score of a query's match, after the second stage if the encoder has one.")
     encoder: str
-    regions: dict[str, int] = Field(description="Of each frame; one without regions scores 0.")
+    regions: dict[str, int] = Field(description="How many regions each frame has; without regions the score is 0.")
     explanation: ExplanationView | None = Field(
-        default=None, description="With `explain`: why; a is the query, b the match."
+        default=None, description="With `explain`: the explanation of the score; a is the query, b the match."
     )
     milliseconds: Milliseconds
 

@@ -59,7 +59,7 @@ JobPageQuery = Annotated[JobPageParameters, Query()]
 JobId = Annotated[str, Path(alias="job", max_length=64, description="Id of the job.", examples=["5f0c6a1de2b94c77"])]
 LastEventId = Annotated[
     str | None,
-    Header(max_length=64, description="The id of the last event that was received; the stream goes on behind it."),
+    Header(max_length=64, description="The id of the last event that was received; the stream goes on after it."),
 ]
 Wait = Annotated[
     float,
@@ -71,7 +71,7 @@ Wait = Annotated[
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> JobPage:
-    """List jobs, the newest first; of those that have ended only the latest are kept."""
+    """List jobs, the newest first; only the latest ended jobs are kept."""
     listing: Listing = ["jobs", page.map, page.kind, page.state]
     after = decode_number(listing, page.cursor)
     found = [
@@ -90,7 +90,7 @@ async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) 
 
 @router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
 async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
-    """Read how a job stands. With `wait` the answer comes when it has ended, or when that time is up."""
+    """Read the state of a job. With `wait` the answer comes when the job has ended, or when that time is over."""
     job = _job_for(jobs, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
@@ -106,11 +106,11 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
     response_class=StreamingResponse,
     responses={
         200: {
-            "description": "Server-sent events. Each is named after the state of the job, which is its data; "
-            "its id names that moment. The stream ends with the job.",
+            "description": "Server-sent events. Each is named after the state of the job; its data is the job, and its "
+            "id identifies this version of the job. The stream ends with the job.",
             "content": {EVENT_STREAM: {}},
         },
-        204: {"description": "The job has ended, and its end was received: there is nothing more to come."},
+        204: {"description": "The job has ended, and the client has received its last event."},
         **problem_documentation(UnknownJob, TooManyWatchers),
     },
 )
@@ -119,8 +119,8 @@ async def follow_job(
 ) -> Response:
     """Follow a job by server-sent events.
 
-    Each event tells all there is to know of the job, so that one who comes late, or again with
-    `Last-Event-ID`, misses nothing that still holds.
+    Each event contains the whole job, so a client that connects late, or again with `Last-Event-ID`, misses nothing
+    that still holds.
     """
     job = _job_for(jobs, principal, job_id)
     if job.ended and last_event_id == job.version:
@@ -137,8 +137,8 @@ async def follow_job(
 def cancel_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep) -> JobView:
     """Ask a job to stop.
 
-    One that waits is cancelled at once; one that runs stops where it can and undoes what must not
-    stay half done. Cancelling twice is no error. It needs the role that asking for the job needs.
+    A waiting job is cancelled at once; a running job stops at the next point where it can, and undoes what must not
+    stay half done. Cancelling twice is no error. It needs the same role as submitting the job.
     """
     job = _job_for(jobs, principal, job_id)
     needed = OPERATIONS.get(str(job.asker.get("operation")), UNLISTED).role

@@ -33,28 +33,28 @@ class Progress(BaseModel):
     """How far a job is."""
 
     done: int
-    total: int | None = Field(description="Null as long as it is not known.")
-    message: str = Field(description="What it is at; may be empty.")
+    total: int | None = Field(description="Null while it is not known.")
+    message: str = Field(description="What the job is doing; may be empty.")
 
 
 class JobView(BaseModel):
-    """One piece of long work."""
+    """A job: long work in the background."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [JOB_EXAMPLE]})
 
     id: str
-    kind: str = Field(description="What it does, such as re-encode.")
-    map: str | None = Field(description="The map that it works on.")
+    kind: str = Field(description="What the job does, such as re-encode.")
+    map: str | None = Field(description="The map that the job works on.")
     state: JobState = Field(description="Queued, then running, then succeeded, failed or cancelled.")
     progress: Progress
-    arguments: dict[str, Any] = Field(description="What it was asked for.")
-    cancelling: bool = Field(description="It was asked to stop, which it does where it can.")
-    resumable: bool = Field(description="After a restart of the service it goes on; any other is then failed.")
-    attempt: int = Field(description="How often it was begun.")
-    result: dict[str, Any] | None = Field(description="What it found or did, once it has succeeded.")
-    problem: Problem | None = Field(description="Why it failed.")
+    arguments: dict[str, Any] = Field(description="The arguments with which the job was submitted.")
+    cancelling: bool = Field(description="The job was asked to stop, and stops at the next point where it can.")
+    resumable: bool = Field(description="The job goes on after a restart of the service; otherwise it then fails.")
+    attempt: int = Field(description="How often the job was started.")
+    result: dict[str, Any] | None = Field(description="The result, once the job has succeeded.")
+    problem: Problem | None = Field(description="Why the job failed.")
     created_at: Timestamp
-    started_at: Timestamp | None = Field(description="When it was last begun.")
+    started_at: Timestamp | None = Field(description="When the job was last started.")
     ended_at: Timestamp | None
 
     @classmethod

@@ -58,7 +58,7 @@ async def receive(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, reque
     settings, length = engine.settings, request.headers.get("content-length", "")
     announced = int(length) if length.isdigit() else settings.max_bulk_bytes
     if announced > settings.max_bulk_bytes:
-        raise BodyTooLarge(f"The body has more than {settings.max_bulk_bytes} bytes, which is the limit.")
+        raise BodyTooLarge(f"The body has more than {settings.max_bulk_bytes} bytes, the most that is accepted here.")
     intake_of(request).pass_on(settings.max_bulk_bytes, settings.bulk_timeout)
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]

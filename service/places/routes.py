@@ -115,11 +115,11 @@ async def enrol_place(
     engine: EngineDep,
     deadline: DeadlineDep,
 ) -> EnrolledPlace:
-    """Enrol one frame under an id of the caller's.
+    """Enrol one frame as a place with an id that the caller chooses.
 
     The whole place is replaced: parameters that are left out are cleared. The same bytes are not
     encoded again, so a request can be repeated until it succeeds. The answer comes when the place is
-    on disk and found by every later query.
+    on disk and every later query finds it.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     fields = options.place_fields(engine.settings)
@@ -141,7 +141,7 @@ async def enrol_place(
     response_model_exclude_unset=True,
     openapi_extra=BATCH_BODY,
     responses={
-        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        202: {"model": JobView, "description": "With `background`: the job that enrols the frames."},
         **problem_documentation(*ENROLMENT_PROBLEMS, BatchOutOfOrder, JobQueueFull, StagingFull),
     },
 )
@@ -155,14 +155,14 @@ async def enrol_places(
     batch_order: BatchOrderDep,
     deadline: DeadlineDep,
 ) -> BatchResults | Response:
-    """Enrol many frames in one request; one that is bad fails alone, all others are stored in one commit.
+    """Enrol many frames in one request; a bad frame fails alone, and all others are stored in one commit.
 
     With `background` the request may be as long as a traverse: it is written to disk as it arrives, and answered with
-    `202` and a job once it is there whole. The job stores frames a few at a time, goes on after a restart of the
-    service, and tells what became of them in its result.
+    `202` and a job once it has arrived completely. The job stores a few frames at a time, goes on after a restart of
+    the service, and reports the frames that failed in its result.
 
-    To go on with a traverse that was broken off, name what the places should hold by `sha256` first: only the frames
-    answered with `frame-needed` have to be sent.
+    To go on with a traverse that was interrupted, first send only the `sha256` of each frame: only the frames answered
+    with `frame-needed` have to be sent.
 
     To have the next batch encoded while this one is being stored, name them: `?batch=a`, then `?batch=b&after=a`.
     """
@@ -256,7 +256,7 @@ def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView
     responses=problem_documentation(UnsupportedMediaType, errors.UnknownPlace, errors.InvalidField, errors.StorageFull),
 )
 def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
-    """Edit what is known of a place by a merge patch: `null` clears, what is left out stays."""
+    """Edit the fields of a place by a merge patch: `null` clears a field, and fields that are left out stay."""
     map_ = engine.atlas.get(map_id)
     with engine.writing(map_id):
         if changes.metadata is not None:
@@ -266,7 +266,7 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
 
 @router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
 def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
-    """Forget a place: no later query finds it."""
+    """Delete a place: no later query finds it."""
     engine.atlas.get(map_id).forget(place_id)
 
 
@@ -279,7 +279,7 @@ def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     },
 )
 def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Response:
-    """See a place as the map keeps it."""
+    """The thumbnail of a place, or a thumbnail of the image that the map keeps."""
     picture = engine.atlas.get(map_id).thumbnail(place_id)
     return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})
 
@@ -293,7 +293,7 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
 
 @traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
 def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
-    """Forget all places of a traverse at once."""
+    """Delete all places of a traverse at once."""
     count = engine.atlas.get(map_id).forget_sequence(sequence)
     request.state.noted = {"places": count}
     return ForgottenSequence(name=sequence, places=count)

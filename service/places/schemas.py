@@ -37,7 +37,7 @@ class PlaceView(BaseModel):
     pose: ShownPose | None
     timestamp: Timestamp | None = Field(description="When the frame was taken.")
     sequence: str | None = Field(description="The traverse that it belongs to.")
-    camera: str | None = Field(description="Whose mask was applied to the frame.")
+    camera: str | None = Field(description="The camera whose mask was applied to the frame.")
     metadata: dict[str, Any]
     regions: int = Field(description="Regions of interest found in the frame.")
     picture: Keep = Field(description="What is kept of the frame.")
@@ -92,7 +92,7 @@ class PoseChanges(BaseModel):
 
 
 class PlaceChanges(BaseModel):
-    """A merge patch (RFC 7396) of a place: null clears, what is left out stays."""
+    """A merge patch (RFC 7396) of a place: null clears a field, and fields that are left out stay."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -106,10 +106,10 @@ class PlaceChanges(BaseModel):
 
 
 class BatchResult(BaseModel):
-    """What became of one place of a batch: ``place`` on success, else ``problem``."""
+    """The result for one place of a batch: ``place`` on success, else ``problem``."""
 
-    id: str | None = Field(description="As it was given; null if it was none.")
-    status: int = Field(description="The status that a PUT of it would have had.")
+    id: str | None = Field(description="The id as it was given; null if it was not a text.")
+    status: int = Field(description="The status that a PUT of the place would have had.")
     change: Change | None = None
     place: PlaceView | None = None
     problem: Problem | None = None
@@ -133,4 +133,4 @@ class ForgottenSequence(BaseModel):
     """A deleted traverse."""
 
     name: str
-    places: int = Field(description="Places that were forgotten with it.")
+    places: int = Field(description="How many places were deleted with it.")

@@ -29,14 +29,14 @@ _DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
 
 
 class FilterParameters(PlaceDescription):
-    """What is known of the frame: filters of what may be found, or soft priors on it."""
+    """What is known of the place: filters on the places that may be found, or soft priors."""
 
     radius: float | None = Field(
         default=None,
         ge=0,
         le=1e9,
         allow_inf_nan=False,
-        description="Metres: the place is within so many of the position given.",
+        description="Metres: the place lies within this distance of the given position.",
         examples=[25.0],
     )
     heading_tolerance: float | None = Field(
@@ -44,7 +44,7 @@ class FilterParameters(PlaceDescription):
         ge=0,
         le=180,
         allow_inf_nan=False,
-        description="Degrees: the place faces within so many of heading.",
+        description="Degrees: the heading of the place differs by at most this much from `heading`.",
     )
     bbox: str | None = Field(
         default=None,
@@ -55,7 +55,7 @@ class FilterParameters(PlaceDescription):
     sequences: str | None = Field(
         default=None,
         max_length=20_000,
-        description="Names of traverses, one of which has the place: separated by commas, or a JSON array of strings.",
+        description="The place belongs to one of these traverses: names separated by commas, or a JSON array of texts.",
         examples=["monday,tuesday"],
     )
     after: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or later.")
@@ -64,32 +64,33 @@ class FilterParameters(PlaceDescription):
         default=None,
         max_length=100_000,
         description="A JSON object: the place's metadata has these values under these keys, at its top level. Numbers "
-        f"are equal as numbers; texts have at most {LONGEST_INDEXED} characters.",
+        f"are compared as numbers; texts may have at most {LONGEST_INDEXED} characters.",
         examples=['{"floor": 2, "light": "day"}'],
     )
     soft: str | None = Field(
         default=None,
         max_length=200,
-        description=f"Which of {', '.join(KINDS)} are no filters but priors, which weigh the places; with commas.",
+        description=f"Which of {', '.join(KINDS)} are not filters but priors, which weigh the places; separated by "
+        "commas.",
         examples=["position,heading"],
     )
     prior_trust: float | None = Field(
         default=None,
         ge=0,
         lt=1,
-        description=f"How probable it is that what is soft is right; {TRUST} if left out. A place against which it "
-        "speaks loses odds down to 1 - prior_trust of them, never more.",
+        description=f"The probability that the soft parameters are right; {TRUST} if left out. The odds of a place "
+        "that contradicts them are multiplied by at least 1 - prior_trust.",
     )
     exclude_frames: int | None = Field(
-        default=None, ge=0, le=10**9, description="Leave out the last so many places of the frame's own sequence."
+        default=None, ge=0, le=10**9, description="Leave out so many of the last places of the frame's own sequence."
     )
     exclude_seconds: float | None = Field(
         default=None,
         ge=0,
         le=1e9,
         allow_inf_nan=False,
-        description="Leave out the places of the frame's own sequence less than so many seconds from its timestamp, "
-        "and those of it that have no timestamp.",
+        description="Leave out the places of the frame's own sequence that were taken within so many seconds of the "
+        "frame, or that have no timestamp.",
     )
 
     def position(self) -> Pose | None:
@@ -135,7 +136,7 @@ class FilterParameters(PlaceDescription):
             found["bbox"] = parse_box(self.bbox)
         if self.after is not None or self.before is not None:
             if self.after is not None and self.before is not None and self.after > self.before:
-                raise InvalidRequest("after: it is later than before.")
+                raise InvalidRequest("after: the time is later than that of before.")
             after, before = (None if moment is None else microseconds(moment) for moment in (self.after, self.before))
             found["time"] = Period(after, before)
         return found
@@ -167,7 +168,7 @@ class FilterParameters(PlaceDescription):
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
             if self.prior_trust is not None:
-                raise InvalidRequest("prior_trust: it needs soft, which says what it is the trust in.")
+                raise InvalidRequest("prior_trust: it needs soft, which names the parameters to which it applies.")
             return set()
         names = set(self.soft.split(","))
         if unknown := sorted(names - set(KINDS)):

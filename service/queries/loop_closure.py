@@ -109,7 +109,7 @@ router = APIRouter(
 @router.post(
     "/query:enrol",
     openapi_extra=frame_body(ClosureParameters),
-    responses={201: {"model": ClosureAnswer, "description": "Nobody knew the frame; it is a place now."}},
+    responses={201: {"model": ClosureAnswer, "description": "The frame was unknown and is a new place now."}},
 )
 async def query_or_enrol(
     map_id: MapId,
@@ -122,9 +122,9 @@ async def query_or_enrol(
 ) -> ClosureAnswer:
     """Locate one frame in a map and, if the verdict is `unknown`, enrol it as the place `id`, as one step.
 
-    Of two robots that send the same new place together one enrols it, and the other finds it. A request can be
-    repeated until it succeeds: the same frame under the same id is looked for among the other places, and not enrolled
-    again. `exclude_frames` and `exclude_seconds` keep a robot from finding what it has just enrolled. A frame without
+    If two robots send the same new place at the same time, one enrols it and the other finds it. A request can be
+    repeated until it succeeds: the same frame with the same id is located among the other places, and not enrolled
+    again. `exclude_frames` and `exclude_seconds` keep a robot from finding its own last frames. A frame without
     regions is not enrolled.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)

@@ -34,14 +34,14 @@ class QueryParameters(LocateParameters):
     """The parameters of a query."""
 
     k: Matches = 5
-    explain: bool = Field(default=False, description="Say why the best match scores as it does.")
+    explain: bool = Field(default=False, description="Explain the score of the best match.")
     encoder: EncoderAssertion = None
 
 
 class ClosureParameters(FilterParameters):
     """The parameters of a loop closure; pose, timestamp and sequence are enrolled with the frame."""
 
-    id: str = Field(description="Id of the place to be made.", examples=["p9"])
+    id: str = Field(description="Id of the place that is created if the frame is unknown.", examples=["p9"])
     metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"floor": 2}'])
     k: Matches = 5
     encoder: EncoderAssertion = None
@@ -59,7 +59,7 @@ class MultiMapParameters(LocateParameters):
     cameras: str | None = Field(
         default=None,
         max_length=10_000,
-        description="A JSON object: which camera took the frame in which part of the form.",
+        description="A JSON object with the camera of each part of the form.",
         examples=['{"left": "side-camera"}'],
     )
     k: Matches = 5

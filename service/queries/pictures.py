@@ -130,6 +130,6 @@ class ExplanationPictures:
             until, picture = self._kept.get((key, name), (0.0, b""))
         if time.monotonic() > until:
             raise UnknownExplanation(
-                f"There is no picture {name[:40]!r}; the last {KEPT} are kept for {SECONDS / 60:.0f} minutes."
+                f"There is no picture {name[:40]!r}; the latest {KEPT} are kept for {SECONDS / 60:.0f} minutes."
             )
         return picture

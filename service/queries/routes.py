@@ -71,8 +71,8 @@ async def query(
 ) -> QueryAnswer:
     """Locate one frame in a map.
 
-    `place` is given only with the verdict `recognized`; `matches` lists the best places whatever the
-    verdict. A place that nobody enrolled is `unknown`, which is an answer and no error.
+    `place` is given only with the verdict `recognized`; `matches` lists the best places with any
+    verdict. A place that was never enrolled is `unknown`, which is an answer and no error.
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
@@ -89,7 +89,7 @@ async def query(
 @router.post(
     "/query:batch",
     response_model_exclude_unset=True,
-    openapi_extra=form_body("The frames, each a file part under a name of its own.", {}, []),
+    openapi_extra=form_body("The frames, each a file part with a name of its own.", {}, []),
 )
 async def query_batch(
     map_id: MapId,
@@ -99,7 +99,7 @@ async def query_batch(
     statistics: StatisticsDep,
     deadline: DeadlineDep,
 ) -> BatchAnswers:
-    """Locate many frames in a map; one that is bad fails alone."""
+    """Locate many frames in a map; a bad frame fails alone."""
     engine.queue.check_room()
     map_ = await engine.map(map_id)
     files, fields = split_form(await read_many(request, engine.settings))
@@ -145,13 +145,17 @@ async def query_batch(
 )
 def see_explanation(
     map_id: MapId,
-    name: Annotated[str, Path(alias="explanation", max_length=64, description="As the answer to the query named it.")],
+    name: Annotated[
+        str, Path(alias="explanation", max_length=64, description="Name of the picture, from the answer to the query.")
+    ],
     engine: EngineDep,
     pictures: PicturesDep,
 ) -> Response:
-    """See a query beside its best match: cells (or regions) that answer each other are joined by lines.
+    """Fetch the picture of an explanation: the query beside its best match, with lines between matching cells.
 
-    `picture` in the explanation of a query is the path; the last pictures can be fetched for some minutes.
+    Without a second stage the lines join matching regions.
+
+    `picture` in the explanation of a query is the path; the latest pictures can be fetched for some minutes.
     """
     picture = pictures.fetch(map_key(engine.atlas.find(map_id)), name)
     return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

@@ -13,7 +13,7 @@ from service.places.schemas import PLACE_EXAMPLE, PlaceView
 
 
 class RelativeBox(BaseModel):
-    """Shares of the upright frame's width and height."""
+    """A box in shares of the upright frame's width and height."""
 
     left: float
     top: float
@@ -22,23 +22,23 @@ class RelativeBox(BaseModel):
 
 
 class ExplainedRegion(BaseModel):
-    """A region of interest and what it carries."""
+    """A region of interest and its share in the score."""
 
     layer: str
     word: int = Field(description="The word of the vocabulary that it was assigned to.")
     box: RelativeBox
-    loss: float = Field(description="What the score would lose without it.")
+    loss: float = Field(description="By how much the score would be lower without the region.")
 
 
 class RegionPair(BaseModel):
-    """Two regions of one word that are each other's nearest; positions in the two lists."""
+    """Two regions of one word that are each other's nearest neighbours: their positions in the two lists."""
 
     query: int
     match: int
 
 
 class CellPair(BaseModel):
-    """Two cells that choose each other; row and column of each in `grid`."""
+    """Two cells that are each other's best match: row and column of each in `grid`."""
 
     query: tuple[int, int]
     match: tuple[int, int]
@@ -46,16 +46,16 @@ class CellPair(BaseModel):
 
 
 class ExplanationView(BaseModel):
-    """The score, taken apart: the sum of `words` and of the gains of all `cells`."""
+    """The parts of a score, which is the sum of `words` and of the gains of all `cells`."""
 
     score: float
     words: list[float] = Field(description="What each word of the vocabulary adds (j_u, as it counts in the score).")
-    query_regions: list[ExplainedRegion] = Field(description="Those that carry most, the most important first.")
+    query_regions: list[ExplainedRegion] = Field(description="The regions with the largest loss, largest first.")
     match_regions: list[ExplainedRegion] | None = Field(
-        description="The same of the other frame; null where no picture of it is kept."
+        description="The same for the other frame; null if the map keeps no picture of it."
     )
-    regions: list[RegionPair] = Field(description="Which region answers to which, among those listed.")
-    cells: list[CellPair] = Field(description="Which cell answers to which; empty without a second stage.")
+    regions: list[RegionPair] = Field(description="The matching regions among those listed.")
+    cells: list[CellPair] = Field(description="The matching cells; empty without a second stage.")
     grid: tuple[int, int] = Field(description="Rows and columns of the cells; (0, 0) without a second stage.")
 
 
@@ -64,11 +64,12 @@ class MatchExplanation(ExplanationView):
 
     place: str = Field(description="Id of the best match.")
     match_picture: str = Field(
-        description="From what the regions of the match were found again: image, thumbnail (which is smaller than "
-        "the frame that was enrolled, so they may differ a little), or none."
+        description="The picture from which the regions of the match were extracted again: image, thumbnail (which is "
+        "smaller than the enrolled frame, so they may differ a little), or none."
     )
     picture: str | None = Field(
-        description="Path of a PNG with both frames side by side, for some minutes; null where none is kept."
+        description="Path of a PNG with both frames side by side, valid for some minutes; null if the map keeps no "
+        "picture of the match."
     )
 
 
@@ -78,13 +79,13 @@ class Match(BaseModel):
     rank: int
     score: float = Field(
         description="J / V, or the cosine of descriptors that are normalized as a whole. If the encoder has a "
-        "second stage (`agreement` of its definition), that counts by 1 - `share`, and to the scores of the best "
-        "`candidates` by it is added `share` times how far their cells agree with the frame's."
+        "second stage (`agreement` in its definition), this is weighted by 1 - `share`, and `share` times the "
+        "agreement of cells is added to the scores of the best `candidates`."
     )
     weight: float | None = Field(
         default=None,
-        description="How much what is soft speaks for the place, over 0 and at most 1: the odds of the match are "
-        "multiplied by it, and the matches stand in the order that this gives. Null without anything soft.",
+        description="The weight of the priors, over 0 and at most 1: the odds of the match are multiplied by it, and "
+        "the matches are ordered by the result. Null without soft parameters.",
     )
     place: PlaceView
 
@@ -107,7 +108,7 @@ class EstimatedPose(BaseModel):
         "distance from the best match to its nearest neighbour."
     )
     heading_spread: float | None = Field(description="Degrees; null where fewer than two of the places have a heading.")
-    places: int = Field(description="How many places it rests on.")
+    places: int = Field(description="How many places the estimate rests on.")
 
     @model_serializer(mode="wrap")
     def _one_frame(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -120,7 +121,7 @@ Reason = Literal["no-regions", "empty-map", "no-place-allowed"]
 
 
 class QueryAnswer(BaseModel):
-    """Where a frame was taken, or that it is not known."""
+    """Where a frame was taken, or that this is not known."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -154,33 +155,34 @@ class QueryAnswer(BaseModel):
     verdict: Verdict
     place: PlaceView | None = Field(description="Non-null only if recognized.")
     probability: float | None = Field(
-        description="That the best match is right, calibrated on frames with known truth; null where there is no "
-        "match, or the calibration cannot tell."
+        description="The probability that the best match is right, calibrated on frames with known truth; null if "
+        "there is no match, or if the calibration gives no probabilities."
     )
-    pose: EstimatedPose | None = Field(description="Null unless recognized, and if the place has no pose.")
-    score: float | None = Field(description="Score of the best match (see its `score`); null where there is none.")
+    pose: EstimatedPose | None = Field(description="Null unless recognized, or if the place has no pose.")
+    score: float | None = Field(description="Score of the best match (see its `score`); null if there is none.")
     margin: float | None = Field(description="Best score minus that of the best rival; null without a rival.")
     decision: float | None = Field(
-        description="By how much the best match stands out of the rest of the map: in standard deviations of the other "
-        "scores or, if the encoder has a second stage, the geometric mean of its score and its lead."
+        description="By how much the best match stands out from the rest of the map: in standard deviations of the "
+        "other scores or, if the encoder has a second stage, the geometric mean of its score and its lead."
     )
-    threshold: float = Field(description="Least decision value that is believed.")
-    reason: Reason | None = Field(default=None, description="Why there is nothing to compare, if so.")
+    threshold: float = Field(description="The least decision value at which the best match can be recognized.")
+    reason: Reason | None = Field(default=None, description="Why there are no matches, if so.")
     matches: list[Match]
     explanation: MatchExplanation | None = Field(
-        default=None, description="With `explain`: why the best match scores as it does."
+        default=None, description="With `explain`: the explanation of the best match's score."
     )
     encoder: str
     milliseconds: Milliseconds
 
 
 class ClosureAnswer(QueryAnswer):
-    """Where a frame was taken, and the place that it became if nobody knew it."""
+    """Where a frame was taken, and the new place if it was unknown."""
 
     change: Literal["created", "unchanged"] | None = Field(
-        description="created: it was enrolled; unchanged: it had been, by the same request; null: it was not."
+        description="created: the frame was enrolled; unchanged: an earlier, equal request had enrolled it; null: it "
+        "was not enrolled."
     )
-    enrolled: PlaceView | None = Field(description="The frame's own place; null if it was not enrolled.")
+    enrolled: PlaceView | None = Field(description="The frame's own place; null if the frame was not enrolled.")
 
 
 class BatchAnswer(BaseModel):
@@ -206,21 +208,21 @@ class MapMatch(BaseModel):
     rank: int
     map: str = Field(description="The map of the place.")
     probability: float | None = Field(
-        description="That the match is right, each map's by its own calibration and before the maps are weighed "
-        "against each other; the matches stand in its order. Null where the map's calibration cannot tell: such "
-        "matches are ranked by how far their decision value is beyond the threshold."
+        description="The probability that the match is right, by its map's calibration and before the maps are weighed "
+        "against each other; the matches are ordered by it. Null if the map's calibration gives no probabilities: such "
+        "matches are ranked by how far their decision value exceeds the threshold."
     )
-    score: float = Field(description="In units of the map's encoder; not to be compared between maps.")
-    weight: float | None = Field(default=None, description="As in the answer of one map.")
+    score: float = Field(description="The score by the map's encoder; scores of different maps cannot be compared.")
+    weight: float | None = Field(default=None, description="See the answer of a single map.")
     place: PlaceView
 
 
 class MapAnswer(BaseModel):
-    """What became of one map: its own verdict, or the problem that kept it from answering."""
+    """The answer of one map: its own verdict, or the problem that kept it from answering."""
 
     map: str
-    status: int = Field(description="The status that a query to this map alone would have had.")
-    verdict: Verdict | None = Field(default=None, description="The map's own, without regard to the others.")
+    status: int = Field(description="The status that a query of this map alone would have had.")
+    verdict: Verdict | None = Field(default=None, description="The map's own verdict, regardless of the other maps.")
     probability: float | None = None
     score: float | None = None
     margin: float | None = None
@@ -232,19 +234,19 @@ class MapAnswer(BaseModel):
 
 
 class FrameReport(BaseModel):
-    """What became of one frame."""
+    """The status of one frame."""
 
     frame: str = Field(description="Name of the form's part; `image` for a raw body.")
-    camera: str | None = Field(description="Whose mask was applied.")
-    status: int = Field(description="200, or the status of its problem.")
+    camera: str | None = Field(description="The camera whose mask was applied.")
+    status: int = Field(description="200, or the status of the frame's problem.")
     regions: int | None = Field(
-        default=None, description="Regions of interest found in it; 0: it is blank, and says nothing."
+        default=None, description="How many regions of interest the frame has; a blank frame has 0 and is ignored."
     )
     problem: Problem | None = None
 
 
 class SeveralAnswer(BaseModel):
-    """Where the frames were taken, and in which map, or that it is not known."""
+    """Where the frames were taken, and in which map, or that this is not known."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -268,10 +270,11 @@ class SeveralAnswer(BaseModel):
     map: str | None = Field(description="The map of the place; non-null only if recognized.")
     place: PlaceView | None = Field(description="Non-null only if recognized.")
     probability: float | None = Field(
-        description="That the best match is right, weighed against the other maps' best, for at most one can be."
+        description="The probability that the best match is right, given the best matches of the other maps, of which "
+        "at most one can be right."
     )
     pose: EstimatedPose | None = Field(description="In the frame of the map; null unless recognized.")
     matches: list[MapMatch]
-    maps: list[MapAnswer] = Field(description="In the order in which they were named, or by id.")
+    maps: list[MapAnswer] = Field(description="In the order in which the maps were named, or by id.")
     frames: list[FrameReport]
     milliseconds: Milliseconds

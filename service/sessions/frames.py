@@ -1,4 +1,4 @@
-"""One frame into a session: encode, locate alone, move the belief on, tell both; over HTTP and over a WebSocket."""
+"""One frame of a session: it is encoded and located alone, the belief is updated, and both are answered."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from service.sessions.sessions import Session, Sessions, alive_rows
 from service.worker_threads import in_thread
 
 
-async def take_in(
+async def process_frame(
     engine: Engine,
     sessions: Sessions,
     statistics: QueryStatistics,
@@ -43,17 +43,21 @@ async def take_in(
     deadline: RequestDeadline,
     request_id: str | None,
 ) -> SessionAnswer:
-    """Answer one frame of a session, in its turn.
+    """Process one frame of a session, after the frames that came before it.
 
-    A frame that raises was not taken in, and the session goes on as if it had not come.
+    If an error is raised, the frame does not count: the session goes on as if the frame had not come.
 
     Args:
-        request_id: that the caller gave; a frame without a number that comes again under it is the same frame.
+        data: the bytes of a JPEG, PNG or WebP file.
+        request_id: the id that the client gave the request; a frame without a number that comes again with the same
+            id is the same frame.
 
     Raises:
-        FrameOutOfOrder: a later frame was taken in already.
-        InvalidRequest: the session needs what the frame does not tell, or cannot use what it tells.
-        QueueFull, DeadlineExceeded, ClientGone, InvalidImage and others: as for a query.
+        FrameOutOfOrder: a later frame was processed already.
+        InvalidRequest: the frame lacks a parameter that the session needs, or has one that it cannot use.
+        WrongEncoder: the map is bound to another encoder than ``options.encoder``.
+        UnknownSession, SessionExpired: the session ended while the frame waited.
+        Others: see ``Engine.recognize``.
     """
     began = time.monotonic()
     engine.assert_encoder(map_, options.encoder)
@@ -67,44 +71,48 @@ async def take_in(
         single = counted_answer(engine, statistics, map_, recognized)
         try:
             return await in_thread(
-                _advanced, sessions, map_, session, run, recognized.answer, single, options, request_id, began
+                _advance, sessions, map_, session, run, recognized.answer, single, options, request_id, began
             )
         except Exception:
-            session.run = None  # it is taken up again as it was written down after the frame before
+            session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
 
 
 def _found_run(sessions: Sessions, map_: Map, session: Session) -> Run:
-    """The run of a session, which may have been deleted while this frame waited."""
+    """The run of a session; raises if the session was deleted while this frame waited."""
     sessions.find(map_, session.id)
     return sessions.run(map_, session)
 
 
 def _check_options(session: Session, options: FrameParameters) -> None:
     if session.options.speed_limit is not None and options.timestamp is None:
-        raise InvalidRequest("timestamp: the session has a speed limit, so each frame needs one.")
+        raise InvalidRequest("timestamp: the session has a speed limit, so every frame needs a timestamp.")
     if session.options.filter == "path" and options.forward is not None:
-        raise InvalidRequest("forward: the filter path knows no odometry.")
+        raise InvalidRequest("forward: the filter path does not use odometry.")
 
 
 def _repeated(session: Session, options: FrameParameters, request_id: str | None) -> SessionAnswer | None:
-    """The answer that was given already, if this frame is the last one sent again."""
+    """The stored answer if this frame is the last frame sent again, else None.
+
+    Raises:
+        FrameOutOfOrder: the frame comes before the last one.
+    """
     number, last = options.frame, session.number
     again = number == last if number is not None and last is not None else False
     if number is None and request_id is not None:
         again = request_id == session.request
     if again:
         if session.answer is None:
-            raise FrameOutOfOrder("The frame was taken in already; its answer is not kept any more.")
+            raise FrameOutOfOrder("The frame was processed already; its answer is not kept any more.")
         return SessionAnswer.model_validate_json(session.answer).model_copy(update={"repeated": True})
     if number is not None and last is not None and number < last:
         raise FrameOutOfOrder(f"Frame {number} comes after frame {last}.")
     if options.timestamp is not None and session.moment is not None and options.timestamp.timestamp() < session.moment:
-        raise FrameOutOfOrder("The frame was taken before the last one that came.")
+        raise FrameOutOfOrder("The frame was taken before the last frame that arrived.")
     return None
 
 
-def _advanced(
+def _advance(
     sessions: Sessions,
     map_: Map,
     session: Session,
@@ -115,7 +123,7 @@ def _advanced(
     request_id: str | None,
     began: float,
 ) -> SessionAnswer:
-    """Move the belief on, write it down, and tell it."""
+    """Update the belief, save the session, and answer."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
     run.advance(_evidence(map_, answered), step)
@@ -146,7 +154,7 @@ def _advanced(
     )
     believed = 1e3 * (time.perf_counter() - started)
     answer.milliseconds = rounded({"belief": believed, "total": 1e3 * (time.monotonic() - began)})
-    # Not before all that may fail is done: a frame that raises was not taken in.
+    # The session changes only here, after everything that may fail: a frame that raises does not count.
     session.answer, session.lost = answer.model_dump_json(), lost
     session.request = request_id
     session.touch()
@@ -160,7 +168,7 @@ def _advanced(
 
 
 def _step(session: Session, run: Run, options: FrameParameters) -> tuple[Step, Motion]:
-    """The motion since the last frame, and what tells it."""
+    """The robot's motion since the last frame, and what it is known from."""
     if not run.frames:
         return Step(), "first"
     frames = 1
@@ -195,10 +203,10 @@ def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]
 
 
 def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
-    """An estimate as callers see it; a place deleted in this very moment is not told."""
+    """The JSON view of an estimate; places that were deleted in the meantime are left out."""
     candidates = _believed(map_, found.candidates)
-    told = bool(candidates) and found.candidates[0].probability == candidates[0].probability
-    verdict = "ambiguous" if found.verdict == "recognized" and not told else found.verdict
+    has_best = bool(candidates) and found.candidates[0].probability == candidates[0].probability
+    verdict = "ambiguous" if found.verdict == "recognized" and not has_best else found.verdict
     return BeliefView(
         verdict=verdict,
         place=candidates[0].place if verdict == "recognized" else None,
@@ -210,7 +218,7 @@ def belief_view(map_: Map, run: Run, found: Estimate) -> BeliefView:
 
 
 def session_view(session: Session, frames: int) -> SessionView:
-    """A session as it is listed."""
+    """The JSON view of a session, as it is listed."""
     options = session.options.model_dump()
     return SessionView(
         **{**options, "expires_after": session.expires_after},
@@ -226,7 +234,7 @@ def session_view(session: Session, frames: int) -> SessionView:
 
 
 def session_report(sessions: Sessions, map_: Map, session: Session, k: int = 5) -> SessionReport:
-    """A session and what is believed now; call it in the session's turn, in a thread."""
+    """The JSON view of a session with its present belief; call it in the session's turn, in a thread."""
     run = sessions.run(map_, session)
     found = run.look(k, alive_rows(map_))
     view = session_view(session, run.frames)

@@ -1,4 +1,4 @@
-"""Sessions: a robot's run as a belief over places, frame by frame."""
+"""Routes of sessions: create, list, read and delete, and send a frame."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from service.http.dependencies import (
 from service.http.openapi import frame_body
 from service.http.route_classes import StrictRoute
 from service.queries.answers import StatisticsDep
-from service.sessions.frames import session_report, session_view, take_in
+from service.sessions.frames import process_frame, session_report, session_view
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView
 from service.sessions.sessions import Sessions
 from service.telemetry.requests import REQUEST_ID
@@ -64,7 +64,7 @@ GONE = problem_documentation(UnknownSession, SessionExpired)
 def create_session(
     map_id: MapId, new: NewSession, engine: EngineDep, sessions: SessionsDep, response: Response
 ) -> SessionView:
-    """Begin a run. It ends when it is deleted, or when no frame has come for `expires_after` seconds."""
+    """Begin a session. It ends when it is deleted, or when no frame has come for `expires_after` seconds."""
     map_ = engine.atlas.get(map_id)
     if new.camera is not None:
         map_.cameras.mask(new.camera)
@@ -75,7 +75,7 @@ def create_session(
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: SessionsDep) -> SessionPage:
-    """List the sessions of a map that are under way."""
+    """List the sessions of a map that have not ended."""
     map_ = await engine.map(map_id)
     listing: Listing = ["sessions-of", map_id]
     after = decode_name(listing, page.cursor)
@@ -89,7 +89,7 @@ async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: 
 
 @router.get("/{session}", responses=GONE)
 async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> SessionReport:
-    """Read a session and what is believed of its robot now."""
+    """Read a session and the present belief about where its robot is."""
     map_ = await engine.map(map_id)
     session = await in_thread(sessions.find, map_, session_id)
     async with session.turn():
@@ -98,7 +98,7 @@ async def read_session(map_id: MapId, session_id: SessionId, engine: EngineDep, 
 
 @router.delete("/{session}", status_code=204, responses=GONE)
 async def delete_session(map_id: MapId, session_id: SessionId, engine: EngineDep, sessions: SessionsDep) -> None:
-    """End a run."""
+    """End a session."""
     map_ = await engine.map(map_id)
     session = await in_thread(sessions.find, map_, session_id)
     await in_thread(sessions.delete, session)
@@ -131,18 +131,18 @@ async def send_frame(
     statistics: StatisticsDep,
     deadline: DeadlineDep,
 ) -> SessionAnswer:
-    """Take in one frame of a run, and tell where the robot is.
+    """Send one frame of a session, and learn where the robot is.
 
-    The belief stands at the top, the answer to the frame alone under `single`. A frame that is sent again, under
-    the same `frame` number or, without one, under the same `X-Request-Id`, is counted once and gets the same answer.
-    A frame that is answered with a problem was not taken in.
+    The answer is the belief after the frame; `single` has the answer to the frame alone. A frame that is sent again,
+    with the same `frame` number or, without one, with the same `X-Request-Id`, counts once and gets the same answer.
+    A frame that is answered with a problem does not count.
     """
     engine.queue.check_room()
-    session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # before the body is read
+    session = await in_thread(sessions.find, await engine.map(map_id), session_id)  # fails before the body is read
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     given = request.headers.get("x-request-id", "")
     given_id = given if REQUEST_ID.fullmatch(given) else None
-    answer = await take_in(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
+    answer = await process_frame(engine, sessions, statistics, map_, session, data, options, deadline, given_id)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "session": session_id, "verdict": answer.verdict}
     return answer

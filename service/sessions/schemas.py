@@ -1,4 +1,4 @@
-"""Sessions: a robot's run, what is believed of it, and what is told beside each frame."""
+"""Sessions, beliefs and the parameters of a frame as JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Motion = Literal["first", "sequence", "speed-limit", "odometry"]
 
 
 class NewSession(BaseModel):
-    """How a run is to be followed."""
+    """The options of a session."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, json_schema_extra={"examples": [{"filter": "bayes", "speed_limit": 1.5}]}
@@ -48,18 +48,18 @@ class NewSession(BaseModel):
     filter: Literal["bayes", "path"] = Field(
         default="bayes",
         description="bayes: a hidden Markov model over the places. path: the best straight path through the last "
-        "frames, as SeqSLAM searches for; it knows neither odometry nor a speed limit.",
+        "frames, as in SeqSLAM; it uses neither odometry nor a speed limit.",
     )
     advance: float = Field(
         strict=True,
         default=1.0,
         ge=0,
         le=100,
-        description="Frames of the map's traverse that usually go by from one frame to the next, where neither "
-        "odometry nor a speed limit tells more.",
+        description="By how many frames of the map's traverse the robot usually moves on from one frame to the next; "
+        "used where neither odometry nor a speed limit is given.",
     )
     backwards: bool = Field(
-        strict=True, default=False, description="The robot may go against the traverse as readily as with it."
+        strict=True, default=False, description="The robot may move against the traverse as well as along it."
     )
     speed_limit: float | None = Field(
         strict=True,
@@ -67,7 +67,7 @@ class NewSession(BaseModel):
         gt=0,
         le=1000,
         allow_inf_nan=False,
-        description="Metres a second; then every frame needs a timestamp. Needs places with poses.",
+        description="Metres per second. Every frame then needs a timestamp, and the places need poses.",
     )
     sequences: list[Sequence] | None = Field(
         default=None, min_length=1, max_length=100, description="Only the places of these traverses."
@@ -77,7 +77,7 @@ class NewSession(BaseModel):
         default=0,
         ge=0,
         le=20,
-        description="Tell once more where the robot was so many frames ago, given all since.",
+        description="Also estimate where the robot was so many frames ago, given all frames since.",
     )
     path_frames: int = Field(strict=True, default=10, ge=2, le=50, description="Frames of a path; for the filter path.")
     camera: CameraName = None
@@ -86,7 +86,8 @@ class NewSession(BaseModel):
         default=None,
         gt=0,
         allow_inf_nan=False,
-        description="Seconds without a frame after which it ends; at most, and by default, what the service is set to.",
+        description="Seconds without a frame after which the session ends; the service's setting is the default and "
+        "the maximum.",
     )
 
     @model_validator(mode="after")
@@ -96,19 +97,19 @@ class NewSession(BaseModel):
         return self
 
     def run_options(self) -> RunOptions:
-        """The same for the belief."""
+        """The options of :class:`core.belief.Run`."""
         return RunOptions(self.filter, Stride(self.advance, self.backwards), self.lag, self.path_frames)
 
 
 class FrameParameters(Parameters):
-    """Beside a frame of a session."""
+    """The parameters of a frame of a session."""
 
     frame: int | None = Field(
         default=None,
         ge=0,
         le=2**53,
-        description="The robot's own number of the frame, growing. A number missed is a frame that did not arrive; the "
-        "last number again is the same frame sent again, and gets the same answer.",
+        description="The robot's own number of the frame; numbers grow. A missing number is a frame that did not "
+        "arrive; the last number again is the same frame sent again, and gets the same answer.",
     )
     timestamp: Timestamp | None = Field(
         default=None, description="When the frame was taken; never before the last one."
@@ -118,7 +119,7 @@ class FrameParameters(Parameters):
         ge=-1e5,
         le=1e5,
         allow_inf_nan=False,
-        description="Odometry: metres forward since the frame before, in the direction faced then.",
+        description="Odometry: metres forward since the frame before, in the direction that the robot faced then.",
     )
     left: float | None = Field(
         default=None, ge=-1e5, le=1e5, allow_inf_nan=False, description="Odometry: metres to the left; with forward."
@@ -147,7 +148,7 @@ class FrameParameters(Parameters):
         return self
 
     def odometry(self) -> Odometry | None:
-        """The motion told; None if none is."""
+        """The odometry of the frame; None if it has none."""
         if self.forward is None:
             return None
         turn, spread = math.radians(self.turn or 0.0), math.radians(self.turn_deviation or 0.0)
@@ -158,7 +159,7 @@ class BelievedPlace(BaseModel):
     """One place where the robot may be."""
 
     rank: int
-    probability: float = Field(description="Of it and of the places that are the same place.")
+    probability: float = Field(description="The probability of the place and its neighbours that are the same place.")
     place: PlaceView
 
 
@@ -171,18 +172,18 @@ class EarlierBelief(BaseModel):
 
 
 class BeliefView(BaseModel):
-    """What is believed of where a robot is."""
+    """The belief about where a robot is."""
 
     verdict: Verdict = Field(description="recognized: one place, with its neighbours, is at least as probable as not.")
     place: PlaceView | None = Field(description="Non-null only if recognized.")
-    probability: float | None = Field(description="Of the best candidate; null if there is none.")
-    unknown: float = Field(description="Probability that the robot sees what the map does not show.")
-    lost: bool = Field(description="It was recognized in this run, and has not been for five frames or more.")
-    candidates: list[BelievedPlace] = Field(description="Distinct places, best first, whatever the verdict.")
+    probability: float | None = Field(description="The probability of the best candidate; null if there is none.")
+    unknown: float = Field(description="The probability that the robot is at a place that the map does not have.")
+    lost: bool = Field(description="The robot was recognized in this session, but not in the last five frames or more.")
+    candidates: list[BelievedPlace] = Field(description="Distinct places, best first, with any verdict.")
 
 
 class SessionAnswer(BeliefView):
-    """What is believed once a frame is seen, and what the frame says alone."""
+    """The belief after a frame, and the answer to the frame alone."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -212,15 +213,15 @@ class SessionAnswer(BeliefView):
 
     session: str
     frame: int | None = Field(description="The robot's number of the frame.")
-    frames: int = Field(description="Frames taken in so far.")
-    earlier: EarlierBelief | None = Field(description="With a lag, once there are frames enough.")
-    motion: Motion = Field(description="By what the belief was moved on to this frame.")
-    repeated: bool = Field(default=False, description="The frame was sent again; it was counted once.")
-    restored: bool = Field(description="The session was taken up again after the service had been restarted.")
+    frames: int = Field(description="How many frames the session has processed.")
+    earlier: EarlierBelief | None = Field(description="With a lag, once there are enough frames.")
+    motion: Motion = Field(description="How the robot's motion since the last frame was known.")
+    repeated: bool = Field(default=False, description="The frame was sent again, and counts once.")
+    restored: bool = Field(description="The session was restored after a restart of the service.")
     frames_lost: int | None = Field(
-        description="Frames that the robot had numbered and a restart lost; null while that is not known."
+        description="How many numbered frames were lost by a restart; null while this is not known."
     )
-    saved: bool = Field(description="A restart of the service would not lose this frame.")
+    saved: bool = Field(description="The frame is on disk: a restart of the service would not lose it.")
     single: QueryAnswer = Field(description="The answer to the frame alone.")
     milliseconds: Milliseconds
 
@@ -234,14 +235,14 @@ class SessionView(NewSession):
     map: str
     created_at: Timestamp
     expires_at: Timestamp
-    frames: int = Field(description="Frames taken in so far.")
-    last_frame: int | None = Field(description="The robot's number of the last one.")
+    frames: int = Field(description="How many frames the session has processed.")
+    last_frame: int | None = Field(description="The robot's number of the last frame.")
     restored: bool
     frames_lost: int | None
 
 
 class SessionReport(SessionView):
-    """A session and what is believed now."""
+    """A session and its present belief."""
 
     model_config = ConfigDict(extra="ignore", json_schema_extra={"examples": [SESSION_EXAMPLE]})
 

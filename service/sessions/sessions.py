@@ -1,4 +1,4 @@
-"""The sessions of all maps: found, bounded in number and memory, ended when nobody comes, kept over a restart."""
+"""The sessions of all maps: they are limited in number and memory, expire without frames, and survive a restart."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pydantic import ValidationError
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
 from core.disk.files import disk_errors
 from core.errors import UnknownSequence
-from core.places import Neighborhood
 from core.recognition.selection import Conditions, Selection
+from core.recognition.stages import neighborhood_of
 from core.storage import Map, Snapshot
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.sessions.schemas import NewSession
@@ -29,22 +29,23 @@ from service.sessions.store import SessionStore, StoredSession
 from service.settings import Settings
 
 WAITING = 8
-"""Frames that may wait for their turn in one session; a robot that sends faster hears that it does."""
+"""The most frames of one session that may wait for their turn."""
 
 REMEMBERED_SECONDS = 24 * 3600.0
-"""So long it is told that a session is over, before it is as if there had been none."""
+"""For how long an ended session is remembered as ended; later it counts as unknown."""
 
 REMEMBERED = 10_000
+"""How many ended sessions are remembered."""
 
-GRAPH_SHARE = 20.0
-"""A map that is written to is looked at anew when so many times as long went by as that took the last time."""
+GRAPH_REUSE = 20.0
+"""The graph of a map that changes is used for so many times as long as it took to build, then built again."""
 
 CLOCKS_DIFFER = 1.0
-"""Seconds by which two clocks part without one having been set: what is told of a session stays the same."""
+"""Two clocks that differ by fewer seconds count as equal, so that the reported expiry of a session does not jitter."""
 
 EXPIRED = "No frame came for too long."
-MAP_GONE = "Its map was deleted; the one of that name now is another."
-STATE_LOST = "What it had come to believe was damaged on disk."
+MAP_GONE = "Its map was deleted; the map of that id is another one now."
+STATE_LOST = "Its saved belief was damaged on disk."
 
 log = logging.getLogger("placerec.sessions")
 
@@ -53,13 +54,18 @@ log = logging.getLogger("placerec.sessions")
 class Session:
     """One robot's run in one map.
 
-    created, used: seconds since 1970; of the creation and of the last frame.
-    number, moment, request: of the last frame, as the robot counts it, when it was taken (seconds since 1970), and
-        the id that the caller gave the request.
-    lost: frames that a restart is known to have lost.
-    answer: JSON of the last answer.
-    run: None after a restart, until the next frame.
-    idle_since: when the last frame came by the monotonic clock, by which it ends: the other one may be set.
+    created, used: when the session was created and when its last frame came, seconds since 1970 UTC.
+    number: the robot's number of the last frame.
+    moment: when the last frame was taken, seconds since 1970 UTC.
+    request: the id that the client gave the request of the last frame.
+    lost: how many frames were lost by a restart; None if that is not known.
+    answer: the last answer, JSON.
+    run: the belief; None after a restart, until the next frame.
+    restored: whether the session was restored after a restart.
+    streaming: whether a WebSocket streams into the session.
+    waiting: how many frames are being processed or wait for that.
+    idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
+        one may be set.
     """
 
     id: str
@@ -83,29 +89,29 @@ class Session:
 
     @property
     def expires(self) -> float:
-        """When it ends unless a frame comes, seconds since 1970, by the clock as it is set now."""
+        """When the session expires unless a frame comes, seconds since 1970 UTC, by the clock as it is set now."""
         used = time.time() - (time.monotonic() - self.idle_since)
         return self.expires_after + (self.used if abs(used - self.used) < CLOCKS_DIFFER else used)
 
     def touch(self) -> None:
-        """A frame came, now."""
+        """Note that a frame has come now."""
         self.used, self.idle_since = time.time(), time.monotonic()
 
     @property
     def selection(self) -> Selection | None:
-        """What of the map it is about; None: everything."""
+        """The filter for the session's sequences; None: all places of the map."""
         names = self.options.sequences
         return None if names is None else Selection(Conditions(sequences=tuple(names)))
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """The session's turn for one frame: first come, first served.
+        """Hold the session's turn for one frame; frames get it in the order of their arrival.
 
         Raises:
-            QueueFull: too many wait already.
+            QueueFull: too many frames of the session wait already.
         """
         if self.waiting >= WAITING:
-            raise QueueFull("Too many frames of this session wait for their turn; send this one again in a moment.")
+            raise QueueFull("Too many frames of this session are waiting; send this one again in a moment.")
         self.waiting += 1
         try:
             async with self._lock:
@@ -115,8 +121,12 @@ class Session:
 
 
 @dataclass(frozen=True, eq=False)
-class _Charted:
-    """The graph of a map's snapshot."""
+class _CachedGraph:
+    """The graph of a map's snapshot.
+
+    made: when it was finished, by the monotonic clock.
+    took: how many seconds it took to build.
+    """
 
     snapshot: Snapshot
     graph: PlaceGraph
@@ -124,25 +134,25 @@ class _Charted:
     took: float
 
     def serves(self, snapshot: Snapshot, now: float) -> bool:
-        """Whether it is of this snapshot, or too new to be worth making again."""
-        return self.snapshot is snapshot or now - self.made < GRAPH_SHARE * self.took
+        """Whether the graph is that of the snapshot, or recent enough to be used for it."""
+        return self.snapshot is snapshot or now - self.made < GRAPH_REUSE * self.took
 
 
 class Sessions:
-    """All sessions; any thread may call any method."""
+    """All sessions.  Thread-safe."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._store = SessionStore(settings.data_dir)
         self._lock = threading.RLock()
-        self._charting = threading.Lock()
-        self._charts: dict[tuple[str, str, tuple[str, ...]], _Charted] = {}
+        self._graph_lock = threading.Lock()
+        self._graphs: dict[tuple[str, str, tuple[str, ...]], _CachedGraph] = {}
         self._living: dict[str, Session] = {}
         self._ended: dict[str, tuple[str, str]] = {}
         self._load()
 
     def close(self) -> None:
-        """Let the file go; every frame that was answered is in it."""
+        """Close the file, which has every answered frame."""
         with self._lock:
             self._store.close()
 
@@ -160,7 +170,7 @@ class Sessions:
                 expires_after = float(content.pop("expires_after"))
                 options = NewSession.model_validate(content)
             except (ValueError, KeyError, TypeError, ValidationError) as error:
-                log.error("session %s cannot be taken up: %s", stored.id, error)
+                log.error("session %s cannot be restored: %s", stored.id, error)
                 self._store.end(stored.id, STATE_LOST, now)
                 self._ended[stored.id] = (stored.map, STATE_LOST)
                 continue
@@ -171,17 +181,17 @@ class Sessions:
                 idle_since=time.monotonic() - max(0.0, now - stored.used),
             )  # fmt: skip
         if kept:
-            log.info("sessions are taken up", extra={"sessions": len(kept)})
+            log.info("sessions are restored", extra={"sessions": len(kept)})
 
-    # Finding
+    # Creating, finding and ending sessions
 
     def create(self, map_: Map, options: NewSession) -> Session:
-        """Begin a run; blocks, so call it in a thread.
+        """Create a session; blocks, so call it in a thread.
 
         Raises:
-            TooManySessions: there is no room for one more.
-            UnknownSequence: the map has no traverse of a name that is given.
-            StorageFull, StorageFailure: it cannot be written down.
+            TooManySessions: there are too many sessions, or they would need too much memory.
+            UnknownSequence: the map has no sequence of one of the names.
+            StorageFull, StorageFailure: the session cannot be saved.
         """
         names = options.sequences or []
         if absent := set(names) - set(map_.attributes.sequence_codes(names)):
@@ -190,7 +200,7 @@ class Sessions:
         now, longest = time.time(), self._settings.session_expiry
         expires_after = min(options.expires_after or longest, longest)
         session = Session(
-            f"s-{secrets.token_hex(8)}", map_.record.id, _created(map_), options, expires_after, now, now,
+            f"s-{secrets.token_hex(8)}", map_.record.id, _creation_time(map_), options, expires_after, now, now,
             run=Run(options.run_options(), graph),
         )  # fmt: skip
         assert session.run is not None
@@ -217,15 +227,20 @@ class Sessions:
         return session
 
     def find(self, map_: Map, session_id: str) -> Session:
-        """A living session of a map.
+        """A session of a map that has not ended.
 
         Raises:
-            UnknownSession, SessionExpired: there is none.
+            UnknownSession: the map has no such session.
+            SessionExpired: the session has ended.
         """
         with self._lock:
             self._sweep()
             session = self._living.get(session_id)
-            if session is not None and session.map_id == map_.record.id and session.map_created_at != _created(map_):
+            if (
+                session is not None
+                and session.map_id == map_.record.id
+                and session.map_created_at != _creation_time(map_)
+            ):
                 self._end(session, MAP_GONE)
                 session = None
             if session is not None and session.map_id == map_.record.id:
@@ -236,27 +251,27 @@ class Sessions:
         raise UnknownSession(f"The map has no session {session_id[:80]!r}.")
 
     def of_map(self, map_: Map) -> list[Session]:
-        """The living sessions of a map, by id."""
+        """The sessions of a map that have not ended, in the order of their ids."""
         with self._lock:
             self._sweep()
             found = [one for one in self._living.values() if one.map_id == map_.record.id]
-        return sorted((one for one in found if one.map_created_at == _created(map_)), key=lambda one: one.id)
+        return sorted((one for one in found if one.map_created_at == _creation_time(map_)), key=lambda one: one.id)
 
     def count(self) -> int:
-        """Sessions that are under way, of all maps."""
+        """The number of sessions of all maps that have not ended."""
         return len(self._living)
 
     def delete(self, session: Session) -> None:
-        """End a run; it is as if there had been none.
+        """Delete a session; later it counts as unknown.
 
         Raises:
             StorageFull, StorageFailure: the disk refuses.
         """
-        with self._lock:  # a frame of it that is under way is not to write it down again
+        with self._lock:  # so that a frame that is being processed does not save the session again
             with disk_errors("delete a session"):
                 self._store.forget(session.id)
             self._living.pop(session.id, None)
-            self._drop_charts()
+            self._drop_unused_graphs()
 
     def _sweep(self) -> None:
         now = time.monotonic()
@@ -268,29 +283,29 @@ class Sessions:
         self._living.pop(session.id, None)
         self._ended[session.id] = (session.map_id, reason)
         while len(self._ended) > REMEMBERED:
-            self._forget_quietly(next(iter(self._ended)))
-        self._drop_charts()
+            self._forget_on_disk(next(iter(self._ended)))
+        self._drop_unused_graphs()
         try:
             self._store.end(session.id, reason, time.time())
         except sqlite3.Error as error:
-            log.warning("the end of session %s is not written down: %s", session.id, error)
+            log.warning("the end of session %s is not saved: %s", session.id, error)
 
-    def _forget_quietly(self, session_id: str) -> None:
+    def _forget_on_disk(self, session_id: str) -> None:
         self._ended.pop(session_id)
         try:
             self._store.forget(session_id)
         except sqlite3.Error as error:
-            log.warning("session %s cannot be forgotten: %s", session_id, error)
+            log.warning("session %s cannot be deleted on disk: %s", session_id, error)
 
-    # Going on
+    # Graphs and runs
 
     def graph(self, map_: Map, selection: Selection | None) -> PlaceGraph:
-        """The places as they are now, or were a moment ago where they change faster than they can be looked at."""
+        """The graph of the places that a session is about; while the map changes it may be slightly out of date."""
         names = selection.filters.sequences or () if selection else ()
-        key = (map_.record.id, _created(map_), names)
-        neighborhood = Neighborhood(map_.record.same_place_radius, map_.record.same_place_frames)
-        with self._charting:
-            snapshot, known, now = map_.snapshot(), self._charts.get(key), time.monotonic()
+        key = (map_.record.id, _creation_time(map_), names)
+        neighborhood = neighborhood_of(map_)
+        with self._graph_lock:
+            snapshot, known, now = map_.snapshot(), self._graphs.get(key), time.monotonic()
             if known is not None and known.graph.neighborhood == neighborhood and known.serves(snapshot, now):
                 return known.graph
             living = snapshot.alive
@@ -299,24 +314,24 @@ class Sessions:
                 living = living if allowed is None else living & allowed
             graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
             done = time.monotonic()
-            self._charts[key] = _Charted(snapshot, graph, done, done - now)
-            if len(self._charts) > self._settings.max_sessions:  # of sessions that were refused, or are over
+            self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)
+            if len(self._graphs) > self._settings.max_sessions:  # some are of refused or ended sessions
                 with self._lock:
-                    self._drop_charts()
+                    self._drop_unused_graphs()
             return graph
 
-    def _drop_charts(self) -> None:
-        """Those of maps and sequences that no session is about."""
+    def _drop_unused_graphs(self) -> None:
+        """Drop the graphs of maps and sequences that no session uses."""
         used = {(one.map_id, one.map_created_at, tuple(one.options.sequences or ())) for one in self._living.values()}
-        for key in list(self._charts):
+        for key in list(self._graphs):
             if key not in used:
-                self._charts.pop(key, None)
+                self._graphs.pop(key, None)
 
     def run(self, map_: Map, session: Session) -> Run:
-        """The session's run over the places as they are now; call it in the session's turn.
+        """The session's run, over the present places of the map; call it in the session's turn.
 
         Raises:
-            SessionExpired: what it believed cannot be read any more.
+            SessionExpired: the saved belief cannot be read.
         """
         graph = self.graph(map_, session.selection)
         if session.run is None:
@@ -324,7 +339,7 @@ class Sessions:
                 stored = self._store.read(session.id)
                 state = None if stored is None or stored.state is None else from_bytes(stored.state)
             except (sqlite3.Error, DamagedRecord) as error:
-                log.error("session %s cannot be taken up: %s", session.id, error)
+                log.error("session %s cannot be restored: %s", session.id, error)
                 with self._lock:
                     self._end(session, STATE_LOST)
                 raise SessionExpired(f"The session {session.id} is over. {STATE_LOST} Begin a new one.") from error
@@ -335,7 +350,7 @@ class Sessions:
         return session.run
 
     def frames_of(self, session: Session) -> int:
-        """How many frames a session has taken in, without taking it up; 0 if that cannot be read."""
+        """How many frames a session has processed; 0 if that cannot be read.  The session is not restored for this."""
         if session.run is not None:
             return session.run.frames
         try:
@@ -345,22 +360,21 @@ class Sessions:
             return 0
 
     def save(self, session: Session) -> bool:
-        """Write a session down as it is; False if the disk refuses, which is no reason not to answer, and for a session
-        that was ended meanwhile."""
+        """Save a session; returns whether it was saved: not if the disk refuses, or if the session has ended."""
         try:
-            # Without our lock: a sync takes a while, and others look for theirs.
+            # The lock is not held: writing to disk takes a while, and other sessions need the lock.
             return self._store.renew(_stored(session))
         except sqlite3.Error as error:
-            log.warning("session %s is not written down: %s", session.id, error)
+            log.warning("session %s is not saved: %s", session.id, error)
             return False
 
 
 def alive_rows(map_: Map) -> NDArray[np.bool_]:
-    """Which rows of the map hold a place at this moment."""
+    """Which rows of the map hold a place now; bool [rows]."""
     return map_.snapshot().alive
 
 
-def _created(map_: Map) -> str:
+def _creation_time(map_: Map) -> str:
     return map_.record.created_at.isoformat()
 
 

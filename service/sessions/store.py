@@ -1,8 +1,7 @@
 """Sessions on disk: one small SQLite file in the data directory, written after every frame.
 
-A frame that is answered was written down and synced, as every write that is acknowledged (``synchronous=FULL`` in WAL
-mode): a power cut takes none of it back.  A file that cannot be read is put aside: sessions are worth less than a
-service that starts.
+Before a frame is answered it is written and synced (``synchronous=FULL`` in WAL mode), so a power cut loses no answered
+frame.  A damaged file is renamed and replaced by a new one, so that the service can start.
 """
 
 from __future__ import annotations
@@ -42,12 +41,12 @@ _SCHEMA = Schema(application_id=0x504C5253, version=1, create=[_TABLE])  # "PLRS
 
 @dataclass(frozen=True)
 class StoredSession:
-    """One row; times are seconds since 1970.
+    """One row of the file; times are seconds since 1970 UTC.
 
-    number, moment, request: of the last frame, as the robot counts it, when it was taken, the request that brought it.
-    lost: frames that are known to be lost by a restart.
-    ended: why the session is over; None while it lives.
-    state: as ``core.belief.record`` writes it; answer: the JSON last answered.
+    number, moment, request, lost: as in :class:`service.sessions.sessions.Session`.
+    ended: why the session has ended; None if it has not.
+    state: the belief, as ``core.belief.record`` writes it.
+    answer: the last answer, JSON.
     """
 
     id: str
@@ -67,13 +66,13 @@ class StoredSession:
 
 COLUMNS = tuple(StoredSession.__dataclass_fields__)
 HEAD = COLUMNS[:-2]
-"""What is read of each session at the start; the rest when it goes on."""
+"""The columns that are read at the start; the others are read when a session goes on."""
 
 
 class SessionStore:
-    """The file in use; any thread may call any method.
+    """The file of the sessions.  Thread-safe.
 
-    Every method but ``close`` may raise ``sqlite3.Error``: the disk refuses.
+    Every method but ``close`` may raise ``sqlite3.Error``, if the disk refuses.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -90,18 +89,18 @@ class SessionStore:
             self._connection = file.open_or_replace()
 
     def close(self) -> None:
-        """Write the log back and let the file go."""
+        """Write the log back and close the file."""
         with self._lock:
             self._connection.close()
 
     def all(self) -> list[StoredSession]:
-        """All sessions, those that have ended too, without states and answers."""
+        """All sessions, including ended ones, without states and answers."""
         with self._lock:
             found = self._connection.execute(f"SELECT {', '.join(HEAD)} FROM sessions").fetchall()
         return [StoredSession(*row) for row in found]
 
     def read(self, session_id: str) -> StoredSession | None:
-        """One session whole."""
+        """One session with all columns; None if there is no such session."""
         with self._lock:
             row = self._connection.execute(
                 f"SELECT {', '.join(COLUMNS)} FROM sessions WHERE id = ?", [session_id]
@@ -109,14 +108,14 @@ class SessionStore:
         return None if row is None else StoredSession(*row)
 
     def write(self, session: StoredSession) -> None:
-        """Put a session in place of what was there of it."""
+        """Write a session, new or changed."""
         marks = ", ".join("?" * len(COLUMNS))
         values = [getattr(session, name) for name in COLUMNS]
         with self._lock:
             self._connection.execute(f"INSERT OR REPLACE INTO sessions VALUES ({marks})", values)
 
     def renew(self, session: StoredSession) -> bool:
-        """The same, unless it was forgotten or has ended meanwhile; whether it was there."""
+        """Write a changed session; returns False, and writes nothing, if it was deleted or has ended."""
         assignments = ", ".join(f"{name} = ?" for name in COLUMNS)
         values = [getattr(session, name) for name in COLUMNS]
         with self._lock, closing(self._connection.cursor()) as cursor:
@@ -124,7 +123,7 @@ class SessionStore:
             return cursor.rowcount > 0
 
     def end(self, session_id: str, reason: str, moment: float) -> None:
-        """Remember that, when and why a session ended, and nothing else of it."""
+        """Mark a session as ended, for a reason, and delete its state and answer."""
         with self._lock:
             self._connection.execute(
                 "UPDATE sessions SET ended = ?, used = ?, state = NULL, answer = NULL WHERE id = ?",
@@ -132,6 +131,6 @@ class SessionStore:
             )
 
     def forget(self, session_id: str) -> None:
-        """Remove all trace of a session."""
+        """Delete a session."""
         with self._lock:
             self._connection.execute("DELETE FROM sessions WHERE id = ?", [session_id])

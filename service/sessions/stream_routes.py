@@ -1,9 +1,9 @@
-"""A run over one WebSocket: frames one way, answers the other, without a request for each.
+"""The route of a stream: the frames and answers of a session over one WebSocket, without a request for each frame.
 
-Messages from the robot: a text message (JSON, the parameters of a frame; optional) and then a binary one, the frame.
-Messages to the robot: one text message for each frame, in their order, the answer or {"problem": …}.  A frame whose
-parameters were refused has had its message, and is not taken in.  The next frame is read when the last one is
-answered, so that a robot that is too fast is held back by its own connection.
+The robot sends, for each frame, an optional text message (JSON, the frame's parameters) and a binary message (the
+frame).  The service sends one text message for each frame, in order: the answer or {"problem": …}.  If the parameters
+of a frame are refused, that is the message for the frame, and the frame does not count.  The next frame is read only
+when the last one is answered, so a robot that sends too fast is slowed down by its own connection.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from service.errors.problems import Problem, problem_of, problem_response
 from service.http.bodies import parse_json
 from service.http.schemas import validated
 from service.http.uploads import check_frame
-from service.sessions.frames import take_in
+from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters
 from service.sessions.sessions import Session, Sessions
 from service.worker_threads import in_thread
@@ -52,7 +52,7 @@ POLICY_VIOLATION = 1008
 
 @router.websocket("/v1/maps/{map}/sessions/{session}/stream")
 async def stream_frames(socket: WebSocket) -> None:
-    """Take in the frames of a run as they come, until the robot closes the connection or the session ends."""
+    """Process the frames of a session until the robot closes the connection or the session ends."""
     state = socket.app.state
     engine: Engine = state.engine
     sessions: Sessions = state.sessions
@@ -63,7 +63,7 @@ async def stream_frames(socket: WebSocket) -> None:
         if session.streaming:
             raise StreamTaken("Another connection streams into this session; close that one first.")
     except (Fault, PlacerecError) as error:
-        await socket.send_denial_response(_refusal(socket, error))
+        await socket.send_denial_response(_denial(socket, error))
         return
     session.streaming = True
     try:
@@ -75,8 +75,8 @@ async def stream_frames(socket: WebSocket) -> None:
 
 
 async def _serve(state: State, map_id: str, session: Session, socket: WebSocket) -> None:
-    told: dict[str, Any] | None = None
-    refused = False
+    parameters: dict[str, Any] | None = None  # of the next frame
+    refused = False  # whether the parameters of the next frame were refused
     while True:
         try:
             async with asyncio.timeout(session.expires_after):
@@ -88,19 +88,19 @@ async def _serve(state: State, map_id: str, session: Session, socket: WebSocket)
             return
         try:
             if message.get("bytes") is None:
-                previous, told, refused = told, None, True
+                previous, parameters, refused = parameters, None, True
                 if previous is not None:
                     raise InvalidRequest("Two text messages came without a frame between them; both are dropped.")
-                told, refused = _parameters(message.get("text") or "", state.engine), False
+                parameters, refused = _parameters(message.get("text") or "", state.engine), False
                 continue
-            given, told = told, None
+            given, parameters = parameters, None
             if refused:
                 refused = False
                 continue
             await socket.app.state.gate.turn(socket.scope)
             answer = await _answer(state, map_id, session, message["bytes"], given or {})
         except (Fault, PlacerecError) as error:
-            await _tell(socket, error)
+            await _send_problem(socket, error)
             if isinstance(error, UnknownSession | SessionExpired):
                 await socket.close(POLICY_VIOLATION, "The session is over.")
                 return
@@ -120,7 +120,7 @@ async def _answer(state: State, map_id: str, session: Session, data: bytes, give
     map_ = await engine.map(map_id)
     await in_thread(state.sessions.find, map_, session.id)
     deadline = RequestDeadline(time.monotonic() + engine.settings.request_timeout, _never)
-    answer = await take_in(engine, state.sessions, state.statistics, map_, session, data, options, deadline, None)
+    answer = await process_frame(engine, state.sessions, state.statistics, map_, session, data, options, deadline, None)
     return answer.model_dump_json()
 
 
@@ -134,15 +134,15 @@ def _parameters(text: str, engine: Engine) -> dict[str, Any]:
 
 
 async def _never() -> None:
-    """A robot that hangs up is noticed when it is answered; its frame counts all the same."""
+    """Never return: if a robot hangs up, its frame is still processed, and the answer is not delivered."""
     await asyncio.Event().wait()
 
 
-async def _tell(socket: WebSocket, error: Exception) -> None:
+async def _send_problem(socket: WebSocket, error: Exception) -> None:
     problem: Problem = problem_of(error, socket.scope["path"], socket.scope["state"]["request_id"])
     await socket.send_json({"problem": problem.model_dump(exclude_none=True)})
 
 
-def _refusal(socket: WebSocket, error: Exception) -> Response:
-    """The problem as the answer to the handshake."""
+def _denial(socket: WebSocket, error: Exception) -> Response:
+    """The answer to a handshake that is refused."""
     return problem_response(Request({**socket.scope, "type": "http", "method": "GET"}), error)

@@ -25,7 +25,7 @@ from core.storage import Atlas
 from tests.core.storage.frames import frame
 from tests.faults.damage import flip
 from tests.faults.injection import attached
-from tests.service.places.test_durability import all_places, answers
+from tests.service.places.test_durability import answers
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 from tests.syscalls import strace
@@ -88,19 +88,19 @@ def faults(server: Server, *arguments: str) -> Iterator[None]:
 
 def check_refused(server: Server, status: int, slug: str) -> None:
     """Writes are answered with a problem, queries and other maps go on, and nothing was half written."""
-    before = all_places(server, "lab")
+    before = server.places("lab")
     assert_problem(server.enrol("lab", "refused", jpeg(7)), status, slug)
     assert_problem(server.client.patch("/v1/maps/lab", json={"description": "refused"}), status, slug)
     assert_problem(server.client.post("/v1/maps", json={"id": "refused"}), status, slug)
     assert server.query("lab", jpeg(1))["matches"][0]["place"]["id"] == "p1"
     assert server.query("hall", jpeg(50))["matches"][0]["place"]["id"] == "h0"
-    assert all_places(server, "lab") == before
+    assert server.places("lab") == before
     assert server.client.get("/livez").status_code == 200
 
 
 def check_recovered(server: Server) -> None:
     """What was refused is not there, the next write succeeds, and the map is sound."""
-    assert "refused" not in all_places(server, "lab")
+    assert "refused" not in server.places("lab")
     assert server.client.get("/v1/maps/refused").status_code == 404
     assert server.client.get("/v1/maps/lab").json()["description"] == ""
     response = server.enrol("lab", "taken", jpeg(8))

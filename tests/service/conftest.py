@@ -14,11 +14,12 @@ from tests.service.server import Server
 
 _numbers = itertools.count()
 
-TIGHT: dict[str, object] = {
+TIGHT: dict[str, int] = {
     "max_image_bytes": 60_000,
     "max_image_pixels": 400_000,
     "max_batch_items": 3,
     "max_batch_bytes": 150_000,
+    "max_bulk_bytes": 1_000_000,
     "max_upload_memory": 500_000,
     "max_json_bytes": 4096,
     "max_metadata_bytes": 200,

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,16 +41,35 @@ SECOND_STAGE = AgreementDefinition(
 
 
 def install_coarse_encoder(folder: Path) -> str:
-    """Put the encoder into a models directory; returns its identity."""
-    extractor = FeatureExtractor(_packaged_backbone(LAYERS), COARSE_DEFINITION)
-    return install(folder, COARSE, extractor, COARSE_DEFINITION, _packaged_network())
+    """Put the coarse encoder into a models directory; returns its identity."""
+    return _copy(_coarse_encoder, folder)
 
 
 def install_two_stage_encoder(folder: Path) -> str:
-    """The same with a second stage that examines the best three places; returns its identity."""
+    """Put the coarse encoder with a second stage, which examines three places, into a models directory."""
+    return _copy(_two_stage_encoder, folder)
+
+
+def _copy(make: Callable[[], tuple[tempfile.TemporaryDirectory[str], str]], folder: Path) -> str:
+    made, identity = make()
+    shutil.copytree(made.name, folder, dirs_exist_ok=True)
+    return identity
+
+
+@cache
+def _coarse_encoder() -> tuple[tempfile.TemporaryDirectory[str], str]:
+    """A models directory with the encoder, made once for all tests, and the encoder's identity."""
+    folder = tempfile.TemporaryDirectory()
+    extractor = FeatureExtractor(_packaged_backbone(LAYERS), COARSE_DEFINITION)
+    return folder, install(Path(folder.name), COARSE, extractor, COARSE_DEFINITION, _packaged_network())
+
+
+@cache
+def _two_stage_encoder() -> tuple[tempfile.TemporaryDirectory[str], str]:
+    folder = tempfile.TemporaryDirectory()
     definition = COARSE_DEFINITION.model_copy(update={"agreement": SECOND_STAGE})
     extractor = FeatureExtractor(_packaged_backbone(definition.outputs), definition, _projections())
-    return install(folder, TWO_STAGES, extractor, definition, _packaged_network())
+    return folder, install(Path(folder.name), TWO_STAGES, extractor, definition, _packaged_network())
 
 
 def _packaged_network() -> str:

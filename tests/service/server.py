@@ -115,6 +115,17 @@ class Server:
             f"/v1/maps/{map_id}/places/{place_id}", params=text(parameters), content=data, headers=typed(data)
         )
 
+    def places(self, map_id: str) -> dict[str, dict[str, Any]]:
+        """All places of a map by their ids, in the order of their enrolment."""
+        found: dict[str, dict[str, Any]] = {}
+        cursor: str | None = ""
+        while cursor is not None:
+            parameters = {"limit": "1000"} | ({"cursor": cursor} if cursor else {})
+            page = self.client.get(f"/v1/maps/{map_id}/places", params=parameters).json()
+            found |= {item["id"]: item for item in page["items"]}
+            cursor = page["next_cursor"]
+        return found
+
     def query(self, map_id: str, data: bytes, **parameters: object) -> dict[str, Any]:
         """The answer to one frame."""
         response = self.client.post(

@@ -1,4 +1,4 @@
-"""Search and second stage on a real map with a real encoder; no HTTP."""
+"""The whole path from a picture to an answer, on a real map with a real encoder."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def found(lab: Map, encoder: Encoder, query: Encoding, k: int = PLACES) -> list[
     return [(score, place.id) for score, place in located.matches]
 
 
-def test_the_first_few_gain_and_the_others_do_not(
+def test_only_the_best_places_gain_by_the_second_stage(
     lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding
 ) -> None:
     expected, without = both_stages(encoder, seen, query), first_stage(encoder, seen, query)
@@ -103,14 +103,14 @@ def test_the_first_few_gain_and_the_others_do_not(
     assert_matches(found(lab, encoder, query, k=2), dict(list(expected.items())[:2]))
 
 
-def test_many_queries_are_answered_as_each_alone(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
+def test_queries_together_have_the_same_answers_as_alone(lab: Map, encoder: Encoder, seen: list[Encoding]) -> None:
     queries = [encoder.encode(seen_again(scene(seed))) for seed in (1, 5, 6)]
     for one, located in zip(queries, locate(lab, encoder, queries, PLACES), strict=True):
         matches = [(score, place.id) for score, place in located.matches]
         assert_matches(matches, both_stages(encoder, seen, one))
 
 
-def test_what_agrees_cell_by_cell_comes_first_if_it_is_examined(
+def test_an_examined_place_that_agrees_cell_by_cell_comes_first(
     lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding
 ) -> None:
     """The third by its descriptor shows the very cells of the query, the first two show none of them."""
@@ -141,7 +141,7 @@ class Late:
         return self._stale if self.left >= 0 else Map.snapshot(self._lab)
 
 
-def test_a_place_deleted_under_the_search_gives_way_to_the_next(
+def test_a_place_deleted_during_the_search_is_replaced_by_the_next(
     lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     best = next(iter(both_stages(encoder, seen, query)))
@@ -157,7 +157,7 @@ def test_a_place_deleted_under_the_search_gives_way_to_the_next(
     assert_matches(found(lab, encoder, query), expected)
 
 
-def test_a_place_given_another_frame_under_the_search_is_compared_by_that(
+def test_a_place_replaced_during_the_search_is_compared_by_its_new_frame(
     lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     best = next(iter(both_stages(encoder, seen, query)))
@@ -169,7 +169,7 @@ def test_a_place_given_another_frame_under_the_search_is_compared_by_that(
     assert_matches(found(lab, encoder, query), both_stages(encoder, places, query))
 
 
-def test_where_places_go_on_being_deleted_the_others_are_told(
+def test_while_places_go_on_being_deleted_the_others_are_listed(
     lab: Map, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = both_stages(encoder, seen, query)

@@ -1,4 +1,4 @@
-"""A map held against itself while it is written to."""
+"""Queries of a map by its own places, while places are stored."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ from core.storage import MapSettings
 from tests.service.engines import ENCODER, enrolments, runtime_at
 
 
-def test_a_place_that_is_listed_before_its_row_can_be_read_is_left_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_place_listed_before_its_row_is_readable_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     no_encoder: Any = None  # no score is asked for
     with runtime_at(tmp_path) as runtime:
         map_ = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))

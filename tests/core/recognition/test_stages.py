@@ -1,4 +1,4 @@
-"""The second stage sees other places than the best one, however many neighbours that has."""
+"""The second stage examines other places than the best one, however many neighbours the best one has."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def crowd() -> tuple[NDArray[np.float32], Whereabouts, NDArray[np.float32]]:
     return scores, in_sequence(60, [*range(50), *range(1000, 2000, 100)]), gains
 
 
-def test_the_twin_of_a_place_with_many_neighbours_is_examined() -> None:
+def test_a_similar_place_behind_many_neighbours_is_examined() -> None:
     scores, places, gains = crowd()
     found = examine(scores, places, SAME, 30, lambda rows: gains[rows])
     assert found.examined.sum() == 35
@@ -36,7 +36,7 @@ def test_the_twin_of_a_place_with_many_neighbours_is_examined() -> None:
     assert judgement.margin is not None and judgement.margin < 0.02
 
 
-def test_without_it_the_answer_could_not_be_ambiguous() -> None:
+def test_without_examining_it_the_answer_would_be_recognized() -> None:
     scores, places, gains = crowd()
     raised = scores.copy()
     raised[:30] += gains[:30]
@@ -45,7 +45,7 @@ def test_without_it_the_answer_could_not_be_ambiguous() -> None:
     assert judgement.verdict == "recognized"
 
 
-def test_candidates_that_are_other_places_are_enough() -> None:
+def test_no_more_is_examined_if_the_candidates_are_different_places() -> None:
     scores = np.linspace(0.2, 0.1, 60).astype(np.float32)
     asked: list[int] = []
 
@@ -60,7 +60,7 @@ def test_candidates_that_are_other_places_are_enough() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 4])
-def test_maps_smaller_than_the_list(n: int) -> None:
+def test_maps_smaller_than_the_number_of_candidates(n: int) -> None:
     found = examine(
         np.linspace(0.2, 0.1, n).astype(np.float32),
         in_sequence(n),

@@ -1,4 +1,4 @@
-"""Frames that wait together share a forward pass, and nothing else: neither faults, nor delays, nor values."""
+"""Frames that wait at the same time share a forward pass, but neither errors, nor delays, nor values."""
 
 from __future__ import annotations
 
@@ -82,6 +82,12 @@ class Watched:
         assert begun.wait(30)
         return free.set
 
+    def put_together(self, frames: Sequence[QueuedFrame]) -> None:
+        """Let the frames wait until all of them do."""
+        go = self.hold()
+        self.batches.put(frames)
+        go()
+
     def frame(self, seed: int, name: str = DEFAULT_ENCODER, **more: Any) -> QueuedFrame:
         given: dict[str, Any] = {"mask": None, "deadline": time.monotonic() + 60, **more}
         return QueuedFrame(self.catalogue.resolve(name), given.pop("data", None) or jpeg(seed), **given)
@@ -108,11 +114,9 @@ def answers(frames: Sequence[QueuedFrame]) -> list[Encoded]:
     return [frame.result.result(60) for frame in frames]
 
 
-def test_what_waits_together_shares_a_pass_and_gives_what_each_gives_alone(watched: Watched, default: Encoder) -> None:
+def test_frames_that_share_a_pass_have_the_encodings_of_frames_alone(watched: Watched, default: Encoder) -> None:
     frames = [watched.frame(seed, mask=UPPER_HALF if seed == 2 else None) for seed in range(5)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     for seed, (frame, found) in enumerate(zip(frames, answers(frames), strict=True)):
         alone = default.encode(decode(frame.data), frame.mask)
         assert cosine(found.encoding, alone) > 0.9999, seed
@@ -123,7 +127,7 @@ def test_what_waits_together_shares_a_pass_and_gives_what_each_gives_alone(watch
     assert cosine(frames[2].result.result().encoding, default.encode(scene(2))) < 0.99, "the mask counted"
 
 
-def test_a_frame_alone_does_not_wait_for_company(watched: Watched) -> None:
+def test_a_single_frame_does_not_wait_for_others(watched: Watched) -> None:
     for seed in range(3):
         frame = watched.frame(seed)
         watched.batches.put([frame])
@@ -131,12 +135,10 @@ def test_a_frame_alone_does_not_wait_for_company(watched: Watched) -> None:
     assert watched.sizes == [1, 1, 1]
 
 
-def test_many_frames_are_several_batches_in_their_order(watched: Watched) -> None:
+def test_many_frames_are_several_batches_in_order(watched: Watched) -> None:
     count = 2 * cores() * MOST_FRAMES + 3
     frames = [watched.frame(seed % 4) for seed in range(count)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     answers(frames)
     assert [frame for batch in watched.taken for frame in batch] == frames
     assert sum(watched.sizes) == count and max(watched.sizes) == MOST_FRAMES
@@ -145,9 +147,7 @@ def test_many_frames_are_several_batches_in_their_order(watched: Watched) -> Non
 @pytest.mark.parametrize("poison", [b"poison", jpeg(1)[:2000]])
 def test_a_poisoned_image_fails_alone(watched: Watched, poison: bytes) -> None:
     frames = [watched.frame(0), watched.frame(1, data=poison), watched.frame(2)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     assert isinstance(frames[1].result.exception(60), (NotAnImage, TruncatedImage))
     assert len(answers([frames[0], frames[2]])) == 2
     assert sum(watched.sizes) == 2
@@ -164,9 +164,7 @@ def test_a_frame_that_breaks_the_encoder_fails_alone(watched: Watched, monkeypat
 
     monkeypatch.setattr(Encoder, "encode_batch", breaks)
     frames = [watched.frame(seed) for seed in range(3)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     assert isinstance(frames[1].result.exception(60), ArithmeticError)
     assert len(answers([frames[0], frames[2]])) == 2
 
@@ -174,9 +172,7 @@ def test_a_frame_that_breaks_the_encoder_fails_alone(watched: Watched, monkeypat
 def test_encoders_are_batched_apart(watched: Watched, catalogue: EncoderCatalogue) -> None:
     names = [DEFAULT_ENCODER, COARSE, DEFAULT_ENCODER, COARSE, COARSE]
     frames = [watched.frame(seed, name) for seed, name in enumerate(names)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     found = answers(frames)
     assert [one.encoder.name for one in found] == names
     assert sum(watched.sizes) == 5 and len(watched.sizes) < 5
@@ -191,14 +187,12 @@ def scene_of(seed: int) -> Pixels:
 def test_an_encoder_that_is_not_there_fails_its_own_frames(watched: Watched) -> None:
     absent = QueuedFrame("absent", jpeg(0), None, time.monotonic() + 60)
     there = watched.frame(1)
-    go = watched.hold()
-    watched.batches.put([absent, there])
-    go()
+    watched.put_together([absent, there])
     assert isinstance(absent.result.exception(60), UnknownEncoder)
     assert there.result.result(60).encoder.name == DEFAULT_ENCODER
 
 
-def test_what_is_late_or_given_up_is_not_encoded(watched: Watched) -> None:
+def test_late_and_cancelled_frames_are_not_encoded(watched: Watched) -> None:
     late, given_up, there = watched.frame(0, deadline=time.monotonic() - 1), watched.frame(1), watched.frame(2)
     go = watched.hold()
     watched.batches.put([late, given_up, there])
@@ -231,33 +225,29 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
 
 
 @pytest.mark.parametrize(("seconds", "from_robot"), [(0.0, True), (3600.0, True), (3600.0, False)])
-def test_bulk_alone_comes_in_small_batches_while_robots_are_about(
+def test_batches_of_bulk_are_small_while_robots_send_frames(
     watched: Watched, seconds: float, from_robot: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(microbatches, "QUIET_SECONDS", seconds)
     watched.batches.put(first := [watched.frame(0, from_robot=from_robot)])
     answers(first)
     frames = [watched.frame(0, bulk=True) for _ in range(cores() * MOST_FRAMES)]
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     answers(frames)
     most = MOST_BULK if seconds and from_robot else MOST_FRAMES
     assert max(watched.sizes[1:]) == most and len(watched.sizes[1:]) <= len(frames) // most + cores()
 
 
-def test_what_is_decoded_at_one_time_is_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_pixels_decoded_at_one_time_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(microbatches, "MOST_PIXELS", 3 * 320 * 240)
     frames = [watched.frame(seed) for seed in range(7)]
     frames.append(watched.frame(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
-    go = watched.hold()
-    watched.batches.put(frames)
-    go()
+    watched.put_together(frames)
     answers(frames)
     assert watched.sizes == [3, 3, 1, 1]
 
 
-def test_what_waits_is_dropped_at_the_end(catalogue: EncoderCatalogue) -> None:
+def test_waiting_frames_are_cancelled_at_the_end(catalogue: EncoderCatalogue) -> None:
     watched = Watched(catalogue)
     go = watched.hold()
     frame, task = watched.frame(0), watched.batches.call(lambda: None)
@@ -305,7 +295,7 @@ async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder)
 
 @pytest.mark.anyio
 @pytest.mark.parametrize("fault", [DeadlineExceeded, ClientGone])
-async def test_what_is_left_of_a_request_is_given_up(queue: EncoderQueue, fault: type[Exception]) -> None:
+async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: EncoderQueue, fault: type[Exception]) -> None:
     async def leaves() -> None:
         await asyncio.sleep(0.2)
 
@@ -364,8 +354,8 @@ def test_a_batch_over_http_shares_forward_passes(server: Server, traverse: str) 
 
 
 def test_bulk_does_not_keep_a_robot_waiting(server: Server, traverse: str, map_id: str, tmp_path: Path) -> None:
-    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(120)]
-    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(120)]
+    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(80)]
+    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(80)]
 
     def enrol() -> tuple[httpx.Response, float]:
         began = time.monotonic()
@@ -393,9 +383,7 @@ def test_bulk_for_a_second_encoder_gets_its_turn(watched: Watched, monkeypatch: 
     for name, frames in (("robot", robots), ("bulk", bulk)):
         for frame in frames:
             frame.result.add_done_callback(noting(order, name))
-    go = watched.hold()
-    watched.batches.put([*bulk, *robots])
-    go()
+    watched.put_together([*bulk, *robots])
     for frame in (*robots, *bulk):
         frame.result.result(60)
     assert order.index("bulk") == 6, "three batches of robots, then theirs"

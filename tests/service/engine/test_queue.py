@@ -99,7 +99,7 @@ async def test_a_late_frame_is_dropped_before_it_is_encoded(queue: EncoderQueue,
     assert frames_encoded(queue) == 1
 
 
-async def test_who_hangs_up_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
+async def test_the_frame_of_a_client_that_hangs_up_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
     async def leaves() -> None:
         await asyncio.sleep(0.05)
 
@@ -110,7 +110,7 @@ async def test_who_hangs_up_is_dropped(queue: EncoderQueue, busy: threading.Even
     assert frames_encoded(queue) == 1
 
 
-async def test_a_cancelled_request_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
+async def test_the_frame_of_a_cancelled_request_is_dropped(queue: EncoderQueue, busy: threading.Event) -> None:
     waiting = asyncio.ensure_future(queue.encode(IDENTITY, jpeg(1), deadline()))
     await asyncio.sleep(0.05)
     waiting.cancel()
@@ -137,7 +137,7 @@ async def test_an_encoder_that_is_not_there(queue: EncoderQueue) -> None:
         await queue.encode("absent", jpeg(1), deadline())
 
 
-async def test_turns_are_taken_in_order(queue: EncoderQueue, busy: threading.Event) -> None:
+async def test_frames_are_encoded_in_order(queue: EncoderQueue, busy: threading.Event) -> None:
     order: list[int] = []
 
     async def one(number: int) -> None:
@@ -172,8 +172,8 @@ def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> No
     assert 'placerec_problems_total{type="queue-full"}' in tight_server.client.get("/metrics").text
 
 
-def test_a_server_at_work_is_alive_and_keeps_deadlines(server: Server) -> None:
-    slow = encoded(scene(1, 4000, 4000))
+def test_a_busy_server_is_alive_and_keeps_deadlines(server: Server) -> None:
+    slow = encoded(scene(1, 3000, 3000))
     with ThreadPoolExecutor(4) as pool:
         heavy = [pool.submit(server.client.post, "/v1/encode", content=slow, headers=HEADERS) for _ in range(4)]
         slowest, late = 0.0, []

@@ -42,7 +42,7 @@ def encoded(encoder: Encoder, pixels: Pixels) -> Encoded:
 
 
 @pytest.mark.parametrize("together", [1, 2, 4])
-async def test_searched_ahead_as_searched_for(map_: Map, encoder: Encoder, together: int) -> None:
+async def test_a_search_ahead_has_the_answers_of_an_ordinary_search(map_: Map, encoder: Encoder, together: int) -> None:
     search = search_ahead(map_, 3, None)
     assert search is not None and search == search_ahead(map_, 3, None) != search_ahead(map_, 4, None)
     frames = [seen_again(scene(seed), seed) for seed in range(together)]

@@ -1,4 +1,4 @@
-"""Searches that come together are one search, and answer as each would alone."""
+"""Queries that arrive at the same time share a search, and have the same answers as alone."""
 
 from __future__ import annotations
 
@@ -82,7 +82,9 @@ def ids(located: Answer) -> list[str]:
     return [place.id for _, place in located.matches]
 
 
-async def test_together_as_alone(map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]) -> None:
+async def test_searches_together_answer_as_alone(
+    map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
+) -> None:
     together = Searches()
     together._at_once = 1
     found = await asyncio.gather(*(together.locate(map_, encoder, [query], 3) for query in queries))
@@ -97,7 +99,7 @@ async def test_together_as_alone(map_: Map, encoder: Encoder, queries: list[Enco
     assert not together._waiting and not together._running
 
 
-async def test_what_comes_meanwhile_is_the_next_search(
+async def test_queries_that_arrive_during_a_search_share_the_next_one(
     map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
 ) -> None:
     together = Searches()
@@ -111,7 +113,7 @@ async def test_what_comes_meanwhile_is_the_next_search(
     assert sizes == [1, 4]
 
 
-async def test_other_purposes_are_searched_apart(
+async def test_queries_for_different_k_are_searched_apart(
     map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
 ) -> None:
     together = Searches()
@@ -123,7 +125,7 @@ async def test_other_purposes_are_searched_apart(
     assert sum(sizes) == 4 and len(sizes) >= 2
 
 
-async def test_a_large_batch_is_several_searches_in_its_order(
+async def test_a_large_batch_is_several_searches_with_answers_in_order(
     map_: Map, encoder: Encoder, queries: list[Encoding], sizes: list[int]
 ) -> None:
     many = [queries[index % len(queries)] for index in range(2 * MOST_TOGETHER + 3)]
@@ -151,7 +153,7 @@ async def test_a_failing_query_fails_alone(
     assert ids(after) == ["p3"]
 
 
-async def test_who_gives_up_does_not_hold_the_others_up(map_: Map, encoder: Encoder, queries: list[Encoding]) -> None:
+async def test_a_cancelled_query_does_not_delay_others(map_: Map, encoder: Encoder, queries: list[Encoding]) -> None:
     together = Searches()
     given_up = asyncio.ensure_future(together.locate(map_, encoder, queries[:1], 1))
     other = asyncio.ensure_future(together.locate(map_, encoder, queries[1:2], 1))

@@ -1,4 +1,4 @@
-"""Frames without a map."""
+"""Frames without a map, over HTTP."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_a_descriptor_is_the_encoders_own(client: httpx.Client) -> None:
     assert (answer["dtype"], answer["byte_order"]) == ("float32", "little")
 
 
-def test_the_same_as_bytes(client: httpx.Client) -> None:
+def test_a_descriptor_as_bytes(client: httpx.Client) -> None:
     raw = client.post("/v1/encode", content=jpeg(1), headers=JPEG | OCTETS)
     assert raw.headers["content-type"] == "application/octet-stream"
     assert raw.headers["x-encoder"].startswith(DEFAULT_ENCODER) and int(raw.headers["x-regions"]) > 0

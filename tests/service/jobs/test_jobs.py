@@ -1,4 +1,4 @@
-"""Jobs without HTTP: their turn, their end, what a restart makes of them, and what a disk that refuses does."""
+"""Jobs without HTTP: their order and their end, a restart of the service, a disk that refuses, and time slices."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_job_runs_and_is_remembered(tmp_path: Path) -> None:
         assert jobs.get(job.id) == ended
 
 
-def test_a_job_that_fails_says_why_and_a_defect_of_ours_is_not_told(tmp_path: Path) -> None:
+def test_a_failed_job_says_why_but_hides_internal_errors(tmp_path: Path) -> None:
     def refuse(_: JobContext) -> dict[str, Any]:
         raise UnknownMap("There is no map 'lab'.")
 
@@ -144,7 +144,7 @@ def test_cancelling(tmp_path: Path) -> None:
             jobs.cancel("none")
 
 
-def test_a_stop_interrupts_and_the_next_start_goes_on(tmp_path: Path) -> None:
+def test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start(tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path, {"gate": gate}) as jobs:
         job = jobs.submit("gate", "lab", arguments={"to": "hall"})
@@ -161,7 +161,7 @@ def test_a_stop_interrupts_and_the_next_start_goes_on(tmp_path: Path) -> None:
         assert failed.problem["type"] == "urn:placerec:problem:job-lost"
 
 
-def test_a_job_that_cannot_be_taken_up_again_fails_when_the_service_stops(tmp_path: Path) -> None:
+def test_a_job_that_cannot_be_resumed_fails_when_the_service_stops(tmp_path: Path) -> None:
     gate = Gate()
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
@@ -253,7 +253,7 @@ def test_a_file_of_a_later_version_is_refused(tmp_path: Path) -> None:
         Jobs(tmp_path)
 
 
-def test_work_goes_on_when_the_disk_refuses_to_remember_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import sqlite3
 
     gate = Gate()
@@ -274,7 +274,7 @@ def test_work_goes_on_when_the_disk_refuses_to_remember_it(tmp_path: Path, monke
         assert [found.id for found in jobs.all()] == [job.id], "what was refused is not there"
 
 
-def test_a_kind_that_is_gone_after_an_upgrade_ends_in_a_stated_failure(tmp_path: Path) -> None:
+def test_a_job_of_an_unknown_kind_fails_at_the_start(tmp_path: Path) -> None:
     gate, discarded = Gate(), list[str]()
     with running(tmp_path, {"gate": gate}) as jobs:
         job = jobs.submit("gate", "lab", arguments={"form": "f"})
@@ -287,7 +287,7 @@ def test_a_kind_that_is_gone_after_an_upgrade_ends_in_a_stated_failure(tmp_path:
 
 
 @pytest.mark.parametrize("how", ["a record", "the file"])
-def test_what_is_left_of_damaged_records_is_told_as_lost(tmp_path: Path, how: str) -> None:
+def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) -> None:
     import sqlite3
 
     gate = Gate()
@@ -315,7 +315,7 @@ def test_what_is_left_of_damaged_records_is_told_as_lost(tmp_path: Path, how: st
         assert end_of(jobs, jobs.submit("gate", "lab", arguments={})).state == "succeeded"
 
 
-def test_a_file_of_the_first_version_is_taken_over(tmp_path: Path) -> None:
+def test_a_file_of_the_first_version_is_migrated(tmp_path: Path) -> None:
     import sqlite3
 
     with running(tmp_path) as jobs:
@@ -331,7 +331,7 @@ def test_a_file_of_the_first_version_is_taken_over(tmp_path: Path) -> None:
         assert end_of(jobs, jobs.submit("note", None, lambda _: {}, maps={"lab": "then"})).maps == {"lab": "then"}
 
 
-def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
+def test_the_files_of_a_job_are_discarded_however_it_ends(tmp_path: Path) -> None:
     gate, discarded = Gate(), list[str]()
 
     def refuse(_: JobContext) -> dict[str, Any]:
@@ -353,7 +353,7 @@ def test_what_a_job_had_is_discarded_however_it_ends(tmp_path: Path) -> None:
     assert sorted(discarded) == sorted([first.id, second.id, third.id])
 
 
-def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None:
+def test_a_job_fails_if_its_map_was_replaced(tmp_path: Path) -> None:
     from core.storage import Atlas
     from service.jobs.context import creation_time
 
@@ -371,7 +371,48 @@ def test_a_job_is_bound_to_the_map_that_it_was_asked_for(tmp_path: Path) -> None
         gate.set()
         failed = end_of(jobs, bound)
         assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
-        assert end_of(jobs, jobs.submit("look", "lab", look, maps={"lab": creation_time(again)})).result == {
-            "places": 0
-        }
+        rebound = jobs.submit("look", "lab", look, maps={"lab": creation_time(again)})
+        assert end_of(jobs, rebound).result == {"places": 0}
     atlas.close()
+
+
+# Time slices
+
+
+def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.jobs.context.SLICE_SECONDS", 0.0)
+    order, ready = list[str](), threading.Event()
+
+    def stepping(context: JobContext) -> dict[str, Any]:
+        assert ready.wait(5)
+        while (step := context.notes.get("step", 0)) < 3:
+            order.append(f"{context.map_id}{context.arguments['name']}{step}")
+            context.remember(step=step + 1)
+            context.give_way()
+        return {}
+
+    with running(tmp_path, {"step": stepping}) as jobs:
+        maps = ["x", "y", "x"]
+        made = [jobs.submit("step", name, arguments={"name": "ab"[i // 2]}) for i, name in enumerate(maps)]
+        ready.set()
+        assert [end_of(jobs, job).state for job in made] == ["succeeded"] * 3
+    assert [step for step in order if step.startswith("x")] == ["xa0", "xa1", "xa2", "xb0", "xb1", "xb2"]
+    assert order.index("ya0") < order.index("xa2") and order.index("xa1") < order.index("ya2"), order
+
+
+def test_a_job_that_has_given_way_is_cancelled_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.jobs.context.SLICE_SECONDS", 0.0)
+    gate, ready = Gate(), threading.Event()
+
+    def yielding(context: JobContext) -> dict[str, Any]:
+        assert ready.wait(5)
+        context.give_way()
+        return {}
+
+    with running(tmp_path, {"yielding": yielding, "gate": gate}) as jobs:
+        patient, other = jobs.submit("yielding", "x"), jobs.submit("gate", "y")
+        ready.set()
+        assert gate.begun.wait(5) and jobs.get(patient.id).attempt == 1
+        assert jobs.cancel(patient.id).state == "cancelled"
+        gate.open.set()
+        assert end_of(jobs, other).state == "succeeded" and jobs.get(patient.id).state == "cancelled"

@@ -1,4 +1,4 @@
-"""Batches in line: each is encoded and stored after the one that it names, or not at all."""
+"""The order of batches: each is encoded and stored after the batch that it names, or not at all."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ async def begun(waiting: asyncio.Task[None]) -> None:
 
 
 @pytest.mark.anyio
-async def test_one_waits_until_the_other_has_come_so_far() -> None:
+async def test_a_batch_waits_for_the_stage_of_the_batch_before() -> None:
     line = BatchOrder()
     with line.enter("lab", "b", "a", deadline()) as second:
         encoding = asyncio.ensure_future(second.wait_for(Stage.ENCODED))
@@ -52,7 +52,7 @@ async def test_one_waits_until_the_other_has_come_so_far() -> None:
 
 
 @pytest.mark.anyio
-async def test_what_fails_is_not_stored_and_may_come_again() -> None:
+async def test_a_failed_batch_is_not_stored_and_may_be_sent_again() -> None:
     line = BatchOrder()
     second = BatchTurn(line, "lab", None, "a", deadline())
     with pytest.raises(ValueError), line.enter("lab", "a", None, deadline()):
@@ -69,7 +69,7 @@ async def test_what_fails_is_not_stored_and_may_come_again() -> None:
 
 
 @pytest.mark.anyio
-async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_no_batch_waits_forever(monkeypatch: pytest.MonkeyPatch) -> None:
     line = BatchOrder()
     with line.enter("lab", "slow", None, deadline()):
         with pytest.raises(BatchOutOfOrder):
@@ -86,7 +86,7 @@ async def test_nobody_waits_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.anyio
-async def test_so_many_names_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_number_of_remembered_names_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch_order, "KEPT", 3)
     line = BatchOrder()
     with line.enter("lab", "open", None, deadline()):
@@ -105,11 +105,7 @@ def files(first: int, count: int) -> dict[str, bytes]:
     return {f"f{number}": SMALL[number] for number in range(first, first + count)}
 
 
-def order(server: Server, map_id: str) -> list[str]:
-    return [item["id"] for item in server.client.get(f"/v1/maps/{map_id}/places?limit=1000").json()["items"]]
-
-
-def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map_id: str) -> None:
+def test_batches_are_stored_in_order_however_they_arrive(server: Server, map_id: str) -> None:
     answers: dict[str, httpx.Response] = {}
 
     def post(batch: str, after: str | None, first: int) -> None:
@@ -127,10 +123,10 @@ def test_they_are_stored_in_line_in_whatever_order_they_come(server: Server, map
     for sender in senders:
         sender.join(60)
     assert {name: answer.status_code for name, answer in answers.items()} == {"a": 200, "b": 200, "c": 200}
-    assert order(server, map_id) == [f"p{number}" for number in range(24)]
+    assert list(server.places(map_id)) == [f"p{number}" for number in range(24)]
 
 
-def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
+def test_no_batch_is_stored_out_of_order(server: Server, map_id: str) -> None:
     def post(first: int, line: dict[str, str], **options: object) -> httpx.Response:
         return send(server, map_id, numbered(first, 2), files(first, 2), params=line, **options)
 
@@ -138,13 +134,13 @@ def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
     assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
     assert_problem(post(0, {"batch": "a", "encoder": "another"}), 409, "wrong-encoder")
     assert_problem(post(2, {"after": "a"}, headers=hasty), 409, "batch-out-of-order")
-    assert order(server, map_id) == []
+    assert list(server.places(map_id)) == []
     # A frame that is bad fails alone: the batch as such is stored.
     places = [*numbered(0, 1), {"id": "bad", "file": "bad"}]
     first = send(server, map_id, places, {"f0": SMALL[0], "bad": b"none"}, params={"batch": "a"})
     assert [item["status"] for item in first.json()["items"]] == [201, 422]
     assert post(2, {"batch": "b", "after": "a"}).status_code == 200
-    assert order(server, map_id) == ["p0", "p2", "p3"]
+    assert list(server.places(map_id)) == ["p0", "p2", "p3"]
     # Sent once more, as after an answer that was lost, it changes nothing.
     again = post(2, {"batch": "b", "after": "a"})
     assert [item["change"] for item in again.json()["items"]] == ["unchanged", "unchanged"]
@@ -153,10 +149,10 @@ def test_nothing_is_stored_out_of_line(server: Server, map_id: str) -> None:
 @pytest.mark.parametrize(
     "line", [{"batch": "a", "after": "a"}, {"batch": ""}, {"after": "a b"}, {"batch": "a" * 65}, {"after": "a/b"}]
 )
-def test_names_that_make_no_sense(server: Server, map_id: str, line: dict[str, str]) -> None:
+def test_invalid_names_of_batches(server: Server, map_id: str, line: dict[str, str]) -> None:
     assert_problem(send(server, map_id, numbered(0, 1), files(0, 1), params=line), 422, "invalid-request")
 
 
-def test_not_in_the_background(server: Server, map_id: str) -> None:
+def test_named_batches_are_refused_in_the_background(server: Server, map_id: str) -> None:
     line = {"background": "true", "batch": "a"}
     assert_problem(send(server, map_id, numbered(0, 1), files(0, 1), params=line), 422, "invalid-request")

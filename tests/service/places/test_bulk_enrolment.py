@@ -1,19 +1,19 @@
-"""A traverse enrolled by one request and a job: what comes of it, a kill in between, a cancel, and what is refused."""
+"""Bulk enrolment by a request and a job: its result, a crash, a cancel, and forms that are refused."""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import httpx
 
+from tests.service.conftest import TIGHT
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import blank, encoded, jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import finished, places, reaching, wait_until
+from tests.service.upkeep.upkeeping import finished, reaching, wait_until
 
 
 def frames(count: int, offset: int = 0) -> list[bytes]:
@@ -43,7 +43,7 @@ def staged(server: Server) -> list[str]:
     return [path.name for path in folder.iterdir()] if folder.is_dir() else []
 
 
-def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> None:
+def test_a_form_becomes_a_job_and_bad_frames_fail_alone(server: Server) -> None:
     server.create_map("bulk", encoder=COARSE)
     listed = [
         {"id": "a", "file": "one", "x": 1, "y": 2, "sequence": "monday"},
@@ -74,7 +74,7 @@ def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> Non
         4: ("lacking", "invalid-request"),
         6: ("held", "frame-needed"),
     }
-    assert [(place["id"], place["pose"]["x"]) for place in places(server, "bulk").values()] == [("a", 1), ("b", 3)]
+    assert [(place["id"], place["pose"]["x"]) for place in server.places("bulk").values()] == [("a", 1), ("b", 3)]
     assert server.client.get("/v1/maps/bulk/places/a/thumbnail").status_code == 200
     wait_until(lambda: staged(server) == [])  # it is cleared away once the job has ended
 
@@ -82,7 +82,7 @@ def test_a_form_becomes_a_job_and_what_is_bad_fails_alone(server: Server) -> Non
     assert again["result"]["changes"] == {"unchanged": 2}, "the same again changes nothing"
 
 
-def test_what_makes_no_sense_is_refused_and_leaves_nothing(server: Server) -> None:
+def test_malformed_forms_are_refused_and_leave_nothing(server: Server) -> None:
     server.create_map("refusing", encoder=COARSE)
     one = {"one": jpeg(1)}
     assert_problem(sent(server, "refusing", **form(one, [])), 422, "invalid-request")
@@ -101,11 +101,11 @@ def test_what_makes_no_sense_is_refused_and_leaves_nothing(server: Server) -> No
     assert staged(server) == [] and not server.client.get("/v1/jobs?map=refusing").json()["items"]
 
 
-def test_a_kill_a_cancel_and_limits(tmp_path: Path) -> None:
+def test_a_killed_job_is_resumed(tmp_path: Path) -> None:
     install_coarse_encoder(tmp_path / "models")
-    limits = {"max_bulk_bytes": 8 << 20, "max_staged_bytes": 10 << 20, "max_bulk_items": 400}
-    server = Server(tmp_path, limits).wait()
-    server.create_map("long", encoder=COARSE)
+    coarse = {"encoder": COARSE}
+    server = Server(tmp_path, coarse).wait()
+    server.create_map("long")
     count = 128
     wanted = traverse(count)
     job = sent(server, "long", **wanted).json()
@@ -113,43 +113,48 @@ def test_a_kill_a_cancel_and_limits(tmp_path: Path) -> None:
     server.kill()
     (server.data_dir / "staging" / ".arriving").mkdir()  # as a request that was cut leaves it
 
-    server = Server(tmp_path, limits).wait()
+    server = Server(tmp_path, coarse).wait()
     done = finished(server, job)
     assert done["state"] == "succeeded" and done["attempt"] == 2, done
-    told = done["result"]["changes"]
-    assert sum(told.values()) == count and told.get("unchanged", 0) <= 64, told
-    assert list(places(server, "long")) == [f"p{n}" for n in range(count)], "all of them, once, in their order"
+    changes = done["result"]["changes"]
+    assert sum(changes.values()) == count and changes.get("unchanged", 0) <= 64, changes
+    assert list(server.places("long")) == [f"p{n}" for n in range(count)], "all of them, once, in their order"
     assert server.client.post("/v1/maps/long/verify").json()["ok"]
     wait_until(lambda: staged(server) == [])
+    assert server.stop() == 0
 
-    # What is enrolled when the job is cancelled stays; the other map's job has its turn.
-    server.create_map("other", encoder=COARSE)
-    job = sent(server, "other", **traverse(count, "q", count)).json()
-    waiting = sent(server, "long", **traverse(3, "w", 2 * count)).json()
+
+def test_a_cancelled_job_keeps_what_is_enrolled_and_the_next_job_runs(server: Server) -> None:
+    for name in ("cancelled", "next"):
+        server.create_map(name, encoder=COARSE)
+    count = 128
+    job = sent(server, "cancelled", **traverse(count, "q", count)).json()
+    waiting = sent(server, "next", **traverse(3, "w", 2 * count)).json()
     reaching(server, job, 64)
     assert server.client.post(f"/v1/jobs/{job['id']}/cancel").status_code == 200
     stopped = finished(server, job)
-    assert stopped["state"] == "cancelled" and 64 <= len(places(server, "other")) < count
-    assert stopped["progress"]["done"] <= len(places(server, "other"))
+    assert stopped["state"] == "cancelled" and 64 <= len(server.places("cancelled")) < count
+    assert stopped["progress"]["done"] <= len(server.places("cancelled"))
     assert finished(server, waiting)["result"]["changes"] == {"created": 3}
+    wait_until(lambda: staged(server) == [])
 
-    # A map that is deleted and made again is another map.
-    first = sent(server, "long", **traverse(16, "x", 4 * count)).json()
-    server.create_map("again", encoder=COARSE)
+
+def test_a_map_that_is_deleted_and_created_again_is_another_map(server: Server) -> None:
+    for name in ("before", "again"):
+        server.create_map(name, encoder=COARSE)
+    first = sent(server, "before", **traverse(16, "x")).json()
     job = sent(server, "again", **traverse(3)).json()
     server.client.delete("/v1/maps/again")
     server.create_map("again", encoder=COARSE)
     lost = finished(server, job)
-    if lost["state"] != "succeeded":  # it may have come before
+    if lost["state"] != "succeeded":  # the job may have ended before the map was deleted
         assert lost["problem"]["type"].endswith("unknown-map")
-    assert places(server, "again") == {}
-    big = form(
-        {f"f{n}": jpeg(n) + bytes(900_000) for n in range(10)}, [{"id": f"b{n}", "file": f"f{n}"} for n in range(10)]
-    )
-    assert_problem(sent(server, "again", **big), 413, "body-too-large")
+    assert server.places("again") == {}
     finished(server, first)
-    until = time.monotonic() + 5
-    while staged(server) and time.monotonic() < until:
-        time.sleep(0.05)
-    assert staged(server) == []
-    assert server.stop() == 0
+    wait_until(lambda: staged(server) == [])
+
+
+def test_a_form_over_the_limit_is_refused(tight_server: Server, tight_map: str) -> None:
+    big = form({"f": jpeg(1) + bytes(TIGHT["max_bulk_bytes"])}, [{"id": "b", "file": "f"}])
+    assert_problem(sent(tight_server, tight_map, **big), 413, "body-too-large")
+    assert staged(tight_server) == []

@@ -1,4 +1,4 @@
-"""What was acknowledged is there: after SIGKILL, on a full disk, and by the trace of the system calls."""
+"""Acknowledged writes are kept: after SIGKILL, on a full disk, and by the trace of the system calls."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 from tests.syscalls import audit, is_success_response, strace, strace_arguments
@@ -29,19 +30,6 @@ def answers(server: Server, map_id: str, frames: list[bytes]) -> list[dict[str, 
     return found
 
 
-def all_places(server: Server, map_id: str) -> dict[str, dict[str, Any]]:
-    """Every place of a map by its id."""
-    places: dict[str, dict[str, Any]] = {}
-    cursor = ""
-    while True:
-        parameters = {"limit": "1000"} | ({"cursor": cursor} if cursor else {})
-        page = server.client.get(f"/v1/maps/{map_id}/places", params=parameters).json()
-        places |= {item["id"]: item for item in page["items"]}
-        cursor = page["next_cursor"]
-        if cursor is None:
-            return places
-
-
 def test_the_main_job(tmp_path: Path) -> None:
     """A traverse is enrolled, another localized, the process killed and started again: the same answers."""
     server = Server(tmp_path).wait()
@@ -54,7 +42,7 @@ def test_the_main_job(tmp_path: Path) -> None:
         assert response.status_code == 201
     frames = [encoded(seen_again(scene(number), number)) for number in range(TRAVERSE)]
     frames += [jpeg(number) for number in range(200, 204)]
-    before, places = answers(server, "lab", frames), all_places(server, "lab")
+    before, places = answers(server, "lab", frames), server.places("lab")
     for number in range(TRAVERSE):
         assert before[number]["matches"][0]["place"]["id"] == f"p{number:03}"
     assert sum(answer["verdict"] == "recognized" for answer in before[:TRAVERSE]) >= TRAVERSE * 3 // 4
@@ -62,7 +50,7 @@ def test_the_main_job(tmp_path: Path) -> None:
     server.kill()
     server = Server(tmp_path).wait()
     assert answers(server, "lab", frames) == before
-    assert all_places(server, "lab") == places
+    assert server.places("lab") == places
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     assert server.stop() == 0
 
@@ -93,7 +81,9 @@ def test_the_corridor(tmp_path: Path) -> None:
 def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> None:
     frames = [jpeg(number) for number in range(6)]
     acknowledged: dict[str, int] = {}
-    server = Server(tmp_path).wait()
+    install_coarse_encoder(tmp_path / "models")
+    coarse = {"encoder": COARSE}  # it encodes faster than the default encoder
+    server = Server(tmp_path, coarse).wait()
     server.create_map("lab")
     for round_ in range(2):
 
@@ -123,9 +113,9 @@ def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> 
         for worker in workers:
             worker.join(30)
         assert len(acknowledged) >= before + 12
-        server = Server(tmp_path).wait()
+        server = Server(tmp_path, coarse).wait()
 
-    places = all_places(server, "lab")
+    places = server.places("lab")
     assert set(acknowledged) <= set(places)
     assert all(places[name]["pose"] == {"x": float(frame), "y": 0.0} for name, frame in acknowledged.items())
     assert len(places) <= len(acknowledged) + 8, "at most what was under way is there besides"
@@ -163,7 +153,7 @@ def fill(server: Server) -> dict[str, dict[str, Any]]:
         response = server.enrol("lab", f"p{number}", jpeg(number % 10), x=number, y=0)
         if response.status_code == 507:
             assert_problem(response, 507, "storage-full")
-            return all_places(server, "lab")
+            return server.places("lab")
         assert response.status_code == 201, response.text
     raise AssertionError("the disk was never full")
 
@@ -179,25 +169,25 @@ def check_full_disk(server: Server) -> dict[str, dict[str, Any]]:
     places = "[" + ",".join(f'{{"id": "b{number}", "file": "f{number}"}}' for number in range(12)) + "]"
     response = server.client.post("/v1/maps/lab/places", data={"places": places}, files=files)
     assert_problem(response, 507, "storage-full")
-    assert all_places(server, "lab") == kept
+    assert server.places("lab") == kept
     assert answers(server, "lab", [jpeg(1)]) == before
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     return kept
 
 
-def test_a_full_disk_is_told_and_nothing_is_half_written(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path: Path) -> None:
     server = Server(tmp_path, wrapper=LIMITED).wait()
     kept = check_full_disk(server)
     server.kill()
     server = Server(tmp_path).wait()  # the disk has room again
-    assert all_places(server, "lab") == kept
+    assert server.places("lab") == kept
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     assert server.enrol("lab", "more", jpeg(50)).status_code == 201
     assert server.query("lab", jpeg(50))["matches"][0]["place"]["id"] == "more"
     assert server.stop() == 0
 
 
-def test_a_full_file_system_too(tmp_path: Path, small_disk: Path) -> None:
+def test_a_full_file_system_is_reported_and_nothing_is_half_written(tmp_path: Path, small_disk: Path) -> None:
     server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait()
     kept = check_full_disk(server)
     for name in list(kept)[:2]:
@@ -205,13 +195,13 @@ def test_a_full_file_system_too(tmp_path: Path, small_disk: Path) -> None:
     assert server.client.get("/livez").status_code == 200
     server.kill()
     server = Server(tmp_path, {"data_dir": small_disk / "data"}).wait("/livez")
-    assert set(all_places(server, "lab")) <= set(kept)
+    assert set(server.places("lab")) <= set(kept)
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     server.kill()
 
 
 @pytest.mark.skipif(strace() is None, reason="strace is not installed, or may not trace here")
-def test_a_2xx_is_sent_after_all_that_was_written_for_it_is_synced(tmp_path: Path) -> None:
+def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
     trace, folder = tmp_path / "trace", tmp_path.resolve() / "server"
     server = Server(folder, wrapper=strace_arguments(trace)).wait()
     client = server.client

@@ -1,4 +1,4 @@
-"""Places: enrol, browse, read, edit, forget, see."""
+"""Places over HTTP: enrol, list, read, edit and delete them, and fetch their thumbnails."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_enrolling_one_frame(server: Server, map_id: str) -> None:
     assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 1
 
 
-def test_a_put_is_the_whole_place(server: Server, map_id: str) -> None:
+def test_a_put_replaces_the_whole_place(server: Server, map_id: str) -> None:
     first = server.enrol(map_id, "p", jpeg(1), x=1, y=2, sequence="a", metadata={"k": 1}).json()
     assert server.enrol(map_id, "p", jpeg(1), x=1, y=2, sequence="a", metadata={"k": 1}).json()["change"] == "unchanged"
     response = server.enrol(map_id, "p", jpeg(1), heading=5, latitude=48.8, longitude=2.3)
@@ -122,7 +122,7 @@ def test_parameters_that_do_not_fit(server: Server, map_id: str, parameters: dic
     assert server.client.get(f"/v1/maps/{map_id}").json()["places"] == 0
 
 
-def test_a_parameter_stands_once(server: Server, map_id: str) -> None:
+def test_a_parameter_may_not_be_repeated(server: Server, map_id: str) -> None:
     headers = {"Content-Type": "image/jpeg"}
     response = server.client.put(f"/v1/maps/{map_id}/places/p?x=1&x=2&y=3", content=jpeg(1), headers=headers)
     assert_problem(response, 422, "invalid-request")
@@ -226,7 +226,7 @@ def test_metadata_does_not_grow_past_its_limit_by_edits(server: Server, map_id: 
     assert_problem(server.client.patch(path, json={"metadata": {"b": "y" * 9000}}), 422, "invalid-request")
 
 
-def test_forgetting(server: Server, map_id: str) -> None:
+def test_deleting_a_place(server: Server, map_id: str) -> None:
     path = f"/v1/maps/{map_id}/places/p"
     server.enrol(map_id, "p", jpeg(1))
     assert server.query(map_id, jpeg(1))["matches"]
@@ -269,13 +269,13 @@ def test_two_writers_of_one_place_leave_one_of_the_two(server: Server, map_id: s
     assert place["sequence"] == f"s{shown}", "the fields are those that came with the picture"
 
 
-def test_thumbnail_has_no_cached_past(server: Server, map_id: str) -> None:
+def test_thumbnails_are_not_cached(server: Server, map_id: str) -> None:
     server.enrol(map_id, "p", jpeg(1))
     response = server.client.get(f"/v1/maps/{map_id}/places/p/thumbnail")
     assert response.headers["cache-control"] == "no-cache"
     assert response.headers["x-content-type-options"] == "nosniff"
 
 
-def test_what_is_answered_is_json_of_finite_numbers(client: httpx.Client, server: Server, map_id: str) -> None:
+def test_answers_are_json_of_finite_numbers(client: httpx.Client, server: Server, map_id: str) -> None:
     server.enrol(map_id, "p", jpeg(1), x=1, y=2)
     assert "NaN" not in client.get(f"/v1/maps/{map_id}/places").text

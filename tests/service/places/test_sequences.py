@@ -1,4 +1,4 @@
-"""Traverses as a whole."""
+"""Traverses over HTTP: list, count and delete them."""
 
 from __future__ import annotations
 

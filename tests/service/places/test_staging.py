@@ -1,4 +1,4 @@
-"""Forms on disk: what arrives whole, what is cut, refused or damaged, and what a start clears away."""
+"""Forms on disk: they arrive completely, are cut, refused or damaged, and are removed at a start."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ async def test_parts_come_back_as_they_were_sent(tmp_path: Path) -> None:
 
 
 @pytest.mark.anyio
-async def test_what_does_not_come_whole_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_incomplete_form_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     staging = Staging(tmp_path, 1 << 20)
     with pytest.raises(MalformedBody):
         await received(staging, body(one=b"1")[:-4])
@@ -84,7 +84,7 @@ async def test_what_does_not_come_whole_leaves_nothing(tmp_path: Path, monkeypat
 
 
 @pytest.mark.anyio
-async def test_damage_is_found_and_a_start_clears_away_what_nobody_waits_for(tmp_path: Path) -> None:
+async def test_damage_is_found_and_a_start_removes_forms_without_a_job(tmp_path: Path) -> None:
     staging = Staging(tmp_path, 1 << 20)
     first, second = [await received(staging, body(one=b"first")) for _ in range(2)]
     (tmp_path / "staging" / ".arriving").mkdir()
@@ -111,9 +111,7 @@ async def test_damage_is_found_and_a_start_clears_away_what_nobody_waits_for(tmp
 
 
 @pytest.mark.anyio
-async def test_a_task_that_is_cancelled_writes_into_no_other_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_cancelled_task_writes_into_no_other_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As the server does when it stops; the thread goes on, and its file's number must not become another's."""
     staging, reached, opened = Staging(tmp_path, 1 << 20), threading.Event(), threading.Event()
 
@@ -141,7 +139,7 @@ async def test_a_task_that_is_cancelled_writes_into_no_other_file(
 @pytest.mark.anyio
 async def test_forms_leave_room_for_the_maps(tmp_path: Path) -> None:
     free = shutil.disk_usage(tmp_path).free
-    with pytest.raises(StorageFull, match="and for the maps"):
+    with pytest.raises(StorageFull, match="beside the maps"):
         await received(Staging(tmp_path, 2 * free, reserve=free + (1 << 30)), body(one=b"1"))
     roomy = Staging(tmp_path, 2 * free, reserve=0)
     with pytest.raises(StorageFull, match="no room for"):

@@ -1,4 +1,4 @@
-"""Explanations over HTTP: parts that add up, pictures that can be fetched, and maps that keep none."""
+"""Explanations over HTTP: their parts add up to the score, and their pictures can be fetched."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_parts_of_two_frames_add_up_to_their_score(client: httpx.Client) -> 
         assert left["word"] == right["word"]
 
 
-def test_a_frame_and_itself_answer_each_other_in_place(client: httpx.Client) -> None:
+def test_the_cells_of_a_frame_match_themselves(client: httpx.Client) -> None:
     explanation = client.post("/v1/match", params={"explain": True}, files=pair(jpeg(3), jpeg(3))).json()["explanation"]
     assert explanation["cells"] and all(cell["query"] == cell["match"] for cell in explanation["cells"])
     assert explanation["query_regions"] == explanation["match_regions"]
@@ -76,7 +76,7 @@ def test_a_blank_frame_is_explained_too(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize("keep", ["thumbnail", "image", "none"])
-def test_a_query_says_why(server: Server, keep: str) -> None:
+def test_a_query_can_be_explained(server: Server, keep: str) -> None:
     map_id = f"why-{keep}"
     server.create_map(map_id, keep=keep)
     for number in range(6):

@@ -1,4 +1,4 @@
-"""Queries that say what the robot knows: filters, soft priors, its own last frames; over HTTP."""
+"""Queries with filters, soft priors and the robot's own last frames, over HTTP."""
 
 from __future__ import annotations
 
@@ -77,11 +77,11 @@ def numbers(*which: int) -> set[str]:
         ({"sequence": "tuesday, late", "timestamp": "2026-11-20T10:07:30Z", "exclude_seconds": 91}, (0, 1, 2, 3, 4, 5)),
     ],
 )  # fmt: skip
-def test_only_what_is_allowed_is_found(find: Find, parameters: dict[str, object], expected: tuple[int, ...]) -> None:
+def test_filters_bound_what_is_found(find: Find, parameters: dict[str, object], expected: tuple[int, ...]) -> None:
     assert find(**parameters) == numbers(*expected)
 
 
-def test_nothing_allowed_is_an_answer(server: Server, yard: str) -> None:
+def test_a_filter_that_allows_nothing_is_answered(server: Server, yard: str) -> None:
     answer = server.query(yard, jpeg(3), x=1000, y=0, radius=1)
     assert (answer["verdict"], answer["reason"]) == ("unknown", "no-place-allowed")
     assert answer["matches"] == [] and answer["score"] is None and answer["probability"] is None
@@ -106,7 +106,7 @@ def test_around_the_antimeridian(server: Server, islands: str) -> None:
     assert ids(latitude=-17, longitude=-180, radius=50) == numbers(1)
 
 
-def test_a_filter_follows_what_places_are_given(server: Server, map_id: str) -> None:
+def test_a_filter_follows_edits_of_places(server: Server, map_id: str) -> None:
     def ids(**parameters: object) -> list[str]:
         return [match["place"]["id"] for match in server.query(map_id, jpeg(1), **parameters)["matches"]]
 
@@ -138,7 +138,7 @@ def test_a_soft_prior_chooses_among_places_that_look_alike(server: Server, map_i
         assert len(answer["matches"]) == 5, "nothing is ruled out"
 
 
-def test_a_soft_prior_makes_nothing_surer_and_a_carried_robot_is_found(server: Server, yard: str) -> None:
+def test_a_soft_prior_adds_no_certainty_and_a_carried_robot_is_found(server: Server, yard: str) -> None:
     frame = encoded(seen_again(scene(3)))
     plain = server.query(yard, frame)
     assert all(match["weight"] is None for match in plain["matches"])
@@ -224,7 +224,7 @@ def test_the_pose_is_estimated_where_a_place_is_recognized(server: Server, yard:
         {"exclude_frames": -1, "sequence": "monday"},
     ],
 )
-def test_what_cannot_be_known(server: Server, yard: str, parameters: dict[str, object]) -> None:
+def test_invalid_filters(server: Server, yard: str, parameters: dict[str, object]) -> None:
     data = jpeg(1)
     response = server.client.post(
         f"/v1/maps/{yard}/query", params={k: str(v) for k, v in parameters.items()}, content=data, headers=typed(data)

@@ -1,4 +1,4 @@
-"""Queries and their verdicts."""
+"""Queries over HTTP, and their verdicts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_the_margin_is_over_the_best_rival(server: Server, traverse: str) -> Non
     assert answer["margin"] == pytest.approx(answer["score"] - max(rivals))
 
 
-def test_a_place_that_nobody_enrolled_is_unknown(server: Server, traverse: str) -> None:
+def test_a_place_that_was_never_enrolled_is_unknown(server: Server, traverse: str) -> None:
     verdicts = []
     for seed in range(100, 110):
         answer = server.query(traverse, jpeg(seed))
@@ -51,7 +51,7 @@ def test_a_place_that_nobody_enrolled_is_unknown(server: Server, traverse: str) 
     assert verdicts.count("recognized") <= 3
 
 
-def test_two_places_alike_are_ambiguous(server: Server, map_id: str) -> None:
+def test_two_similar_places_are_ambiguous(server: Server, map_id: str) -> None:
     server.enrol(map_id, "here", jpeg(1), x=0, y=0)
     server.enrol(map_id, "there", jpeg(1), x=500, y=0)
     for number in range(10, 16):

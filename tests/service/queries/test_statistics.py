@@ -1,4 +1,4 @@
-"""What was answered is counted once, kept small, and lost only as far as is said."""
+"""Statistics of answers: each answer counts once, the file is bounded, and little is lost by a crash."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def counting(folder: Path, maps: Maps) -> QueryStatistics:
     return QueryStatistics(folder, 3600, lambda: maps.sizes, lambda _: maps.present)
 
 
-def test_what_was_counted_is_read_over_a_restart(tmp_path: Path, maps: Maps) -> None:
+def test_counts_survive_a_restart(tmp_path: Path, maps: Maps) -> None:
     first = counting(tmp_path, maps)
     assert first.read(LAB).since is None and first.read(LAB).weeks == ()
     for _ in range(3):
@@ -58,7 +58,7 @@ def test_what_was_counted_is_read_over_a_restart(tmp_path: Path, maps: Maps) -> 
 
 @given(st.lists(st.tuples(st.sampled_from(["p1", "p2", None]), st.booleans()), max_size=40))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25, deadline=None)
-def test_when_it_is_written_does_not_matter(
+def test_the_moments_of_writing_do_not_matter(
     tmp_path_factory: pytest.TempPathFactory, answers: list[tuple[str | None, bool]]
 ) -> None:
     maps, folder = Maps(), tmp_path_factory.mktemp("counted")
@@ -75,7 +75,7 @@ def test_when_it_is_written_does_not_matter(
     counted.close()
 
 
-def test_a_deleted_map_is_forgotten_and_one_out_of_service_is_not(tmp_path: Path, maps: Maps) -> None:
+def test_counts_of_deleted_maps_are_dropped_and_of_quarantined_maps_kept(tmp_path: Path, maps: Maps) -> None:
     counted = counting(tmp_path, maps)
     counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
     counted.flush()
@@ -88,7 +88,7 @@ def test_a_deleted_map_is_forgotten_and_one_out_of_service_is_not(tmp_path: Path
     counted.close()
 
 
-def test_places_that_are_gone_are_not_kept_for_ever(tmp_path: Path, maps: Maps) -> None:
+def test_counts_of_deleted_places_are_dropped(tmp_path: Path, maps: Maps) -> None:
     counted = counting(tmp_path, maps)
     for n in range(10 + SPARE_PLACES + 5):
         counted.observe(LAB, "recognized", f"p{n}", 0.5, 2.0)
@@ -96,7 +96,7 @@ def test_places_that_are_gone_are_not_kept_for_ever(tmp_path: Path, maps: Maps) 
     counted.close()
 
 
-def test_weeks_are_not_kept_for_ever(tmp_path: Path, maps: Maps) -> None:
+def test_old_weeks_are_dropped(tmp_path: Path, maps: Maps) -> None:
     counted = counting(tmp_path, maps)
     monday = date(2020, 1, 6)
     weeks = {m: Week.of(m, "unknown", 0.1, 0.1) for m in (monday + timedelta(weeks=n) for n in range(MOST_WEEKS + 9))}

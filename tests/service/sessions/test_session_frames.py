@@ -1,4 +1,4 @@
-"""A frame into a session, within the service: nothing is left of one that fails, nor of a session that was ended."""
+"""Frames of a session without HTTP: one that fails does not count, and a deleted session stays deleted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.places.enrolment import FrameToEnrol, enrol
-from service.sessions.frames import take_in
+from service.sessions.frames import process_frame
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer
 from service.sessions.sessions import Session
 from service.settings import Settings
@@ -55,11 +55,11 @@ async def walked(engine: Engine) -> Map:
 async def send(runtime: Runtime, map_: Map, session: Session, number: int) -> SessionAnswer:
     options = FrameParameters(frame=number)
     parts = runtime.engine, runtime.sessions, runtime.statistics
-    return await take_in(*parts, map_, session, jpeg(number), options, deadline(), None)
+    return await process_frame(*parts, map_, session, jpeg(number), options, deadline(), None)
 
 
 @pytest.mark.parametrize("kind", ["bayes", "path"])
-async def test_a_frame_whose_answer_fails_was_not_taken_in(
+async def test_a_frame_whose_answer_fails_does_not_count(
     runtime: Runtime, monkeypatch: pytest.MonkeyPatch, kind: Any
 ) -> None:
     map_ = await walked(runtime.engine)
@@ -89,7 +89,7 @@ async def test_a_frame_whose_answer_fails_was_not_taken_in(
     assert again.candidates[0].probability == pytest.approx(expected.candidates[0].probability, abs=1e-3)
 
 
-async def test_a_session_that_is_ended_during_a_frame_does_not_come_back(runtime: Runtime) -> None:
+async def test_a_session_deleted_during_a_frame_stays_deleted(runtime: Runtime) -> None:
     map_ = await walked(runtime.engine)
     session = runtime.sessions.create(map_, NewSession())
     await send(runtime, map_, session, 0)

@@ -13,7 +13,7 @@ from service.sessions.store import FILE, SessionStore, StoredSession
 ONE = StoredSession("s-1", "lab", "2026", "{}", 1.0, 2.0, 7, 3.5, "robot", 0, None, b"state", "{}")
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_sessions_are_read_as_they_were_written(tmp_path: Path) -> None:
     store = SessionStore(tmp_path)
     store.write(ONE)
     other = SessionStore(tmp_path)  # as after a crash: nothing was closed

@@ -1,4 +1,4 @@
-"""Sessions: a robot's run over HTTP."""
+"""Sessions over HTTP: a robot's run, frame by frame."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_frames_go_in_one_at_a_time(server: Server, traverse: str) -> None:
     assert sorted(answer["frames"] for answer in answers) == [1, 2, 3, 4]
 
 
-def test_a_bad_frame_is_not_taken_in(server: Server, traverse: str) -> None:
+def test_a_bad_frame_does_not_count(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     send(server, traverse, session, again(1), frame=1)
     for data, kind, status, slug in (
@@ -171,7 +171,7 @@ def test_bad_options_of_a_session(server: Server, traverse: str, options: object
     assert_problem(server.client.post(f"/v1/maps/{traverse}/sessions", json=options), 422, "invalid-request")
 
 
-def test_what_a_session_refers_to_must_be_there(server: Server, traverse: str) -> None:
+def test_a_session_needs_existing_sequences_and_cameras(server: Server, traverse: str) -> None:
     path = f"/v1/maps/{traverse}/sessions"
     assert_problem(server.client.post(path, json={"sequences": ["tuesday"]}), 404, "unknown-sequence")
     assert_problem(server.client.post(path, json={"camera": "left"}), 404, "unknown-camera")
@@ -214,7 +214,7 @@ def test_a_form_gives_the_same_answer(server: Server, traverse: str) -> None:
     assert response.json()["candidates"] == expected["candidates"]
 
 
-def test_out_of_the_map_and_carried_off(server: Server, map_id: str) -> None:
+def test_a_robot_that_leaves_the_map_or_is_carried_off(server: Server, map_id: str) -> None:
     for number in range(24):
         server.enrol(map_id, f"p{number}", jpeg(number), sequence="monday")
     session = begin(server, map_id)
@@ -287,7 +287,7 @@ def small(tmp_path: Path) -> Iterator[Server]:
     assert running.stop() == 0
 
 
-def test_what_was_charted_for_a_session_goes_with_it(tmp_path: Path) -> None:
+def test_the_graphs_of_deleted_sessions_are_dropped(tmp_path: Path) -> None:
     with runtime_at(tmp_path) as runtime:
         map_ = runtime.engine.atlas.create("lab", ENCODER, 8)
         map_.open()
@@ -296,7 +296,7 @@ def test_what_was_charted_for_a_session_goes_with_it(tmp_path: Path) -> None:
         runtime.sessions.create(map_, NewSession())
         for number in range(4):
             runtime.sessions.delete(runtime.sessions.create(map_, NewSession(sequences=[f"s{number}"])))
-        assert len(runtime.sessions._charts) == 1 and runtime.sessions.count() == 1
+        assert len(runtime.sessions._graphs) == 1 and runtime.sessions.count() == 1
         runtime.sessions.close()
 
 
@@ -321,7 +321,7 @@ def test_sessions_expire_and_are_bounded(small: Server) -> None:
 
 
 @pytest.mark.parametrize("end", ["kill", "stop"])
-def test_a_run_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
+def test_a_session_goes_on_after_a_restart(tmp_path: Path, end: str) -> None:
     install_coarse_encoder(tmp_path / "models")
     settings = {"encoder": COARSE}
     first = Server(tmp_path, settings=settings).wait()

@@ -1,4 +1,4 @@
-"""Sessions over a WebSocket, with a client of another make."""
+"""Sessions over a WebSocket, with another library's client."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_frames_sent_ahead_are_answered_in_their_order(server: Server, traverse:
     assert [answer["frames"] for answer in answers] == list(range(1, 9))
 
 
-def test_what_is_wrong_is_told_and_the_run_goes_on(server: Server, traverse: str) -> None:
+def test_errors_are_reported_and_the_stream_goes_on(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
         problems = [
@@ -83,7 +83,7 @@ def test_what_is_wrong_is_told_and_the_run_goes_on(server: Server, traverse: str
         assert ask(connection, again(1), frame=8)["problem"]["status"] == 409
 
 
-def test_a_frame_has_one_message_though_its_parameters_be_refused(server: Server, traverse: str) -> None:
+def test_a_frame_has_one_message_even_if_its_parameters_are_refused(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
         for texts in (["{"], ['{"frame": 1}', '{"frame": 2}']):
@@ -108,7 +108,7 @@ def test_a_session_that_is_not_there_is_refused_before_the_handshake(server: Ser
         assert json.loads(response.body)["status"] == status
 
 
-def test_one_stream_a_session(server: Server, traverse: str) -> None:
+def test_a_session_has_at_most_one_stream(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
         with pytest.raises(InvalidStatus) as refused, stream(server, traverse, session):
@@ -119,7 +119,7 @@ def test_one_stream_a_session(server: Server, traverse: str) -> None:
         assert ask(connection, again(1))["frames"] == 2
 
 
-def test_a_session_that_is_deleted_under_the_stream(server: Server, traverse: str) -> None:
+def test_a_session_deleted_during_a_stream(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with stream(server, traverse, session) as connection:
         ask(connection, again(0))

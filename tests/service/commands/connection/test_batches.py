@@ -16,7 +16,6 @@ from service.commands.connection.client import Refused, Service
 from service.commands.console import Failure
 from service.commands.traverse import Frame
 from tests.service.commands.connection.test_client import problem
-from tests.service.places.test_batch_order import order
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 from tests.service.upkeep.upkeeping import wait_until
@@ -85,7 +84,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_two_at_a_time_in_line(server: Server, map_id: str, tmp_path: Path) -> None:
     way = Mischief({})
     told = enrol(server, map_id, tmp_path, 26, way)
-    assert order(server, map_id) == [f"p{index}" for index in range(26)]
+    assert list(server.places(map_id)) == [f"p{index}" for index in range(26)]
     assert {one.change for one in told} == {"created"} and len(told) == 26
     assert way.most == 2 and len(way.sent) == 7
     names = [line["batch"] for line in way.sent]
@@ -102,7 +101,7 @@ def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, m
         lost=[5, 9],
     )
     told = enrol(server, map_id, tmp_path, 60, way)
-    assert order(server, map_id) == [f"p{index}" for index in range(60)]
+    assert list(server.places(map_id)) == [f"p{index}" for index in range(60)]
     assert {one.change for one in told} <= {"created", "unchanged"} and len(told) == 60
     assert len(way.sent) > 15  # those that were sent once more
 
@@ -110,7 +109,7 @@ def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, m
 def test_more_than_the_service_takes_at_a_time(server: Server, map_id: str, tmp_path: Path) -> None:
     way = Mischief({4: problem(413, "body-too-large"), 8: problem(503, "deadline-exceeded", **{"Retry-After": "1"})})
     assert len(enrol(server, map_id, tmp_path, 30, way)) == 30
-    assert order(server, map_id) == [f"p{index}" for index in range(30)]
+    assert list(server.places(map_id)) == [f"p{index}" for index in range(30)]
 
 
 @pytest.mark.parametrize("failing", [1, 2, 4])
@@ -120,10 +119,10 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, t
         enrol(server, map_id, tmp_path, 40, way)
     assert len(way.sent) <= failing + 1
     before = 4 * (failing - 1)
-    assert order(server, map_id) == [f"p{index}" for index in range(before)]
+    assert list(server.places(map_id)) == [f"p{index}" for index in range(before)]
     # The same again goes on.
     enrol(server, map_id, tmp_path, 40, Mischief({}))
-    assert order(server, map_id) == [f"p{index}" for index in range(40)]
+    assert list(server.places(map_id)) == [f"p{index}" for index in range(40)]
 
 
 @pytest.mark.timeout(300)
@@ -147,8 +146,8 @@ def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyP
     sender.join(60)
     assert len(ended) == 1
     server = Server(tmp_path / "service").wait()
-    kept = order(server, "walk")
+    kept = list(server.places("walk"))
     assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 160
     enrol(server, "walk", tmp_path, 160, Mischief({}))
-    assert order(server, "walk") == [f"p{index}" for index in range(160)]
+    assert list(server.places("walk")) == [f"p{index}" for index in range(160)]
     assert server.stop() == 0

@@ -1,4 +1,4 @@
-"""Locks of maps: one holder at a time, and none left behind."""
+"""Locks of maps: each has one holder at a time, and no lock is left behind."""
 
 from __future__ import annotations
 

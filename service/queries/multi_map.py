@@ -202,7 +202,8 @@ def _same_place(a: MapReport, b: MapReport) -> bool:
 def match_log_odds(report: MapReport) -> list[float]:
     """The log odds of each match of a map, by which the matches of several maps are ranked together.
 
-    Those of the best match come from the verdict; the others are lower by what their scores are lower.
+    Those of the best match come from the verdict.  Those of another match are lower in proportion to how much its
+    score is lower.
     """
     answer = report.answer
     assert answer is not None

@@ -1,4 +1,4 @@
-"""Query, and enrol if unknown: one step, repeatable; over HTTP."""
+"""Loop closure over HTTP: locate a frame and enrol it if it is unknown, in one repeatable step."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def fill(server: Server, map_id: str) -> None:
         server.enrol(map_id, f"b{number}", jpeg(number), x=100 * number, y=0)
 
 
-def test_what_nobody_knows_becomes_a_place(server: Server, map_id: str) -> None:
+def test_an_unknown_frame_becomes_a_place(server: Server, map_id: str) -> None:
     response = close(
         server, map_id, "p1", jpeg(1), x=3, y=4, heading=90, sequence="run", timestamp="2026-11-20T10:00:00Z",
         metadata={"floor": 2},
@@ -44,7 +44,7 @@ def test_what_nobody_knows_becomes_a_place(server: Server, map_id: str) -> None:
     assert (stored["sequence"], stored["timestamp"]) == ("run", "2026-11-20T10:00:00Z")
 
 
-def test_what_is_known_does_not(server: Server, map_id: str) -> None:
+def test_a_known_frame_does_not_become_a_place(server: Server, map_id: str) -> None:
     fill(server, map_id)
     server.enrol(map_id, "p1", jpeg(1), x=0, y=0)
     before = count(server, map_id)
@@ -83,7 +83,7 @@ def test_of_eight_robots_at_one_new_place_one_enrols_it(server: Server, map_id: 
     assert count(server, map_id) == len(BACKGROUND) + 1
 
 
-def test_a_robot_does_not_find_what_it_has_just_enrolled(server: Server, map_id: str) -> None:
+def test_a_robot_does_not_find_its_own_last_frames(server: Server, map_id: str) -> None:
     fill(server, map_id)
     looks = [encoded(seen_again(scene(1), seed)) for seed in range(3)]
     for second, look in enumerate(looks[:2]):
@@ -107,7 +107,7 @@ def test_a_blank_frame_is_no_place(server: Server, map_id: str) -> None:
     assert count(server, map_id) == 0
 
 
-def test_what_cannot_be(server: Server, map_id: str) -> None:
+def test_invalid_loop_closures(server: Server, map_id: str) -> None:
     data = jpeg(1)
     path = f"/v1/maps/{map_id}/query:enrol"
     assert_problem(server.client.post(path, content=data, headers=typed(data)), 422, "invalid-request")

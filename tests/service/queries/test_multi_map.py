@@ -1,4 +1,4 @@
-"""One moment's frames asked of several maps, and of rigs of cameras; over HTTP."""
+"""Queries of several maps, and of rigs of cameras, over HTTP."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_place_that_two_maps_have_is_ambiguous(fleet: Server) -> None:
     assert one["verdict"] == "recognized"
 
 
-def test_one_place_of_the_earth_in_two_maps_is_no_rival(server: Server) -> None:
+def test_one_geographic_place_in_two_maps_is_recognized(server: Server) -> None:
     for name in ("by-day", "by-night"):
         server.create_map(name)
         for number in range(8):
@@ -127,7 +127,7 @@ def test_filters_hold_for_every_map(fleet: Server) -> None:
     assert by_map(answer)["yard"]["verdict"] == "unknown"
 
 
-def test_a_blank_camera_spoils_nothing(fleet: Server) -> None:
+def test_a_blank_camera_is_ignored(fleet: Server) -> None:
     answer = ask_rig(fleet, {"front": again(3), "left": encoded(blank(320, 240))}, maps="hall")
     assert (answer["verdict"], answer["place"]["id"]) == ("recognized", "h3")
     assert [(frame["frame"], frame["regions"] > 0) for frame in answer["frames"]] == [("front", True), ("left", False)]
@@ -161,7 +161,7 @@ def rig_map(server: Server) -> str:
     return "rig"
 
 
-def test_two_cameras_are_surer_than_one(server: Server, rig_map: str) -> None:
+def test_two_cameras_are_more_certain_than_one(server: Server, rig_map: str) -> None:
     both = ask_rig(server, {"a": again(4), "b": again(204)}, maps=rig_map, k=4)
     assert both["verdict"] == "recognized" and both["place"]["pose"]["x"] == 40
     assert {match["place"]["id"] for match in both["matches"][:2]} == {"front-4", "left-4"}
@@ -184,7 +184,7 @@ def test_each_part_may_name_its_camera(server: Server, rig_map: str) -> None:
     assert unknown["verdict"] in {"recognized", "ambiguous"}
 
 
-def test_what_cannot_be_asked(fleet: Server) -> None:
+def test_invalid_queries_of_several_maps(fleet: Server) -> None:
     data = jpeg(1)
 
     def problem(status: int, slug: str, **parameters: object) -> None:

@@ -32,9 +32,9 @@ from service.http.uploads import FORM, check_part, media_type, read_frame, read_
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
+from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
-from service.queries.several import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
 
@@ -58,13 +58,13 @@ async def query_maps(
     principal: PrincipalDep,
     deadline: DeadlineDep,
 ) -> SeveralAnswer:
-    """Locate one moment's frames in several maps, ranked together by calibrated probability.
+    """Locate the frames of one moment in several maps; the matches are ranked together by calibrated probability.
 
-    A form with several file parts is one query of a rig: its cameras' evidence is added up place by place, so the
-    frames must be of one moment, and a blank one spoils nothing. A map that is damaged, unknown or lacks its encoder is
-    reported beside the others, which answer all the same. `place` is given only with the verdict `recognized`, which
-    needs the most probable match to be recognized in its own map, and no other map to have one nearly as probable
-    of another place.
+    A form with several file parts is one query of a rig: the evidence of its cameras is added up place by place, so
+    the frames must be of one moment; blank frames are ignored. A map that is damaged, unknown or lacks its encoder is
+    reported, and the other maps answer all the same. `place` is given only with the verdict `recognized`: the most
+    probable match is recognized in its own map, and no other map has a match of another place that is nearly as
+    probable.
     """
     engine.queue.check_room()
     frames, broken, options = await _frames(request, options, engine)
@@ -80,6 +80,7 @@ async def query_maps(
     recognized = together.best if together.verdict == "recognized" else None
     answers = [_map_answer(request, engine, report) for report in reports]
     for report in reports:
+        # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
         if report is recognized or len(reports) == 1:
             _count_for_health(engine, statistics, report)
     matches = _matches(reports, options.k)
@@ -183,7 +184,7 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
 
 
 def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
-    """Count an answer in the statistics of a map; of several maps only the one that recognized the place is counted."""
+    """Count an answer in the statistics of its map."""
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return
