@@ -26,7 +26,7 @@ from service.errors.problems import install_problems, problem_response
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.jobs import routes as jobs
-from service.maps import calibration_routes, camera_routes, transfer_routes
+from service.maps import calibration, camera_routes, transfer_routes
 from service.maps import routes as maps
 from service.places import routes as places
 from service.queries import loop_closure, several_routes
@@ -75,7 +75,7 @@ ROUTERS = (
     places.router,
     places.traverses,
     camera_routes.router,
-    calibration_routes.router,
+    calibration.router,
     loop_closure.router,
     several_routes.router,
     sessions.router,

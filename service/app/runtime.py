@@ -75,7 +75,7 @@ class Runtime:
         register(merging.KIND, partial(merging.merge, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
         register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
-        register(calibration.KIND, partial(calibration.calibrate, engine))
+        register(calibration.KIND, partial(calibration.run_job, engine))
         register(
             bulk_enrolment.KIND,
             partial(bulk_enrolment.enrol_staged, engine, staging),

@@ -13,7 +13,7 @@ import pytest
 from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.storage import Map
-from service.maps import calibration as calibrating
+from service.maps import calibration
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from tests.service.engines import ENCODER, end_of, runtime_at
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
@@ -235,33 +235,33 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
         found = manual.model_copy(update={"source": "map", "threshold": 0.25})
 
-        def measured(map_: Map, *_: object) -> CalibrationReport:
+        def measure(map_: Map, *_: object) -> CalibrationReport:
             if happens is not None:
                 map_.edit({"calibration": happens})
             return CalibrationReport.model_construct(
                 map="lab", encoder=ENCODER, method="map", stored=True, calibration=found, previous=manual, warnings=[]
             )
 
-        monkeypatch.setattr(calibrating, "measured", measured)
+        monkeypatch.setattr(calibration, "measure", measure)
         monkeypatch.setattr(runtime.engine, "load_encoder", lambda _: None)
-        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        wanted = calibration.job_arguments(lab, CalibrationOrder(method="map"), None)
         happens: Calibration | None = manual
-        job = end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted))
+        job = end_of(runtime, runtime.jobs.submit(calibration.KIND, "lab", arguments=wanted))
         assert job.problem is not None and job.problem["type"] == "urn:placerec:problem:revision-mismatch"
         assert lab.record.calibration == manual
 
         happens = None
         lab.edit({"description": "any other change does not matter"})
-        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        wanted = calibration.job_arguments(lab, CalibrationOrder(method="map"), None)
         lab.edit({"description": "nor one that comes later"})
-        assert end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted)).state == "succeeded"
+        assert end_of(runtime, runtime.jobs.submit(calibration.KIND, "lab", arguments=wanted)).state == "succeeded"
         assert lab.record.calibration == found
 
         with pytest.raises(RevisionMismatch):
-            calibrating.store(lab, manual, manual, None)
+            calibration.store(lab, manual, manual, None)
         with pytest.raises(RevisionMismatch):
-            calibrating.store(lab, manual, found, lab.record.revision - 1)
-        calibrating.store(lab, manual, found, lab.record.revision)
+            calibration.store(lab, manual, found, lab.record.revision - 1)
+        calibration.store(lab, manual, found, lab.record.revision)
         assert lab.record.calibration == manual
 
 
