@@ -20,7 +20,7 @@ from service.jobs.context import creation_time
 from service.upkeep import merging
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of
 
-COUNT = 5 * merging.CHUNK
+COUNT = 5 * merging.PLACES_PER_COMMIT
 WANTED: dict[str, Any] = {"from": "hall", "dry_run": False, "on_conflict": "rename", "prefix": "h.", "sample": 0}
 
 
@@ -39,16 +39,16 @@ def folder(tmp_path: Path) -> Path:
 
 def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], None]) -> None:
     """Let something happen in the middle of the merge, once."""
-    adopt, calls = merging._adopt, 0
+    copy, calls = merging._copy, 0
 
     def counted(context: Any, *arguments: Any) -> None:
         nonlocal calls
         calls += 1
         if calls == 3:
             happens(context)
-        adopt(context, *arguments)
+        copy(context, *arguments)
 
-    monkeypatch.setattr(merging, "_adopt", counted)
+    monkeypatch.setattr(merging, "_copy", counted)
 
 
 def check_merged(engine: Engine, before: list[tuple[Any, ...]], theirs: list[tuple[Any, ...]]) -> None:
