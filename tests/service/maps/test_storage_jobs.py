@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 
+from tests.service.map_jobs import enrol_many, finished
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import enrol_many, finished
 
 
 def test_a_map_is_rebuilt_and_verified_in_the_background(server: Server) -> None:

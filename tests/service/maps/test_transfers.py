@@ -20,9 +20,9 @@ from core.storage.archives.manifest import group_names
 from core.storage.archives.reading import Archive, check
 from tests.core.storage.archives.files import Parts, changed, line_changed, named, parts_of, sealed
 from tests.service.encoders import install_coarse_encoder
+from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import wait_until
 
 TAR = {"Content-Type": "application/x-tar"}
 _ids = itertools.count()

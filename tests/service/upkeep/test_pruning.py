@@ -13,7 +13,7 @@ from service.engine.engine import Engine
 from service.jobs.jobs import JobInterrupted
 from service.upkeep import pruning
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
-from tests.service.upkeep.upkeeping import wait_until
+from tests.service.map_jobs import wait_until
 
 GOING = ("l1", "l3", "l5")
 

@@ -10,9 +10,9 @@ import httpx
 import pytest
 
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder, install_two_stage_encoder
+from tests.service.map_jobs import asked, enrol_many, finished, places, reaching
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text
-from tests.service.upkeep.upkeeping import asked, enrol_many, finished, places, reaching
 
 PLACES = 6
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
+from tests.service.map_jobs import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
-from tests.service.upkeep.upkeeping import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 
 
 def between(seed: int, share: float) -> bytes:

@@ -16,10 +16,10 @@ from service.commands.connection.client import Refused, Service
 from service.commands.console import Failure
 from service.commands.manifest import Frame
 from tests.service.commands.connection.test_client import problem
+from tests.service.map_jobs import wait_until
 from tests.service.places.test_batch_order import order
 from tests.service.scenes import jpeg
 from tests.service.server import Server
-from tests.service.upkeep.upkeeping import wait_until
 
 
 class Mischief(httpx.AsyncBaseTransport):

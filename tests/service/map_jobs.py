@@ -1,4 +1,4 @@
-"""Maps to look after, and jobs to wait for."""
+"""Maps of many places that are quickly made, and waiting for the jobs of maps."""
 
 from __future__ import annotations
 
