@@ -1,9 +1,8 @@
-"""Maps calibrated over HTTP: by labelled frames, by a second traverse, by themselves; and what is refused."""
+"""Calibrating maps over HTTP by labelled frames, by a second traverse and by their own frames; refused requests."""
 
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,13 @@ from core.storage import Map
 from service.maps import calibration
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from tests.service.engines import ENCODER, end_of, runtime_at
+from tests.service.map_jobs import finished
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
 PLACES = 16
 PROMISE = {"rule": "precision", "value": 0.85}
-"""Sixteen right answers cannot promise much more."""
+"""Sixteen right answers are too few for a higher precision."""
 APART = 20.0  # metres: over three times the radius of a place, so that places are no neighbours
 
 
@@ -130,7 +130,7 @@ def test_labelled_frames_of_a_camera(server: Server, walked: str) -> None:
     assert_problem(plain, 422, "calibration-impossible")
 
 
-def test_the_map_itself_with_a_warning(server: Server, map_id: str) -> None:
+def test_the_own_frames_of_a_map_calibrate_it_with_a_warning(server: Server, map_id: str) -> None:
     for number in range(12):
         for step in range(2):
             data = encoded(seen_again(scene(number), step)) if step else jpeg(number)
@@ -145,10 +145,7 @@ def test_a_job_does_it_in_the_background(server: Server, walked: str) -> None:
     asked = calibrate(server.client, walked, background=True)
     assert asked.status_code == 202, asked.text
     assert asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"
-    until = time.monotonic() + 60
-    while (job := server.client.get(asked.headers["location"]).json())["state"] in ("queued", "running"):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    job = finished(server, asked.json())
     assert job["state"] == "succeeded", job
     assert job["result"] == calibrate(server.client, walked).json()
 
@@ -192,7 +189,7 @@ def test_orders_that_do_not_fit(client: httpx.Client, walked: str, fields: dict[
     assert_problem(calibrate(client, walked, **fields), 422, "invalid-request")
 
 
-def test_names_that_are_not_there(client: httpx.Client, walked: str) -> None:
+def test_unknown_names(client: httpx.Client, walked: str) -> None:
     assert_problem(calibrate(client, "nowhere"), 404, "unknown-map")
     assert_problem(calibrate(client, walked, sequence="sunday"), 404, "unknown-sequence")
     assert_problem(calibrate(client, walked, pairs={"t1": "m99"}), 404, "unknown-place")
@@ -213,7 +210,7 @@ def test_forms_that_do_not_fit(client: httpx.Client, walked: str) -> None:
     assert_problem(no_order, 422, "invalid-request")
 
 
-def test_bodies_that_are_none(client: httpx.Client, walked: str) -> None:
+def test_bodies_that_are_no_orders(client: httpx.Client, walked: str) -> None:
     path = f"/v1/maps/{walked}/calibrate"
     json_type = {"Content-Type": "application/json"}
     assert_problem(client.post(path, content=b"{", headers=json_type), 400, "malformed-body")
@@ -229,7 +226,7 @@ def test_an_edit_in_between_is_noticed(client: httpx.Client, walked: str) -> Non
 
 
 def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The job, a restart between its commit and its end, and an order that came too late; without HTTP."""
+    """A job that finds another calibration, and one that finds other edits; without HTTP."""
     with runtime_at(tmp_path) as runtime:
         lab = runtime.engine.atlas.create("lab", ENCODER, 8)
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
@@ -265,7 +262,7 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
         assert lab.record.calibration == manual
 
 
-def test_what_takes_longer_than_the_request_may_is_given_up(server: Server, walked: str) -> None:
+def test_a_request_that_runs_out_of_time_stores_nothing(server: Server, walked: str) -> None:
     before = server.client.get(f"/v1/maps/{walked}").json()["calibration"]
     response = server.client.post(
         f"/v1/maps/{walked}/calibrate",
