@@ -97,18 +97,18 @@ def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequen
     clashing: list[str] = []
     unnamed: list[Outline] = []  # places that should be copied, but have no free id
     for place in other.transfer.outline():
-        there = here.get(place.id)
-        if there is not None and there.digest == place.digest:
+        present = here.get(place.id)
+        if present is not None and present.digest == place.digest:
             known += 1
-        elif there is None:
+        elif present is None:
             coming.append((place, place.id))
         elif rule == "skip":
             skipped.append(place.id)
         elif rule == "rename":
             name = prefix + place.id
-            if (there := here.get(name)) is not None and there.digest == place.digest:
+            if (present := here.get(name)) is not None and present.digest == place.digest:
                 known += 1
-            elif there is not None or not _can_name_a_place(name):
+            elif present is not None or not _can_name_a_place(name):
                 clashing.append(name)
                 unnamed.append(place)
             else:
@@ -214,10 +214,10 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 
 def _new_cameras(map_: Map, other: Map, plan: Plan) -> list[str]:
-    there = {camera.name for camera in map_.cameras.all()}
+    existing = {camera.name for camera in map_.cameras.all()}
     used = {place.camera for place, _ in plan.coming}
     names = [plan.cameras.get(camera.name, camera.name) for camera in other.cameras.all() if camera.name in used]
-    return [name for name in names if name not in there]
+    return [name for name in names if name not in existing]
 
 
 def _places_before(context: JobContext, map_: Map) -> list[Outline]:
@@ -257,8 +257,8 @@ def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str
     """
     free: list[tuple[Outline, str]] = []
     for place, name in due:
-        there = map_.digest(name)
-        if there is None or there.hex() == context.notes["coming"][name]:
+        digest = map_.digest(name)
+        if digest is None or digest.hex() == context.notes["coming"][name]:
             free.append((place, name))
         elif context.arguments["on_conflict"] != "skip":
             raise MergeConflict(f"The place {name!r} was enrolled with another frame during the merge.")
@@ -311,14 +311,11 @@ def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: Bas
     """
     try:
         noted = {name: {bytes.fromhex(digest)} for name, digest in context.notes["coming"].items()}
-        with suppress(PlacerecError):  # if the other map is gone, its places were copied as they are noted
-            for place, name in (
-                []
-                if other is None
-                else plan_merge(map_, other, context.arguments, _places_before(context, map_)).coming
-            ):
-                if name in noted:
-                    noted[name].add(place.digest)
+        if other is not None:
+            with suppress(PlacerecError):  # if the other map is gone, its places were copied as they are noted
+                for place, name in plan_merge(map_, other, context.arguments, _places_before(context, map_)).coming:
+                    if name in noted:
+                        noted[name].add(place.digest)
         copied = {
             place.id: place.digest
             for place in map_.transfer.outline()
@@ -374,14 +371,14 @@ def measure_overlap(engine: Engine, context: JobContext, map_: Map, other: Map) 
         rows = np.array([place.row for place in some], np.int64)
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
         encodings = [Encoding(d, cells, _NO_REGIONS, {}) for d, cells in zip(descriptors, local, strict=True)]
-        there = other.transfer.find([place.id for place in some])
+        stored = other.transfer.find([place.id for place in some])
         for place, located in zip(some, locate(map_, encoder, encodings, 1), strict=True):
             verdicts[located.judgement.verdict] += 1
-            if located.judgement.verdict != "recognized" or place.id not in there:
+            if located.judgement.verdict != "recognized" or place.id not in stored:
                 continue
             score, match = located.matches[0]
             pairs.append({"place": place.id, "match": match.id, "score": float(score)})
-            ours, theirs = match.pose, there[place.id][0].pose
+            ours, theirs = match.pose, stored[place.id][0].pose
             if ours is not None and theirs is not None and ours.kind() == theirs.kind():
                 apart.append(float(np.linalg.norm(ours.position() - theirs.position())))
         context.progress(first + len(some), len(chosen), "comparing the maps")

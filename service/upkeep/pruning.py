@@ -62,21 +62,21 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 
 def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str, str]]:
     """The report, and the SHA-256 of the images of the places to remove, by id."""
-    wanted = context.arguments
+    options = context.arguments
     map_ = context.map(engine.atlas)
     own = SelfQueries(map_, engine.load_encoder(map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
-    if wanted["queries"] is not None:
-        queries = _members(names, wanted["queries"])
+    if options["queries"] is not None:
+        queries = _members(names, options["queries"])
         references = ~queries
     else:
         queries = references = np.ones(len(own), np.bool_)
-    trial = _search(engine, context, own, queries, references, wanted["sample"])
+    trial = _search(engine, context, own, queries, references, options["sample"])
     pairs = neighbour_pairs(own.where, own.neighborhood)
-    removable = references & _members(names, wanted["sequence"]) if wanted["sequence"] is not None else references
+    removable = references & _members(names, options["sequence"]) if options["sequence"] is not None else references
     pairs = pairs[references[pairs].all(axis=1)]
     similarity = _similarities(engine, context, own, pairs)
-    choices = steps(similarity, STEPS) if wanted["similarity"] is None else [wanted["similarity"]]
+    choices = steps(similarity, STEPS) if options["similarity"] is None else [options["similarity"]]
     before = trial.found(references)
     tried: list[Thinning] = []
     for least in choices:
@@ -84,7 +84,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         # Places that must stay can stand in for others, but not the other way round.
         kept = thinned(len(own), pairs, similarity, least, removable)
         tried.append(Thinning(least, kept, before, trial.found(kept & references)))
-    most_loss = 1.0 if wanted["similarity"] is not None else wanted["max_recall_loss"]
+    most_loss = 1.0 if options["similarity"] is not None else options["max_recall_loss"]
     chosen = best_thinning(tried, most_loss)
     going = (
         {} if chosen is None else {own.places[i].id: own.places[i].digest.hex() for i in np.flatnonzero(~chosen.kept)}
@@ -94,7 +94,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         "places": len(own),
         "removed": len(going),
         "similarity": None if chosen is None else chosen.least,
-        "measured_on": "leave-one-out" if wanted["queries"] is None else wanted["queries"],
+        "measured_on": "leave-one-out" if options["queries"] is None else options["queries"],
         "queries": len(before),
         "recall_before": _share(before),
         "recall_after": _share(after),

@@ -83,20 +83,20 @@ def submit(
     responses=problem_documentation(*JOB_PROBLEMS, errors.MapExists, TooManyMaps, errors.UnknownEncoder, ImagesMissing),
 )
 def reencode_map(
-    map_id: MapId, wanted: Reencoding, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
+    map_id: MapId, options: Reencoding, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
     """Make a new map from the images of this map, for another encoder or with the cameras' present masks.
 
     The map must keep the images of all its places. It serves meanwhile, and changes to it are copied, too. The new
     map is listed only when it is complete.
     """
-    check_map_id(wanted.to)
-    principal.require(wanted.to)
+    check_map_id(options.to)
+    principal.require(options.to)
     map_ = engine.atlas.get(map_id)
-    identity = engine.resolve(wanted.encoder)
+    identity = engine.resolve(options.encoder)
     reencoding.check_images(map_)
-    check_new_map(engine, jobs, wanted.to)
-    return submit(engine, jobs, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
+    check_new_map(engine, jobs, options.to)
+    return submit(engine, jobs, response, reencoding.KIND, {"to": options.to, "encoder": identity}, map_)
 
 
 @router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
@@ -140,7 +140,7 @@ async def check_health(
     dependencies=[Depends(json_body)],
     responses=problem_documentation(*JOB_PROBLEMS, errors.UnknownSequence),
 )
-def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
+def prune_map(map_id: MapId, options: Pruning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
     """Remove places whose neighbours can stand in for them; by default, only report how much recall would be lost.
 
     A place is removed only if a place that stays is the same place by the map's settings and looks alike. With
@@ -148,14 +148,14 @@ def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, jobs: JobsDep, 
     """
     map_ = engine.atlas.get(map_id)
     sequences = map_.transfer.sequence_ends()
-    for name in (wanted.sequence, wanted.queries):
+    for name in (options.sequence, options.queries):
         if name is not None and name not in sequences:
             raise errors.UnknownSequence(f"The map has no sequence {name!r}.")
-    if wanted.queries is not None and wanted.queries == wanted.sequence:
+    if options.queries is not None and options.queries == options.sequence:
         raise InvalidRequest(
             "queries: a sequence whose frames are the queries cannot be pruned; name another sequence."
         )
-    return submit(engine, jobs, response, pruning.KIND, wanted.model_dump(), map_)
+    return submit(engine, jobs, response, pruning.KIND, options.model_dump(), map_)
 
 
 @router.post(
@@ -165,7 +165,7 @@ def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, jobs: JobsDep, 
     responses=problem_documentation(*JOB_PROBLEMS, errors.WrongEncoder, MergeConflict),
 )
 def merge_map(
-    map_id: MapId, wanted: Merging, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
+    map_id: MapId, options: Merging, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
     """Copy the places of another map of the same encoder into this one; by default, only report what would be copied.
 
@@ -173,13 +173,13 @@ def merge_map(
     recognizes. With `"dry_run": false` the places are copied with their pictures and are not encoded again. Poses are
     copied as they are, so both maps must use the same frame of reference.
     """
-    if wanted.source == map_id:
+    if options.source == map_id:
         raise InvalidRequest("from: a map cannot be merged with itself.")
-    principal.require(wanted.source)
-    map_, other = engine.atlas.get(map_id), engine.atlas.get(wanted.source)
+    principal.require(options.source)
+    map_, other = engine.atlas.get(map_id), engine.atlas.get(options.source)
     merging.check_same_encoder(map_, other)
-    arguments = wanted.model_dump(by_alias=True) | {"prefix": wanted.prefix or f"{wanted.source}-"}
-    if not wanted.dry_run:
+    arguments = options.model_dump(by_alias=True) | {"prefix": options.prefix or f"{options.source}-"}
+    if not options.dry_run:
         plan = merging.plan_merge(map_, other, arguments, map_.transfer.outline())
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))

@@ -35,13 +35,14 @@ def runtime_at(folder: Path) -> Iterator[Runtime]:
         runtime.engine.close()
 
 
-def enrolments(first: int, count: int, name: str, sequence: str) -> list[Enrolment]:
+def enrolments(first: int, count: int, name: str, sequence: str, dimension: int = 8) -> list[Enrolment]:
+    """Places with random descriptors, numbered from ``first`` on."""
     random = np.random.default_rng(first)
     made = []
     for number in range(first, first + count):
         picture = f"picture {number}".encode()
         fields = PlaceFields(pose=Pose(x=number, y=0), sequence=sequence, metadata={"number": number})
-        descriptor = random.normal(size=8).astype(np.float32)
+        descriptor = random.normal(size=dimension).astype(np.float32)
         digest = number.to_bytes(32, "big")
         made.append(Enrolment(f"{name}{number}", fields, descriptor, 5, digest, thumbnail=picture))
     return made

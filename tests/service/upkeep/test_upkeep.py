@@ -12,9 +12,10 @@ import httpx
 import numpy as np
 import pytest
 
+from core.storage import MapSettings
 from service.queries.statistics import key_of
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
-from tests.service.engines import runtime_at
+from tests.service.engines import enrolments, runtime_at
 from tests.service.map_jobs import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
@@ -301,13 +302,18 @@ MANY = 640
 
 @pytest.mark.timeout(300)  # the service is started several times
 def test_a_kill_in_the_middle_of_a_merge(folder: Path) -> None:
+    with runtime_at(folder) as runtime:
+        identity = runtime.engine.resolve(COARSE)
+        encoder = next(one for one in runtime.engine.catalogue.describe() if one.identity == identity)
+        settings = MapSettings(keep="thumbnail")
+        for name, first, count, sequence in (("lab", 1, 64, "monday"), ("hall", 1001, MANY, "tuesday")):
+            map_ = runtime.engine.atlas.create(name, identity, encoder.dimension, settings, encoder.local_shape)
+            map_.enrol(enrolments(first, count, name[0], sequence, encoder.dimension))
     server = Server(folder).wait()
-    enrol_many(server, "lab", 64, keep="thumbnail")
-    enrol_many(server, "hall", MANY, keep="thumbnail", name="h", sequence="tuesday")
     answered = 0
 
     def ask() -> None:
-        """Robots that ask without a pause: the merge stands back for each, and takes its time."""
+        """A robot that queries without a pause: the merge gives way to each query, and so takes long."""
         nonlocal answered
         with suppress(httpx.TransportError), httpx.Client(base_url=server.client.base_url, timeout=30) as client:
             while client.post("/v1/maps/lab/query", content=jpeg(3), headers=typed(jpeg(3))).status_code == 200:
@@ -316,7 +322,7 @@ def test_a_kill_in_the_middle_of_a_merge(folder: Path) -> None:
     robots = [threading.Thread(target=ask) for _ in range(3)]
     for robot in robots:
         robot.start()
-    wait_until(lambda: answered >= len(robots))  # all of them ask by now
+    wait_until(lambda: answered >= len(robots))  # all of them have begun
     before = answered
     job = asked(server, "lab", "merge", dry_run=False, sample=0, **{"from": "hall"})
     reaching(server, job, 64)
