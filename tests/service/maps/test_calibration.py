@@ -62,15 +62,15 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
     assert dry["stored"] is False
     assert server.client.get(f"/v1/maps/{walked}").json() == before.json()
 
-    told = calibrate(server.client, walked, dry_run=False).json()
-    assert told["stored"] is True and told["calibration"] == dry["calibration"]
-    assert told["previous"] == before.json()["calibration"]
+    report = calibrate(server.client, walked, dry_run=False).json()
+    assert report["stored"] is True and report["calibration"] == dry["calibration"]
+    assert report["previous"] == before.json()["calibration"]
     after = server.client.get(f"/v1/maps/{walked}").json()
-    assert after["calibration"] == told["calibration"]
+    assert after["calibration"] == report["calibration"]
     assert after["calibration"]["source"] == "sequence:tuesday"
     assert (after["calibration"]["frames"], after["revision"]) == (PLACES + 6, before.json()["revision"] + 1)
 
-    measured = told["measurement"]
+    measured = report["measurement"]
     assert (measured["known"], measured["unknown"]) == (PLACES, PLACES + 6)
     assert measured["auc_roc"] > 0.8 and measured["auc_roc_right"] > 0.8
     held = measured["cross_validated"]
@@ -79,9 +79,9 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
     assert held["reliability"]["answers"] == 2 * PLACES + 6
     thresholds = [point["threshold"] for point in measured["points"]]
     assert thresholds == sorted(thresholds)
-    assert "22 frames" in told["warnings"][0]
+    assert "22 frames" in report["warnings"][0]
     answer = server.query(walked, jpeg(3))
-    assert answer["threshold"] == told["calibration"]["threshold"]
+    assert answer["threshold"] == report["calibration"]["threshold"]
 
     reset = server.client.patch(f"/v1/maps/{walked}", json={"calibration": None})
     assert reset.json()["calibration"]["source"] == "encoder-default"
@@ -89,9 +89,9 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
 
 def test_stated_pairs_stand_in_for_poses(server: Server, walked: str) -> None:
     pairs = {f"t{number}": f"m{number}" for number in range(PLACES)} | {f"t{PLACES}": None}
-    told = calibrate(server.client, walked, pairs=pairs).json()["measurement"]
-    assert (told["frames"], told["known"], told["unknown"]) == (PLACES + 1, PLACES, PLACES + 1)
-    assert told["right"] >= 0.8 * PLACES
+    report = calibrate(server.client, walked, pairs=pairs).json()["measurement"]
+    assert (report["frames"], report["known"], report["unknown"]) == (PLACES + 1, PLACES, PLACES + 1)
+    assert report["right"] >= 0.8 * PLACES
     too_much = calibrate(server.client, walked, pairs=pairs, target={"rule": "precision", "value": 0.99})
     assert "promise" in assert_problem(too_much, 422, "calibration-impossible")["detail"]
     turned = {f"t{number}": f"m{(number + 8) % PLACES}" for number in range(PLACES)}
@@ -103,9 +103,9 @@ def test_labelled_frames(server: Server, walked: str) -> None:
     files = {f"f{number}": encoded(seen_again(scene(number), 100 + number)) for number in range(14)}
     files |= {f"stranger{number}": jpeg(200 + number) for number in range(4)}
     labels = [{"file": name, "place": f"m{name[1:]}" if name[0] == "f" else None} for name in files]
-    told = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.1})
-    assert told.status_code == 200, told.text
-    report = told.json()
+    response = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.1})
+    assert response.status_code == 200, response.text
+    report = response.json()
     assert report["measurement"]["known"] == 14 and report["measurement"]["unknown"] == 18
     assert report["calibration"]["source"] == "frames"
     strict = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.01}).json()
@@ -135,10 +135,10 @@ def test_the_own_frames_of_a_map_calibrate_it_with_a_warning(server: Server, map
         for step in range(2):
             data = encoded(seen_again(scene(number), step)) if step else jpeg(number)
             server.enrol(map_id, f"p{number}-{step}", data, x=APART * number + step, y=0)
-    told = calibrate(server.client, map_id, method="map", sequence=None, target={"rule": "mean_of_negatives"}).json()
-    assert told["calibration"]["source"] == "map"
-    assert "one walk" in told["warnings"][0]
-    assert told["measurement"]["frames"] == 24
+    report = calibrate(server.client, map_id, method="map", sequence=None, target={"rule": "mean_of_negatives"}).json()
+    assert report["calibration"]["source"] == "map"
+    assert "one walk" in report["warnings"][0]
+    assert report["measurement"]["frames"] == 24
 
 
 def test_a_job_does_it_in_the_background(server: Server, walked: str) -> None:
