@@ -1,1 +1,1 @@
-"""The application, put together."""
+"""The application: its lifetime, its routes at the root, and the page that documents its interface."""

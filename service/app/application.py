@@ -1,4 +1,4 @@
-"""The application: layers around it, routes in it, and what lives while it runs."""
+"""The application: its routes, its middleware, and the runtime that lives while it runs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
 from service.jobs import routes as jobs
-from service.maps import calibration_routes, camera_routes, transfer_routes
+from service.maps import calibration, camera_routes, transfer_routes
 from service.maps import routes as maps
 from service.maps.schemas import CalibrationOrder
 from service.places import routes as places
@@ -46,40 +46,43 @@ SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out
 DESCRIPTION = """\
 Enrol the frames of a traverse as the places of a map, then ask where another frame was taken.
 
-A frame travels as the raw body (`image/jpeg`, `image/png`, `image/webp`) with its parameters in the query \
-string, or as a `multipart/form-data` with one file part and the same parameters as fields. A 2xx on a write means \
-that it is on disk and found by every later query, so a request without an answer can simply be sent again.
+A frame is sent as the raw body (`image/jpeg`, `image/png`, `image/webp`) with its parameters in the query \
+string, or as `multipart/form-data` with one file part and the same parameters as fields. A 2xx answer to a write \
+means that it is on disk and found by every later query; a request that got no answer can be sent again.
 
-`X-Request-Id` is taken or made. `X-Request-Timeout` (seconds) drops a request that would come too late. \
-An answer with `Retry-After` asks to be tried again.
+The service uses the `X-Request-Id` of a request, or makes one. `X-Request-Timeout` (seconds) drops a request that \
+cannot be answered in time. An answer with `Retry-After` asks the client to send the request again later.
 
-As soon as a key was ever created, every request needs one: `Authorization: Bearer placerec_…`. \
-Each operation says what role its key needs: `query`, `enrol` (may also query) or `admin` (may do everything).
+As soon as a key has been created, every request needs one: `Authorization: Bearer placerec_…`. \
+Each operation names the role that its key needs: `query`, `enrol` (may also query) or `admin` (may do everything).
 """
 TAGS = [
     {"name": "maps", "description": "A map is one environment, bound for life to one encoder."},
     {"name": "places", "description": "A place is one enrolled reference frame."},
     {"name": "sequences", "description": "A sequence is one traverse: it is listed and deleted as a whole."},
-    {"name": "cameras", "description": "What of a camera's frames is to be ignored."},
+    {"name": "cameras", "description": "A camera has a mask: which part of its frames is ignored."},
     {"name": "queries", "description": "A query is one frame, answered with ranked matches and a verdict."},
-    {"name": "calibration", "description": "When the answers of a map are to be believed, measured on the map itself."},
-    {"name": "sessions", "description": "A session is a robot's run: a belief over places, frame by frame."},
-    {"name": "frames", "description": "What the encoder makes of a frame, without a map."},
-    {"name": "upkeep", "description": "Making a map anew, its health, pruning, merging."},
-    {"name": "transfer", "description": "Maps as files: backup, restore, move."},
-    {"name": "jobs", "description": "Long work: it goes on in the background and is told as it does."},
-    {"name": "encoders", "description": "Models and vocabularies installed."},
-    {"name": "service", "description": "Health, counters, version."},
+    {
+        "name": "calibration",
+        "description": "A calibration decides when a map's answers are believed; it is measured on the map itself.",
+    },
+    {"name": "sessions", "description": "A session is a robot's run: a belief over places that every frame updates."},
+    {"name": "frames", "description": "The encoder applied to frames, without a map."},
+    {"name": "upkeep", "description": "Re-encoding, rebuilding, health reports, pruning and merging of maps."},
+    {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
+    {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
+    {"name": "encoders", "description": "The models and vocabularies that are installed."},
+    {"name": "service", "description": "Health, metrics and version of the service."},
 ]
 
 ROUTERS = (
-    queries.router,  # routes are tried in turn, so the one that robots ask most comes first
+    queries.router,  # routes are tried in this order, so the most frequent one comes first
     root.router,
     maps.router,
     places.router,
     places.traverses,
     camera_routes.router,
-    calibration_routes.router,
+    calibration.router,
     loop_closure.router,
     multi_map_routes.router,
     sessions.router,
@@ -94,7 +97,7 @@ ROUTERS = (
 
 
 def _operation_id(route: APIRoute) -> str:
-    """An operation is called as the function that does it."""
+    """An operation has the name of its function."""
     return route.name
 
 
@@ -106,11 +109,11 @@ class Application(FastAPI):
         return document(self, (BatchItem, CalibrationOrder))
 
 
-class Published:
-    """ASGI layer that tells the application under which path a proxy publishes it.
+class RootPath:
+    """ASGI middleware that tells the application under which path a proxy publishes it.
 
     Args:
-        root_path: such as /placerec; requests may come with it or, where the proxy takes it off, without.
+        root_path: for example /placerec; requests may come with it or, if the proxy removes it, without it.
     """
 
     def __init__(self, app: ASGIApp, root_path: str) -> None:
@@ -125,8 +128,8 @@ class Published:
         await self.app(scope, receive, send)
 
 
-async def _tell_methods(request: Request, _error: Exception) -> Response:
-    """405 with all the methods that the resource has; the framework names those of one route alone."""
+async def _method_not_allowed(request: Request, _error: Exception) -> Response:
+    """Answer 405 with all methods of the resource; the framework would name those of one route only."""
     path = request.scope["path"].removeprefix(request.scope["root_path"])
     routes = [one for router in ROUTERS for one in router.routes if isinstance(one, APIRoute)]
     found = [route for route in routes if route.path_regex.match(path)]
@@ -134,12 +137,12 @@ async def _tell_methods(request: Request, _error: Exception) -> Response:
     known = {method for route in literal or found for method in route.methods or ()}
     known |= {"HEAD"} if "GET" in known else set()
     allowed = ", ".join(sorted(known))
-    detail = f"{request.scope['method'][:20]} is not possible here; what is: {allowed}."
+    detail = f"The method {request.scope['method'][:20]} is not allowed here; allowed are {allowed}."
     return problem_response(request, HTTPException(405, detail, {"Allow": allowed}))
 
 
-async def _tell_unknown(scope: Scope, receive: Receive, send: Send) -> None:
-    """404 for a path without a route; the framework would answer a WebSocket with an empty 403."""
+async def _not_found(scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer 404 if a path has no route; the framework would answer a WebSocket with an empty 403."""
     error = HTTPException(404)
     if scope["type"] != "websocket":
         raise error
@@ -148,15 +151,16 @@ async def _tell_unknown(scope: Scope, receive: Receive, send: Send) -> None:
 
 
 def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> FastAPI:
-    """The service; nothing is opened or loaded before it starts.
+    """Create the application; nothing is opened or loaded before it starts.
 
     Args:
-        settings: from the environment if left out.
-        as_owner: for a caller in this process, who can read the disk and needs no key; never for a server.
+        settings: read from the environment if left out.
+        as_owner: no request needs a key.  This is for a client in the same process, which can read the disk anyway;
+            never for a server.
 
     Raises:
         SettingsError: a setting is wrong, or would expose the service without keys.
-        KeysUnreadable: it cannot be told whether there are keys.
+        KeysUnreadable: the file of keys cannot be read.
     """
     chosen = settings if settings is not None else read_settings()
     store = KeyStore(chosen.data_dir)
@@ -185,7 +189,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         summary=SUMMARY,
         description=DESCRIPTION,
         openapi_tags=TAGS,
-        openapi_url=None,  # routes of our own: strict about nothing from elsewhere
+        openapi_url=None,  # service.app.routes serves the document and a page that loads nothing from other sites
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
@@ -193,15 +197,15 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
         lifespan=lifespan,
     )
     install_problems(app)
-    app.add_exception_handler(405, _tell_methods)
+    app.add_exception_handler(405, _method_not_allowed)
     for router in ROUTERS:
         app.include_router(router)
-    app.router.default = _tell_unknown
+    app.router.default = _not_found
     app.state.gate = gate
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
     app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics)
     app.add_middleware(Telemetry, metrics=metrics)
     if chosen.root_path:
-        app.add_middleware(Published, root_path=chosen.root_path)  # the outermost is added last
+        app.add_middleware(RootPath, root_path=chosen.root_path)  # the outermost middleware is added last
     return app

@@ -1,4 +1,4 @@
-"""The page at /docs: the OpenAPI document for people, in one self-contained HTML file."""
+"""The page at /docs, which shows the OpenAPI document in one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ Json = dict[str, Any]
 
 
 def page(document: Json) -> str:
-    """The whole page for an OpenAPI document."""
+    """The HTML page of an OpenAPI document."""
     groups: dict[str, list[tuple[str, str, Json]]] = {tag["name"]: [] for tag in document.get("tags", [])}
     for path, item in document["paths"].items():
         for method, operation in item.items():
@@ -86,7 +86,7 @@ def _menu(name: str, operations: list[tuple[str, str, Json]]) -> str:
 
 
 def _prose(text: str) -> str:
-    """Paragraphs; what stands between back-ticks as code."""
+    """Text as HTML paragraphs, with code where it has back-ticks."""
     paragraphs = []
     for paragraph in filter(None, text.split("\n\n")):
         pieces = escape(paragraph).split("`")
@@ -142,7 +142,7 @@ def _resolve(document: Json, schema: Json) -> Json:
 
 
 def _content(document: Json, content: Json) -> str:
-    """An example if there is one, else the names of the fields."""
+    """An example if the schema has one, else the names and descriptions of its fields."""
     schema = _resolve(document, content.get("schema", {}))
     for example in schema.get("examples", []):
         shown = json.dumps(example, indent=2, ensure_ascii=False)
@@ -158,7 +158,7 @@ def _content(document: Json, content: Json) -> str:
 
 
 def _curl(method: str, path: str, operation: Json) -> str:
-    """A command line that does it."""
+    """A command line that performs the operation."""
     address = path.replace("{map}", "lab").replace("{place}", "p7").replace("{sequence}", "monday")
     address = address.replace("{job}", "5f0c6a1de2b94c77")
     address = address.replace("{session}", "s-4f2a9c01d37be586")

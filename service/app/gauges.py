@@ -1,4 +1,4 @@
-"""Gauges that are read when Prometheus asks: how full each bounded resource is, and how maps are searched."""
+"""Gauges that are computed when Prometheus reads them: how full each bounded resource is, how maps are searched."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from service.jobs.records import JobState
 
 
 class RuntimeCollector(Collector):
-    """Gauges of what lives while the application runs.
+    """Collects the gauges of a running application.
 
     Args:
-        uploads: the memory of request bodies.
-        threads: of the storage.
+        uploads: the memory that request bodies occupy.
+        threads: the limiter of the threads for storage.
     """
 
     def __init__(self, runtime: Runtime, uploads: UploadMemory, threads: CapacityLimiter) -> None:
@@ -32,50 +32,56 @@ class RuntimeCollector(Collector):
 
     def collect(self) -> Iterable[Metric]:
         runtime = self._runtime
-        yield _gauge("placerec_upload_bytes", "Bytes of request bodies that are held.", self._uploads.held)
+        yield _gauge("placerec_upload_bytes", "Bytes of request bodies held in memory.", self._uploads.held)
         busy, waiting = self._threads.borrowed_tokens, self._threads.statistics().tasks_waiting
-        yield _gauge("placerec_storage_threads", "Threads that may search, read or write.", self._threads.total_tokens)
-        yield _gauge("placerec_storage_threads_busy", "Threads that do.", busy)
-        yield _gauge("placerec_storage_threads_waited_for", "Requests that wait for such a thread.", waiting)
-        yield _gauge("placerec_sessions", "Sessions that are under way.", runtime.sessions.count())
+        yield _gauge(
+            "placerec_storage_threads", "Threads that may search, read or write maps.", self._threads.total_tokens
+        )
+        yield _gauge("placerec_storage_threads_busy", "Storage threads that are busy.", busy)
+        yield _gauge("placerec_storage_threads_waited_for", "Requests that wait for a storage thread.", waiting)
+        yield _gauge("placerec_sessions", "Open sessions.", runtime.sessions.count())
         yield _gauge("placerec_job_watchers", "Clients that follow jobs.", runtime.jobs.watchers)
         yield self._jobs()
         yield from self._maps()
         with suppress(OSError):
             usage = shutil.disk_usage(runtime.settings.data_dir)
-            yield _gauge("placerec_disk_free_bytes", "Free bytes of the disk of the data directory.", usage.free)
-            yield _gauge("placerec_disk_bytes", "All bytes of that disk.", usage.total)
-        yield _gauge("placerec_stopping", "1 while the service is about to stop.", int(runtime.stopping))
+            yield _gauge("placerec_disk_free_bytes", "Free bytes on the disk of the data directory.", usage.free)
+            yield _gauge("placerec_disk_bytes", "Size of the disk of the data directory in bytes.", usage.total)
+        yield _gauge("placerec_stopping", "1 if the service is about to stop, else 0.", int(runtime.stopping))
 
     def _jobs(self) -> Metric:
         counts = Counter(job.state for job in self._runtime.jobs.all())
-        gauge = GaugeMetricFamily("placerec_jobs", "Jobs that are remembered, by their state.", labels=["state"])
+        gauge = GaugeMetricFamily(
+            "placerec_jobs", "Jobs, by state, including ended ones that are still listed.", labels=["state"]
+        )
         for state in get_args(JobState):
             gauge.add_metric([state], counts[state])
         return gauge
 
     def _maps(self) -> Iterable[Metric]:
-        """By tier, for a name of each map would be one more series for every map."""
+        """Counts by tier; a label with the name of each map would make too many series."""
         tiers, building, open_ = Counter[str](), 0, 0
         for record in self._runtime.engine.all_records():
-            with suppress(PlacerecError):  # deleted, or found to be damaged, since it was listed
+            with suppress(PlacerecError):  # it was deleted or found to be damaged since it was listed
                 map_ = self._runtime.engine.atlas.find(record.id)
                 if map_.is_open:
                     status = map_.index_status()
                     open_ += 1
                     tiers[status.tier] += 1
                     building += status.state == "building"
-        gauge = GaugeMetricFamily("placerec_maps_searched", "Open maps, by how they are searched.", labels=["tier"])
+        gauge = GaugeMetricFamily(
+            "placerec_maps_searched", "Open maps, by the tier in which they are searched.", labels=["tier"]
+        )
         for tier in get_args(Tier):
             gauge.add_metric([tier], tiers[tier])
         yield gauge
         yield _gauge("placerec_indexes_building", "Open maps whose index is being built.", building)
-        yield _gauge("placerec_maps_open", "Maps that are open: the others are opened by their first query.", open_)
+        yield _gauge("placerec_maps_open", "Open maps; a map is opened by its first query.", open_)
 
 
 @contextmanager
 def gauges(runtime: Runtime, uploads: UploadMemory, threads: CapacityLimiter) -> Iterator[None]:
-    """Within, these gauges are among the metrics."""
+    """Add these gauges to the metrics while the block runs."""
     collector = RuntimeCollector(runtime, uploads, threads)
     runtime.engine.metrics.registry.register(collector)
     try:

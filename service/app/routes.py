@@ -1,4 +1,4 @@
-"""At the root: is it alive, is it ready, what does it count, what is it."""
+"""Routes at the root (liveness, readiness, metrics, version, documentation), and the list of encoders."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ router = APIRouter(tags=["service"])
 
 @router.get("/livez")
 async def check_liveness() -> Health:
-    """Whether the process answers; cheap, for a supervisor that restarts it."""
+    """Check that the process answers; this is cheap, and meant for a supervisor that restarts it."""
     return Health()
 
 
 @router.get("/readyz", responses=problem_documentation(NotReady))
 async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readiness:
-    """Whether frames can be served: encoder loaded and true to its golden values, maps open, disk writable.
+    """Check that the service can answer queries: the encoder reproduces its golden values and the disk is writable.
 
-    A damaged map does not make the service unready; it is named here to whoever may use it.
+    A damaged map does not make the service unready; it is listed here if the key may use it.
     """
     checks = await runtime.check_readiness()
     damaged = runtime.engine.atlas.quarantined().items()
@@ -48,16 +48,16 @@ async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readi
 @router.get(
     "/metrics",
     response_class=Response,
-    responses={200: {"description": "Prometheus's text format.", "content": {"text/plain": {}}}},
+    responses={200: {"description": "The text format of Prometheus.", "content": {"text/plain": {}}}},
 )
 async def read_metrics(engine: EngineDep) -> Response:
-    """The counters for Prometheus."""
+    """Read the metrics for Prometheus."""
     return Response(await in_thread(engine.metrics.expose), media_type=CONTENT_TYPE_LATEST)
 
 
 @router.get("/version")
 async def read_version(request: Request, engine: EngineDep) -> Version:
-    """What runs here."""
+    """Read the versions of the service and its libraries."""
     return Version(
         version=request.app.version,
         encoder=engine.settings.encoder,
@@ -69,23 +69,23 @@ async def read_version(request: Request, engine: EngineDep) -> Version:
 
 @router.get("/openapi.json", include_in_schema=False)
 async def read_openapi(request: Request) -> Response:
-    """This interface, described for machines."""
-    return Response(_written(request.app), media_type="application/json")
+    """Read the OpenAPI document."""
+    return Response(_openapi_json(request.app), media_type="application/json")
 
 
 @router.get("/docs", include_in_schema=False)
 async def read_documentation(request: Request) -> Response:
-    """This interface, described for people; the page needs nothing from elsewhere."""
-    return HTMLResponse(_shown(request.app), headers={"Content-Security-Policy": SECURITY_POLICY})
+    """Read the documentation of this interface; the page loads nothing from other sites."""
+    return HTMLResponse(_documentation_html(request.app), headers={"Content-Security-Policy": SECURITY_POLICY})
 
 
-@lru_cache(1)  # everybody may ask, and making it anew takes as long as a query
-def _written(app: FastAPI) -> bytes:
+@lru_cache(1)  # needs no key, and takes as long as a query
+def _openapi_json(app: FastAPI) -> bytes:
     return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
 
 
 @lru_cache(1)
-def _shown(app: FastAPI) -> bytes:
+def _documentation_html(app: FastAPI) -> bytes:
     return page(app.openapi()).encode()
 
 
@@ -94,5 +94,5 @@ encoders = APIRouter(prefix="/v1/encoders", tags=["encoders"], dependencies=[Dep
 
 @encoders.get("")
 def list_encoders(engine: EngineDep) -> EncoderPage:
-    """List the models and vocabularies installed here, damaged ones too, with what they are made of."""
+    """List the installed encoders and their definitions, including damaged ones."""
     return EncoderPage(items=engine.catalogue.describe(), next_cursor=None)

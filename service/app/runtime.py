@@ -1,4 +1,4 @@
-"""What lives while the application runs: the engine, and beside it the jobs, sessions, transfers and upkeep of maps."""
+"""The parts of a running application: the engine, the jobs, the sessions, exports and imports, and counted answers."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from service.upkeep import merging, pruning, reencoding
 from service.worker_threads import in_thread
 
 DISK_CHECK_SECONDS = 1.0
-"""The disk is tried at most this often; a readiness probe that comes sooner gets the last result."""
+"""The disk is checked at most this often; a readiness probe that comes sooner gets the last result."""
 
 log = logging.getLogger("placerec.runtime")
 
 
 class Runtime:
-    """Everything that the routes work with, made when the application starts.
+    """Everything that the routes work with; made when the application starts.
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
@@ -68,14 +68,14 @@ class Runtime:
         self._register_jobs()
 
     def _register_jobs(self) -> None:
-        """Name the kinds of jobs that can be taken up again after a restart; ``imports`` has named its own."""
+        """Register the kinds of jobs that continue after a restart; ``Imports`` registers its own."""
         engine, staging, register = self.engine, self.staging, self.jobs.register
         register(reencoding.KIND, partial(reencoding.reencode, engine))
         register(pruning.KIND, partial(pruning.prune, engine))
         register(merging.KIND, partial(merging.merge, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
         register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
-        register(calibration.KIND, partial(calibration.calibrate, engine))
+        register(calibration.KIND, partial(calibration.run_job, engine))
         register(
             bulk_enrolment.KIND,
             partial(bulk_enrolment.enrol_staged, engine, staging),
@@ -83,7 +83,7 @@ class Runtime:
         )
 
     def publish(self, state: State) -> None:
-        """Hand the parts to the routes, which find them by name (``service.http.dependencies.FromState``)."""
+        """Make the parts available to the routes, which find them by name (``service.http.dependencies.FromState``)."""
         state.runtime = self
         state.engine, state.jobs, state.sessions = self.engine, self.jobs, self.sessions
         state.staging, state.batch_order = self.staging, self.batch_order
@@ -92,41 +92,41 @@ class Runtime:
         state.exports, state.imports = self.exports, self.imports
 
     def start(self) -> None:
-        """Begin to load the default encoder and take up jobs; call it from the event loop, which goes on meanwhile."""
+        """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""
         for name in unknown_variables():
-            log.warning("the environment sets %s, which is no setting", name)
+            log.warning("the environment sets %s, which is not a setting", name)
         self.engine.start()
-        self._clear_away()
+        self._remove_leftovers()
         self.statistics.start()
         self.exports.clean()
         self.imports.clean()
         self.jobs.start()
 
-    def _clear_away(self) -> None:
-        """Remove what no job will finish."""
-        open_ = [job.arguments for job in self.jobs.all() if not job.ended]
-        unfinished = {arguments.get("to") for arguments in open_}
-        self.staging.clean({arguments["form"] for arguments in open_ if "form" in arguments})
+    def _remove_leftovers(self) -> None:
+        """Remove the forms and unlisted maps that belong to no unfinished job."""
+        unended = [job.arguments for job in self.jobs.all() if not job.ended]
+        unfinished = {arguments.get("to") for arguments in unended}
+        self.staging.clean({arguments["form"] for arguments in unended if "form" in arguments})
         for map_id in self.engine.atlas.unlisted():
             if map_id not in unfinished:
                 with suppress(PlacerecError):  # the next start tries again
                     self.engine.atlas.abandon(map_id)
 
     async def close(self) -> None:
-        """Finish what runs and give the data directory back."""
+        """Stop the jobs, save what is in memory, and release the data directory."""
         self.engine.stop_loading()
         await self.exports.close()
-        # Jobs stop first, for they need the encoder and the maps.
+        # Jobs stop first, since they need the encoder and the maps.
         await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
         await to_thread.run_sync(self.statistics.close)
         await to_thread.run_sync(self.sessions.close)
         await to_thread.run_sync(self.engine.close)
 
     async def check_readiness(self) -> dict[str, str]:
-        """The outcome of each check, all of them "ok".
+        """The outcome of each check by its name; each is "ok".
 
         Raises:
-            NotReady: at least one is not.
+            NotReady: at least one is not "ok".
         """
         now = time.monotonic()
         if now - self._disk_checked > DISK_CHECK_SECONDS:
@@ -137,7 +137,7 @@ class Runtime:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
         if bad:
-            raise NotReady(f"Not ready: {'; '.join(bad)}", checks)
+            raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks
 
     def _check_disk(self) -> str:

@@ -1,4 +1,4 @@
-"""What runs here: encoders, versions, health."""
+"""JSON of the routes at the root and of the list of encoders."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from service.maps.schemas import QuarantinedMap
 
 
 class EncoderPage(BaseModel):
-    """All encoders installed."""
+    """All installed encoders."""
 
     items: list[EncoderSummary]
     next_cursor: Cursor
 
 
 class Health(BaseModel):
-    """The process runs."""
+    """The process is alive."""
 
     status: Literal["ok"] = "ok"
 
 
 class Readiness(BaseModel):
-    """The service can work."""
+    """The service is ready for requests."""
 
     status: Literal["ready"] = "ready"
     checks: dict[str, str]
@@ -34,7 +34,7 @@ class Readiness(BaseModel):
 
 
 class Version(BaseModel):
-    """What runs here."""
+    """Versions of the service and its libraries."""
 
     name: str = "placerec"
     version: str

@@ -1,1 +1,1 @@
-"""Maps: made, calibrated, exported, imported."""
+"""Maps: their settings, cameras, calibration, exports and imports."""

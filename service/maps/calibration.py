@@ -1,10 +1,17 @@
-"""A map calibrated by what is asked of it, at once or as a job, and never over what an operator has set meanwhile."""
+"""Calibrating a map: the route, and the job that does it in the background.
+
+A map is asked frames whose places are known.  Its threshold, margin and probability curve follow from its answers, and
+become the map's own calibration unless an operator has set another one meanwhile.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fastapi import APIRouter, Depends, Request, Response
+
+from core import errors
 from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, Encoding
@@ -12,37 +19,200 @@ from core.recognition.calibration import (
     TOGETHER,
     LabelledQueries,
     ProgressCallback,
-    calibrate_map,
     calibration_warnings,
     queries_from_labels,
     queries_from_map,
     queries_from_traverse,
 )
+from core.recognition.calibration import (
+    calibrate_map as fit_calibration,
+)
 from core.recognition.stages import calibration_of
 from core.storage import Map, Snapshot
-from service.engine.engine import Engine
-from service.jobs.context import JobContext, yield_to_requests
+from service.engine.engine import Engine, camera_mask
+from service.engine.queue import RequestDeadline
+from service.errors.faults import (
+    DeadlineExceeded,
+    EncoderNotInstalled,
+    InvalidRequest,
+    JobQueueFull,
+    QueueFull,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation
+from service.http.bodies import json_size, parse_json
+from service.http.dependencies import DeadlineDep, EngineDep, IfMatch, MapId, single_values
+from service.http.headers import expected_revision
+from service.http.schemas import validated
+from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
+from service.jobs.context import JobContext, creation_time, yield_to_requests
+from service.jobs.routes import JobsDep, accepted
+from service.jobs.schemas import JobView
 from service.maps.schemas import CalibrationOrder, CalibrationReport
+from service.worker_threads import in_thread
 
 KIND = "calibrate"
+"""The kind of the job."""
+
+router = APIRouter(
+    prefix="/v1/maps/{map}",
+    tags=["calibration"],
+    dependencies=[Depends(single_values)],
+    responses=problem_documentation(
+        errors.UnknownPlace,
+        errors.UnknownSequence,
+        errors.UnknownCamera,
+        errors.RevisionMismatch,
+        UnsupportedMediaType,
+        errors.CalibrationImpossible,
+        errors.InvalidImage,
+        errors.NoRegions,
+        QueueFull,
+        JobQueueFull,
+        EncoderNotInstalled,
+        errors.StorageFull,
+    ),
+)
+
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": {"$ref": "#/components/schemas/CalibrationOrder"}},
+            FORM: {
+                "schema": {
+                    "type": "object",
+                    "required": ["calibration"],
+                    "properties": {"calibration": {"$ref": "#/components/schemas/CalibrationOrder"}},
+                    "additionalProperties": {"type": "string", "format": "binary"},
+                }
+            },
+        },
+    }
+}
 
 
-def measured(
-    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
-) -> CalibrationReport:
-    """Ask a map, and report what follows; nothing is stored.
+# The route
 
-    Args:
-        encodings: of the frames of the order's labels, in their order.
+
+@router.post(
+    "/calibrate",
+    openapi_extra=BODY,
+    response_model=CalibrationReport,
+    responses={202: {"model": JobView, "description": "The job that calibrates the map, if `background` is true."}},
+)
+async def calibrate_map(
+    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, deadline: DeadlineDep, if_match: IfMatch = None
+) -> CalibrationReport | Response:
+    """Measure when a map's answers can be believed, and store the result as the map's calibration.
+
+    With a JSON body, the frames that are asked are the map's own: those of one traverse, compared with the others, or
+    all of them. With a form, they are new frames: each is a file part, and a part `calibration` holds the same JSON
+    with a label for each frame. The threshold, the margin and the probability curve follow from the answers; the
+    reported quality is cross-validated. If the answers are too few or too poor to calibrate the map, the request is
+    refused and the map keeps its calibration.
+    """
+    map_ = await engine.map(map_id)
+    expected = expected_revision(if_match, map_.record.revision)
+    if media_type(request) == FORM:
+        order, encodings = await _read_labelled_frames(engine, map_, request, deadline)
+    else:
+        order, encodings = await _read_order(request), []
+    try:
+        encoder = await in_thread(engine.catalogue.get, map_.record.encoder)
+    except errors.UnknownEncoder as error:
+        raise EncoderNotInstalled(str(error)) from error
+    request.state.noted = {"map": map_id, "method": order.method}
+    if order.background:
+        arguments, maps = job_arguments(map_, order, expected), {map_id: creation_time(map_)}
+        job = await in_thread(jobs.submit, KIND, map_id, arguments=arguments, maps=maps)
+        return accepted(job, engine.settings)
+
+    def advance(_done: int, _total: int) -> None:
+        if deadline.seconds_left() <= 0:
+            raise DeadlineExceeded(
+                "The time ran out before the map was calibrated, and nothing was stored; use `background`."
+            )
+
+    replaces = map_.record.calibration
+    report = await in_thread(measure, map_, encoder, order, encodings, advance)
+    if not order.dry_run:
+        await in_thread(store, map_, report.calibration, replaces, expected)
+    return report
+
+
+async def _read_order(request: Request) -> CalibrationOrder:
+    """The JSON body of a request.
 
     Raises:
-        UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure.
-        Others: what ``advance`` raises.
+        UnsupportedMediaType, MalformedBody, InvalidRequest.
+    """
+    kind = media_type(request)
+    if kind != "application/json":
+        raise UnsupportedMediaType(f"Send the body as application/json or {FORM}, not as {kind[:80] or 'nothing'}.")
+    value = parse_json(await request.body(), "The body")
+    json_size(value, "The body")
+    order = validated(CalibrationOrder, value)
+    if order.method == "frames":
+        raise InvalidRequest("method: send frames in a form, and this JSON in its part 'calibration'.")
+    return order
+
+
+async def _read_labelled_frames(
+    engine: Engine, map_: Map, request: Request, deadline: RequestDeadline
+) -> tuple[CalibrationOrder, list[Encoding]]:
+    """The order in a form, and its frames encoded, in the order of the labels.
+
+    Raises:
+        UnsupportedMediaType, MalformedBody.
+        InvalidRequest: there is not exactly one label for each frame.
+        UnknownCamera: the map has no camera that a label names.
+        InvalidImage, NoRegions: a frame cannot be used.
+        QueueFull, EncoderNotInstalled.
+    """
+    engine.queue.check_room()
+    value, others = json_part(await read_many(request, engine.settings), "calibration")
+    json_size(value, "The part 'calibration'")
+    order = validated(CalibrationOrder, value)
+    if order.method != "frames" or order.labels is None:
+        raise InvalidRequest("method: a form is for the method frames; send a JSON body for the other methods.")
+    files = {part.name: part for part in others}
+    names = [label.file for label in order.labels]
+    if not all(is_file(part) for part in others) or len(files) != len(others) or sorted(files) != sorted(names):
+        raise InvalidRequest("labels: there must be exactly one for each file part of the form, with its name.")
+    for name in names:
+        check_part(files[name], engine.settings)
+    masks = [await camera_mask(map_, label.camera) for label in order.labels]
+    with engine.queue.place(len(names)):
+        outcomes = await engine.encode_all(map_.record.encoder, [files[name].data for name in names], deadline, masks)
+    encodings = []
+    for name, outcome in zip(names, outcomes, strict=True):
+        if isinstance(outcome, Exception):
+            raise outcome
+        if not len(outcome.encoding.regions):
+            raise errors.NoRegions(f"The frame {name[:80]!r} has no regions to compare.")
+        encodings.append(outcome.encoding)
+    return order, encodings
+
+
+# Measuring and storing
+
+
+def measure(
+    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
+) -> CalibrationReport:
+    """Ask a map the frames of an order, and report the calibration that follows; nothing is stored.
+
+    Args:
+        encodings: the frames of the order's labels, in their order; empty for the other methods.
+
+    Raises:
+        UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure, and whatever ``advance`` raises.
     """
     snapshot = map_.snapshot()
     queries = _queries(map_, snapshot, order, encodings)
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = calibrate_map(map_, encoder, snapshot, queries, order.target, source, advance)
+    found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance)
     return CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -56,21 +226,31 @@ def measured(
     )
 
 
+def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
+    if order.method == "frames":
+        assert order.labels is not None
+        return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
+    if order.method == "sequence":
+        assert order.sequence is not None
+        return queries_from_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
+    return queries_from_map(map_, snapshot, order.most)
+
+
 def store(map_: Map, calibration: Calibration, replaces: Calibration | None, expected: int | None) -> None:
-    """Make a calibration the map's, unless somebody has given it another one since it was asked for.
+    """Store a calibration as the map's own, unless the map was given another one since the calibration was ordered.
 
     Args:
-        replaces: the one that the map had then; None: that of its encoder.
-        expected: revision that the map must have; None: any.
+        replaces: the map's own calibration at that time; None if it had none.
+        expected: the revision that the map must have; None for any.
 
     Raises:
-        RevisionMismatch: the map's calibration, which is kept, is another one by now; or its revision is.
+        RevisionMismatch: the map has another calibration or revision by now; it keeps its calibration.
         StorageFull, StorageFailure.
     """
     while True:
         record = map_.record
         if record.calibration != replaces:
-            raise RevisionMismatch("The map was given another calibration meanwhile; that one is kept.")
+            raise RevisionMismatch("The map was given another calibration meanwhile, which it keeps.")
         try:
             map_.edit({"calibration": calibration}, record.revision if expected is None else expected)
         except RevisionMismatch:
@@ -80,8 +260,11 @@ def store(map_: Map, calibration: Calibration, replaces: Calibration | None, exp
             return
 
 
-def arguments_of(map_: Map, order: CalibrationOrder, expected: int | None) -> dict[str, Any]:
-    """What the job is to know: the order, and what it may replace."""
+# The job
+
+
+def job_arguments(map_: Map, order: CalibrationOrder, expected: int | None) -> dict[str, Any]:
+    """The arguments of the job: the order, and what :func:`store` needs to know of the map as it is now."""
     replaces = map_.record.calibration
     return order.model_dump(mode="json") | {
         "revision": expected,
@@ -89,21 +272,22 @@ def arguments_of(map_: Map, order: CalibrationOrder, expected: int | None) -> di
     }
 
 
-def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Do what the job says; after a restart the map is asked anew, unless its calibration was stored already.
+def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
+    """Calibrate a map as a job; an attempt after a restart begins again unless the calibration was stored already.
 
     Raises:
         UnknownMap, UnknownSequence, UnknownPlace, EncoderNotInstalled, CalibrationImpossible, RevisionMismatch,
-            StorageFull, StorageFailure: the map has the calibration it had.
+            StorageFull, StorageFailure: the map keeps its calibration.
+        JobCancelled, JobInterrupted.
     """
     map_ = context.map(engine.atlas)
-    wanted = dict(context.arguments)
-    expected, replaces = wanted.pop("revision"), wanted.pop("replaces")
-    order = CalibrationOrder.model_validate(wanted)
+    arguments = dict(context.arguments)
+    expected, replaces = arguments.pop("revision"), arguments.pop("replaces")
+    order = CalibrationOrder.model_validate(arguments)
     if (noted := context.notes.get("report")) is not None:
         report = CalibrationReport.model_validate(noted)
         if map_.record.calibration == report.calibration:
-            return report.model_dump(mode="json")  # killed between the commit and the end of the job
+            return report.model_dump(mode="json")  # the process was killed after the commit
 
     def advance(done: int, total: int) -> None:
         context.progress(done, total)
@@ -111,19 +295,9 @@ def calibrate(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         if done % TOGETHER == 0:
             yield_to_requests(engine, context)
 
-    report = measured(map_, engine.load_encoder(map_), order, [], advance)
-    told = report.model_dump(mode="json")
+    report = measure(map_, engine.load_encoder(map_), order, [], advance)
+    result = report.model_dump(mode="json")
     if not order.dry_run:
-        context.remember(report=told)
+        context.remember(report=result)
         store(map_, report.calibration, None if replaces is None else Calibration.model_validate(replaces), expected)
-    return told
-
-
-def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
-    if order.method == "frames":
-        assert order.labels is not None
-        return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
-    if order.method == "sequence":
-        assert order.sequence is not None
-        return queries_from_traverse(map_, snapshot, order.sequence, order.pairs, order.most)
-    return queries_from_map(map_, snapshot, order.most)
+    return result

@@ -1,4 +1,4 @@
-"""Cameras: what of their frames is to be ignored (a bonnet, a gantry, a time stamp)."""
+"""Routes of a map's cameras: which part of their frames is ignored (a bonnet, a gantry, a time stamp)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ router = APIRouter(
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
 )
-CameraName = Annotated[Camera, Path(alias="camera", description="As frames name it.", examples=["front"])]
+CameraName = Annotated[
+    Camera, Path(alias="camera", description="The name that frames give with `?camera=`.", examples=["front"])
+]
 
 
 @router.put(
@@ -35,10 +37,10 @@ CameraName = Annotated[Camera, Path(alias="camera", description="As frames name 
 def put_camera(
     map_id: MapId, name: CameraName, definition: CameraDefinition, engine: EngineDep, response: Response
 ) -> CameraView:
-    """Say what to ignore in the frames of a camera; frames name it with `?camera=`.
+    """Create or replace a camera: a mask of what is ignored in its frames, which name it with `?camera=`.
 
-    The mask holds for every frame that comes from now on. Places that were enrolled under another mask
-    stay as they are until their frames are sent again.
+    The mask is applied to every frame from now on. Places that were enrolled with another mask stay as they are
+    until their frames are sent again.
     """
     made, is_new = engine.atlas.get(map_id).cameras.put(name, definition.mask)
     response.status_code = 201 if is_new else 200
@@ -59,5 +61,5 @@ def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraVie
 
 @router.delete("/{camera}", status_code=204, responses=problem_documentation(errors.UnknownCamera, errors.StorageFull))
 def forget_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
-    """Forget a camera. Frames that name it are refused from then on; its places stay."""
+    """Forget a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
     engine.atlas.get(map_id).cameras.forget(name)

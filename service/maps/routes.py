@@ -1,4 +1,4 @@
-"""Maps: create, list, read, edit, delete, verify."""
+"""Routes that create, list, read, edit, delete and verify maps."""
 
 from __future__ import annotations
 
@@ -41,13 +41,14 @@ router = APIRouter(
     responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
 )
 ALL_MAPS = "(all)"
-"""What is possessed while a map is made, so that no two are counted as the last one: no map is called so."""
+"""The lock held while a map is created, so that two requests cannot both create the last map that is allowed; no map
+can have this id."""
 
 BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
 
 
 def show_map(engine: Engine, map_: Map) -> MapView:
-    """A map as callers see it."""
+    """A map as JSON."""
     record = map_.record
     calibration = record.calibration or engine.default_calibration(record.encoder)
     return MapView(
@@ -80,7 +81,7 @@ def create_map(
     request.state.noted = {"map": new.id}
     principal.require(new.id)
     identity = engine.resolve(new.encoder)
-    encoder = next(s for s in engine.catalogue.describe() if s.identity == identity)
+    encoder = next(summary for summary in engine.catalogue.describe() if summary.identity == identity)
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
         check_map_count(engine)
@@ -95,7 +96,7 @@ def create_map(
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_maps(page: Page, engine: EngineDep, principal: PrincipalDep) -> MapPage:
-    """List the maps in the order of their ids, and those that are damaged; of a key limited to maps, only those."""
+    """List the maps in the order of their ids, and the damaged maps; a key limited to some maps sees only those."""
     if principal.maps is None:
         records, next_cursor = engine.atlas.records(page.cursor, page.limit)
     else:
@@ -105,14 +106,14 @@ def list_maps(page: Page, engine: EngineDep, principal: PrincipalDep) -> MapPage
         try:
             items.append(show_map(engine, engine.atlas.find(record.id)))
         except (errors.UnknownMap, errors.MapQuarantined):
-            continue  # deleted, or found to be damaged, since it was listed
+            continue  # it was deleted or found to be damaged since it was listed
     damaged = engine.atlas.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return MapPage(items=items, next_cursor=next_cursor, quarantined=quarantined)
 
 
 def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters) -> tuple[list[MapRecord], str | None]:
-    """The page of a listing of these maps alone, and its cursor, which names no other map either."""
+    """A page of these maps alone, and its cursor, which does not reveal other maps either."""
     listing: Listing = ["maps-among", *sorted(map_ids)]
     found = []
     for map_id in sorted(map_ids):
@@ -124,7 +125,7 @@ def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters
 
 @router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
 def read_map(map_id: MapId, engine: EngineDep, response: Response) -> MapView:
-    """Read a map's settings, its calibration and its size; the ETag is for editing it."""
+    """Read a map's settings, calibration and size; send its ETag as `If-Match` when you edit the map."""
     map_ = engine.atlas.get(map_id)
     response.headers["ETag"] = entity_tag(map_.record.revision)
     return show_map(engine, map_)
@@ -143,8 +144,8 @@ def edit_map(
 ) -> MapView:
     """Edit a map by a merge patch.
 
-    A calibration set here is the map's own (`"source": "manual"`); what is not given of it is taken
-    from the one in force. `null` brings the encoder's default back.
+    A calibration that is set here becomes the map's own (`"source": "manual"`); values that are left out are those
+    of the calibration in force. `null` restores the encoder's default.
     """
     map_ = engine.atlas.get(map_id)
     expected = expected_revision(if_match, map_.record.revision)
@@ -154,7 +155,7 @@ def edit_map(
 
 
 def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[str, Any]:
-    """A merge patch as values to set: null is the default of its field."""
+    """The values that a merge patch sets; null stands for the default of its field."""
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
     calibration = given.pop("calibration", None)
@@ -171,7 +172,7 @@ def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | No
     default = engine.default_calibration(record.encoder)
     base = record.calibration or default
     if base is None:
-        raise errors.InvalidField(f"The encoder {record.encoder} is not installed; its calibration is not known.")
+        raise errors.InvalidField(f"The encoder {record.encoder} is not installed, so its calibration is not known.")
     values = base.model_dump() | {"source": "manual"}
     for name in changes.model_fields_set:
         value = getattr(changes, name)
@@ -181,7 +182,7 @@ def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | No
 
 @router.delete("/{map}", status_code=204, responses=problem_documentation(errors.UnknownMap, errors.RevisionMismatch))
 def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
-    """Delete a map with all that it holds. A damaged map can be deleted too."""
+    """Delete a map with everything that it contains. A damaged map can be deleted, too."""
     if if_match is not None:
         expected_revision(if_match, engine.atlas.find(map_id).record.revision)
     engine.atlas.delete(map_id)
@@ -192,7 +193,7 @@ def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> No
     "/{map}/verify",
     response_model=VerifyReport,
     responses={
-        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        202: {"model": JobView, "description": "The job that verifies the map, if `background` is true."},
         **problem_documentation(errors.UnknownMap, JobQueueFull, errors.StorageFull),
     },
 )
@@ -201,10 +202,10 @@ def verify_map(
     engine: EngineDep,
     jobs: JobsDep,
     background: Annotated[
-        bool, Query(description="Answer 202 with a job, whose result is the report: a large map takes minutes.")
+        bool, Query(description="Answer 202 with a job; its result is the report. A large map takes minutes.")
     ] = False,
 ) -> VerifyReport | Response:
-    """Read everything that a map stores, a damaged one too, and compare it with its checksums."""
+    """Read all files of a map, which may be damaged, and compare them with their checksums."""
     if not background:
         return engine.atlas.verify(map_id)
     job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))

@@ -1,4 +1,4 @@
-"""Maps and their traverses."""
+"""JSON of maps, their cameras and their calibration."""
 
 from __future__ import annotations
 
@@ -62,38 +62,43 @@ class MapView(BaseModel):
     encoder: str = Field(description="Identity of its encoder.")
     dimension: int = Field(description="Values of one descriptor.")
     description: str
-    keep: Keep = Field(description="What is kept of each frame.")
-    same_place_radius: float = Field(description="Metres within which two places are no rivals.")
-    same_place_frames: int = Field(description="Without poses: frames of a sequence within which they are no rivals.")
-    calibration: Calibration | None = Field(
-        description="When a match is believed; its source is encoder-default until the map has its own. "
-        "Null if its encoder is not installed."
+    keep: Keep = Field(description="What is stored of each frame besides its descriptor.")
+    same_place_radius: float = Field(
+        description="Distance in metres up to which two enrolled places count as the same place, so that neither is "
+        "a rival of the other."
     )
-    index: IndexStatus = Field(description="How it is searched; its `setting` is set by sending `index`.")
-    storage: StorageStatus = Field(description="What it takes on disk.")
+    same_place_frames: int = Field(
+        description="The same for places without poses: their distance in frames of one sequence."
+    )
+    calibration: Calibration | None = Field(
+        description="When a match is believed. The source is encoder-default until the map has its own calibration; "
+        "null if the encoder is not installed."
+    )
+    index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
+    storage: StorageStatus = Field(description="What the map occupies on disk.")
     places: int
-    revision: int = Field(description="Counts the edits; the ETag is made of it.")
+    revision: int = Field(description="Number of the last edit of the settings; the ETag contains it.")
     created_at: Timestamp
     updated_at: Timestamp
 
 
 class QuarantinedMap(BaseModel):
-    """A damaged map, out of service."""
+    """A damaged map, which is out of service."""
 
     id: str
     reason: str
 
 
 class MapPage(BaseModel):
-    """Maps in the order of their ids."""
+    """A page of maps in the order of their ids."""
 
     items: list[MapView]
     next_cursor: Cursor
-    quarantined: list[QuarantinedMap] = Field(description="Damaged maps; they are not among the items.")
+    quarantined: list[QuarantinedMap] = Field(description="Damaged maps, which are not among the items.")
 
 
 class NewMap(MapSettings):
-    """A map to create."""
+    """The settings of a new map."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -103,13 +108,17 @@ class NewMap(MapSettings):
 
     id: str = Field(description="[a-z0-9][a-z0-9._-]{0,63}, not 'import'.")
     encoder: str | None = Field(
-        default=None, max_length=256, description="Name or full identity; the default encoder if left out."
+        default=None,
+        max_length=256,
+        description="Name or full identity of the encoder; the default encoder if left out.",
     )
-    precision: NewPrecision = Field(default="half", description="How its descriptors are kept, for good.")
+    precision: NewPrecision = Field(
+        default="half", description="How the descriptors are stored; it cannot be changed later."
+    )
 
 
 class CalibrationChanges(BaseModel):
-    """Values to set by hand; null is the encoder's own."""
+    """Values of a calibration to set by hand; null restores the encoder's value."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -118,7 +127,7 @@ class CalibrationChanges(BaseModel):
 
 
 class MapChanges(BaseModel):
-    """A merge patch (RFC 7396) of a map: null brings the default back, what is left out stays."""
+    """A merge patch (RFC 7396) of a map: null restores the default, and what is left out stays as it is."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -144,15 +153,15 @@ CAMERA_EXAMPLE: dict[str, Any] = {
 
 
 class CameraDefinition(BaseModel):
-    """What to ignore in the frames of a camera."""
+    """Which part of a camera's frames is ignored."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"mask": CAMERA_EXAMPLE["mask"]}]})
 
-    mask: Mask | None = Field(default=None, description="null: nothing is ignored.")
+    mask: Mask | None = Field(default=None, description="The part that is ignored; null if nothing is.")
 
 
 class CameraView(BaseModel):
-    """One camera of a map."""
+    """A camera of a map."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [CAMERA_EXAMPLE]})
 
@@ -162,7 +171,7 @@ class CameraView(BaseModel):
 
 
 class CameraList(BaseModel):
-    """All cameras of a map, by name; they are few, so there is one page."""
+    """All cameras of a map in the order of their names, on one page."""
 
     items: list[CameraView]
     next_cursor: None = None
@@ -181,64 +190,73 @@ ORDER_EXAMPLE: dict[str, Any] = {
 
 
 class Label(BaseModel):
-    """The true place of one frame of the form."""
+    """The true place of one frame of a form."""
 
     model_config = ConfigDict(extra="forbid")
 
-    file: str = Field(max_length=256, description="Name of the frame's part.")
-    place: str | None = Field(max_length=128, description="Id of the place that it shows; null: the map has it not.")
+    file: str = Field(max_length=256, description="Name of the file part that holds the frame.")
+    place: str | None = Field(
+        max_length=128, description="Id of the place that the frame shows; null if the map lacks that place."
+    )
     camera: CameraName = None
 
 
 class CalibrationOrder(BaseModel):
-    """By what a map is to be calibrated, and what for."""
+    """How a map is to be calibrated, and for which target."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [ORDER_EXAMPLE]})
 
     method: Method = Field(
-        description="`frames`: the labelled frames of this form. `sequence`: one traverse of the map, asked of the "
-        "others. `map`: the map's own frames, each asked of its neighbours; better than nothing."
+        description="Which frames the map is asked. `frames`: the labelled frames of this form. `sequence`: one "
+        "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
+        "neighbours, which is the least reliable method."
     )
-    target: Target = Field(default=Target(rule="precision", value=0.95), description="What the threshold is to reach.")
-    dry_run: bool = Field(strict=True, default=False, description="Measure and tell, store nothing.")
-    background: bool = Field(
-        strict=True, default=False, description="Answer 202 with a job, whose result is the report."
+    target: Target = Field(
+        default=Target(rule="precision", value=0.95), description="What the threshold is chosen to reach."
     )
-    sequence: str | None = Field(default=None, max_length=128, description="The traverse that is asked.")
+    dry_run: bool = Field(strict=True, default=False, description="Report the calibration without storing it.")
+    background: bool = Field(strict=True, default=False, description="Answer 202 with a job; its result is the report.")
+    sequence: str | None = Field(default=None, max_length=128, description="The traverse whose frames are asked.")
     pairs: dict[str, str | None] | None = Field(
         default=None,
         min_length=1,
         max_length=MOST_FRAMES,
-        description="Of places of the sequence to the places among the others that show the same, null for one that "
-        "they lack; only these are asked. Left out: the poses tell.",
+        description="For places of the sequence, the id of a place of another sequence that shows the same, or null if "
+        "there is none. Only these places are asked. If left out, poses decide which places are the same.",
     )
-    most: int = Field(strict=True, default=300, ge=20, le=MOST_FRAMES, description="Frames to ask, spread evenly.")
+    most: int = Field(
+        strict=True,
+        default=300,
+        ge=20,
+        le=MOST_FRAMES,
+        description="How many frames are asked at most; they are chosen evenly.",
+    )
     labels: list[Label] | None = Field(
-        default=None, min_length=1, max_length=MOST_FRAMES, description="One for each frame of the form."
+        default=None, min_length=1, max_length=MOST_FRAMES, description="One label for each frame of the form."
     )
 
     @model_validator(mode="after")
-    def _what_belongs_to_the_method(self) -> CalibrationOrder:
+    def _check_method(self) -> CalibrationOrder:
         if (self.sequence is None) == (self.method == "sequence"):
-            raise ValueError("sequence belongs to the method sequence, and to it only")
+            raise ValueError("sequence is needed by the method sequence, and only by it")
         if self.pairs is not None and self.method != "sequence":
-            raise ValueError("pairs belong to the method sequence")
+            raise ValueError("pairs can be given only with the method sequence")
         if (self.labels is None) == (self.method == "frames"):
-            raise ValueError("labels belong to the method frames, and to it only")
+            raise ValueError("labels are needed by the method frames, and only by it")
         if self.background and self.method == "frames":
-            raise ValueError("frames are calibrated by at once; background belongs to the other methods")
+            raise ValueError("background cannot be used with the method frames")
         return self
 
 
 class CalibrationReport(BaseModel):
-    """A calibration, what was measured in making it, and what to know of it."""
+    """A calibration, and the measurement that it rests on."""
 
     map: str
     encoder: str
     method: Method
     target: Target
-    stored: bool = Field(description="It is the map's own from now on; false for a dry run.")
+    stored: bool = Field(description="Whether it was stored as the map's own calibration; false after a dry run.")
     calibration: Calibration
-    previous: Calibration = Field(description="The one that judged so far.")
+    previous: Calibration = Field(description="The calibration that was in force before.")
     measurement: Measurement
     warnings: list[str]

@@ -154,7 +154,7 @@ BODY: dict[str, Any] = {
     openapi_extra=BODY,
     response_model=MapView,
     responses={
-        202: {"model": JobView, "description": "The job that does it, if `background` is asked for."},
+        202: {"model": JobView, "description": "The job that makes the map, if `background` is true."},
         **problem_documentation(
             errors.InvalidIdentifier,
             errors.MapExists,

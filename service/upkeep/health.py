@@ -1,4 +1,8 @@
-"""How a map does: answers counted over the weeks, its own frames held against it, its sequences walked along."""
+"""The health report of a map.
+
+It counts the map's answers by week, searches for the map's own frames in the map to find places that look alike, and
+follows each sequence to find gaps.
+"""
 
 from __future__ import annotations
 
@@ -31,17 +35,18 @@ from service.upkeep.schemas import (
     WeekView,
 )
 
-HALF = 0.5
-"""Of the time: the map's frames are held against it first, then its sequences are walked along."""
+ALIASING_SHARE = 0.5
+"""Share of the time for places that look alike; the rest is for the sequences."""
 
 STEPS_TOGETHER = 64
+"""How many steps of a sequence are compared at a time."""
 
-SIGN_OF: dict[Measure, Reason] = {"distance": "distance-gap", "time": "time-gap", "similarity": "similarity-gap"}
+REASON_OF: dict[Measure, Reason] = {"distance": "distance-gap", "time": "time-gap", "similarity": "similarity-gap"}
 
 
 @dataclass(frozen=True)
 class _Walk:
-    """One sequence: positions in order, and what is out of the ordinary along it."""
+    """A sequence: the positions of its places in the map, in order, and the gaps between them."""
 
     name: str
     positions: NDArray[np.int64]
@@ -50,6 +55,8 @@ class _Walk:
 
 @dataclass(frozen=True)
 class _Aliasing:
+    """Places that look like other places; ``counts`` and ``hubs`` are as in :mod:`core.upkeep.hubness`."""
+
     examined: int
     neighbours: int
     counts: NDArray[np.int64]
@@ -58,23 +65,24 @@ class _Aliasing:
 
 
 def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds: float, limit: int) -> MapHealth:
-    """The report on a map.
+    """Make the health report of a map.
 
     Args:
-        encoder: that of the map.
-        seconds: to look at the map's frames; of a large one only a part, spread over it, is looked at then.
-        limit: most places, gaps and stretches that are named each.
+        encoder: the map's encoder.
+        statistics: the counted answers of the map.
+        seconds: how long to examine the map's frames; of a large map only a part is examined, spread over the map.
+        limit: how many places, gaps and stretches are listed at most, each.
 
     Raises:
-        MapQuarantined, StorageFailure, UnknownMap: it cannot be read.
+        MapQuarantined, StorageFailure, UnknownMap: the map cannot be read.
     """
     began = time.monotonic()
     own = SelfQueries(map_, encoder)
-    aliasing = _aliasing(own, began + HALF * seconds)
-    walks, all_walked = _walks(own, began + seconds)
+    aliasing = _aliasing(own, began + ALIASING_SHARE * seconds)
+    walks, all_compared = _walks(own, began + seconds)
     silent = [i for i, place in enumerate(own.places) if place.id not in statistics.places]
     names = [place.id for place in own.places]
-    listed = [
+    gaps = [
         GapView(
             sequence=walk.name,
             before=names[walk.positions[gap.before]],
@@ -87,23 +95,23 @@ def examine_health(map_: Map, encoder: Encoder, statistics: Statistics, seconds:
         for walk in walks
         for gap in walk.gaps
     ]
-    listed.sort(key=lambda gap: -gap.severity)
+    gaps.sort(key=lambda gap: -gap.severity)
     return MapHealth(
         map=map_.record.id,
         places=len(own),
-        complete=all_walked and aliasing.examined == len(own),
+        complete=all_compared and aliasing.examined == len(own),
         answers=_answers(statistics),
-        never_matched=_silent(own, statistics, silent, limit),
-        aliasing=_shown(own, aliasing, statistics, limit),
-        gaps=listed[:limit],
-        gap_count=len(listed),
+        never_matched=_never_matched(own, statistics, silent, limit),
+        aliasing=_aliasing_view(own, aliasing, statistics, limit),
+        gaps=gaps[:limit],
+        gap_count=len(gaps),
         retraverse=_retraverse(own, walks, aliasing, statistics, set(silent))[:limit],
     )
 
 
 def _answers(statistics: Statistics) -> AnswersView:
     weeks = statistics.weeks
-    shown = [
+    views = [
         WeekView(
             monday=week.monday,
             queries=week.queries,
@@ -124,27 +132,28 @@ def _answers(statistics: Statistics) -> AnswersView:
         recognized=sum(week.recognized for week in weeks),
         ambiguous=sum(week.ambiguous for week in weeks),
         unknown=sum(week.unknown for week in weeks),
-        weeks=shown,
-        score_trend=_trend(score_trend(weeks)),
-        unknown_trend=_trend(unknown_trend(weeks)),
+        weeks=views,
+        score_trend=_trend_view(score_trend(weeks)),
+        unknown_trend=_trend_view(unknown_trend(weeks)),
     )
 
 
-def _trend(found: Trend | None) -> TrendView | None:
+def _trend_view(found: Trend | None) -> TrendView | None:
     return None if found is None else TrendView(**asdict(found), significant=found.significant)
 
 
-def _silent(own: SelfQueries, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
+def _never_matched(own: SelfQueries, statistics: Statistics, silent: list[int], limit: int) -> SilentPlaces | None:
     asked = sum(week.compared for week in statistics.weeks)
     if not asked or not len(own):
         return None
     ordered = sorted(silent, key=lambda i: own.places[i].number)
-    by_chance = len(own) * math.exp(-asked / len(own))  # none of so many, had each been drawn from all places
+    # Poisson: how many places no query would match if each query matched a place drawn at random.
+    by_chance = len(own) * math.exp(-asked / len(own))
     return SilentPlaces(count=len(silent), by_chance=by_chance, places=[own.places[i].id for i in ordered[:limit]])
 
 
 def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
-    """Which places are among the most alike others of many, and which look more like others than like their own."""
+    """Find places that are neighbours of many others, and places that look more like another place than their own."""
     k = min(hubness.NEIGHBOURS, max(1, len(own) // 10))
     order = spread_order(len(own)).tolist()
     lists: list[NDArray[np.int64]] = [np.empty((0, k), np.int64)]
@@ -156,7 +165,7 @@ def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
         for position, others, scores in own.search(some):
             same = own.near(position, others)
             best, found = hubness.nearest_others(scores, same, k)
-            lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is the index of the last
+            lists.append(np.append(others, hubness.NONE)[best][np.newaxis])  # NONE is -1 and picks the appended NONE
             mine = float(scores[same].max()) if same.any() else None
             has_own = same.any() or own.near(position, everything[everything != position]).any()
             if best[0] != hubness.NONE and has_own and (mine is None or found[0] > mine):
@@ -167,7 +176,7 @@ def _aliasing(own: SelfQueries, until: float) -> _Aliasing:
     return _Aliasing(done, k, counts, hubness.hubs(counts), aliases)
 
 
-def _shown(own: SelfQueries, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
+def _aliasing_view(own: SelfQueries, found: _Aliasing, statistics: Statistics, limit: int) -> AliasingView:
     names = [place.id for place in own.places]
     counted = [statistics.places.get(name) for name in names]
     unsure = np.array([0 if count is None else count.best - count.recognized for count in counted], np.int64)
@@ -194,27 +203,27 @@ def _hubs(names: list[str], counts: NDArray[np.int64], limit: int) -> list[HubVi
 
 
 def _walks(own: SelfQueries, until: float) -> tuple[list[_Walk], bool]:
-    """Every sequence from its first frame to its last; False if some was walked without looking at the frames."""
+    """Every sequence with its gaps; False if the time was up before the frames of all were compared."""
     by_name: dict[str | None, list[int]] = {}
     for position, place in enumerate(own.places):
         by_name.setdefault(place.sequence, []).append(position)
     walks, complete = [], True
     for name, members in by_name.items():
-        if name is None:  # these were not taken one after the other
+        if name is None:  # these places are in no order
             continue
         ordered = np.array(sorted(members, key=lambda i: own.places[i].ordinal), np.int64)
         where = own.where.take(ordered)
         gaps = coverage.long_steps(coverage.distances(where), "distance")
         gaps += coverage.long_steps(coverage.durations(where), "time")
-        similarities, seen = _similarities(own, ordered, until)
+        similarities, all_seen = _similarities(own, ordered, until)
         gaps += coverage.unlike_steps(similarities)
-        complete = complete and seen
+        complete = complete and all_seen
         walks.append(_Walk(name, ordered, gaps))
     return walks, complete
 
 
 def _similarities(own: SelfQueries, ordered: NDArray[np.int64], until: float) -> tuple[NDArray[np.float64], bool]:
-    """How alike each frame looks to the next; NaN behind where the time was up."""
+    """How alike each frame and the next one look, NaN from where the time was up; False if it was up."""
     found = np.full(max(0, len(ordered) - 1), np.nan)
     pairs = np.stack([ordered[:-1], ordered[1:]], axis=1)
     for first in range(0, len(pairs), STEPS_TOGETHER):
@@ -227,11 +236,11 @@ def _similarities(own: SelfQueries, ordered: NDArray[np.int64], until: float) ->
 def _retraverse(
     own: SelfQueries, walks: list[_Walk], aliasing: _Aliasing, statistics: Statistics, silent: set[int]
 ) -> list[StretchView]:
-    """Stretches where several signs come together, the weightiest first."""
+    """The stretches of sequences that should be recorded again; those with the most signs come first."""
     aliased, hubs = {alias.place for alias in aliasing.aliases}, set(aliasing.hubs.tolist())
     made = []
     for walk in walks:
-        signs = [Sign(gap.before, gap.before + 1, SIGN_OF[gap.measure]) for gap in walk.gaps]
+        signs = [Sign(gap.before, gap.before + 1, REASON_OF[gap.measure]) for gap in walk.gaps]
         for index, position in enumerate(walk.positions.tolist()):
             signs += [Sign(index, index, "aliased")] if position in aliased else []
             signs += [Sign(index, index, "hub")] if position in hubs else []

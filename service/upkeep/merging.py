@@ -1,8 +1,8 @@
-"""The places of one map taken into another of the same encoder, without encoding anything again.
+"""The job that merges maps: it copies the places of one map into another of the same encoder, without encoding them.
 
-Places come in by commits of some, each place with all that belongs to it.  After a kill the job goes on behind those
-that came; if it fails or is cancelled, those are taken out again.  Which ones came with it can be told at any time:
-what the map held before has a number up to the one that was noted at the beginning.
+Each commit copies some places with everything that is stored of them.  After a restart the job continues with the
+places that are missing; if it fails or is cancelled, it removes those that it copied.  They are known by their numbers,
+which are higher than the last number that the map had when the merge began.
 """
 
 from __future__ import annotations
@@ -29,24 +29,25 @@ from service.jobs.context import JobContext, JobInterrupted, yield_to_requests
 
 KIND = "merge"
 
-CHUNK = 64
-"""Places of one commit."""
+PLACES_PER_COMMIT = 64
 
-NAMED = 20
+MOST_LISTED = 20
+"""How many ids, names or pairs a report or message lists at most."""
+
 ROUNDS = 3
-"""Places that change in the other map while they are taken are looked at again so often."""
+"""How often the job looks for places that changed in the other map while it copied."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a merge does.
+    """What a merge is going to do.
 
-    coming: the other map's places that come, and the id that each gets.
-    known: places that this map has already, with the same frame.
-    skipped: ids that mean another frame here, whose places are left out.
-    renamed: places that get another id.
-    sequences, cameras: other names for those of the other map.
-    conflicts: sentences that say why it cannot be done.
+    coming: the places of the other map that are copied, each with its id in this map.
+    known: how many places this map has already, with the same frame.
+    skipped: ids of places that are not copied, because the id belongs to another frame here.
+    renamed: how many places get another id.
+    sequences, cameras: the new names of sequences and cameras of the other map, by their names there.
+    conflicts: sentences that say why the maps cannot be merged; empty if they can.
     """
 
     coming: Sequence[tuple[Outline, str]]
@@ -58,55 +59,55 @@ class Plan:
     conflicts: Sequence[str]
 
     def report(self) -> dict[str, Any]:
-        """As callers see it."""
+        """The plan as JSON, for the result of the job."""
         return {
             "coming": len(self.coming),
             "known": self.known,
-            "skipped": {"count": len(self.skipped), "places": list(self.skipped[:NAMED])},
+            "skipped": {"count": len(self.skipped), "places": list(self.skipped[:MOST_LISTED])},
             "renamed": {"places": self.renamed, "sequences": dict(self.sequences), "cameras": dict(self.cameras)},
             "conflicts": list(self.conflicts),
         }
 
 
-def check_encoders(map_: Map, other: Map) -> None:
-    """See that two maps can be compared at all.
+def check_same_encoder(map_: Map, other: Map) -> None:
+    """Check that two maps have the same encoder.
 
     Raises:
-        WrongEncoder: they are of two encoders.
+        WrongEncoder: they have not.
     """
     ours, theirs = map_.record.encoder, other.record.encoder
     if ours != theirs:
         raise WrongEncoder(
-            f"The map {other.record.id} is bound to {theirs}, {map_.record.id} to {ours}: re-encode one of them first."
+            f"The map {other.record.id} is bound to {theirs}, {map_.record.id} to {ours}; re-encode one of them first."
         )
 
 
-def planned(map_: Map, other: Map, wanted: Mapping[str, Any], before: Sequence[Outline]) -> Plan:
-    """What would be done.
+def plan_merge(map_: Map, other: Map, options: Mapping[str, Any], before: Sequence[Outline]) -> Plan:
+    """Decide what to copy, under which names, and find what prevents it; nothing is changed.
 
     Args:
-        wanted: ``on_conflict`` and ``prefix`` of the request.
-        before: what this map held when the merge began.
+        options: ``on_conflict`` and ``prefix`` of the request.
+        before: the places that this map had when the merge began.
     """
-    rule, prefix = wanted["on_conflict"], wanted["prefix"]
+    rule, prefix = options["on_conflict"], options["prefix"]
     here = {place.id: place for place in before}
     coming: list[tuple[Outline, str]] = []
     skipped, conflicts, known, renamed = [], [], 0, 0
     clashing: list[str] = []
-    unnamed: list[Outline] = []  # places that should come, but have no name to come under
+    unnamed: list[Outline] = []  # places that should be copied, but have no free id
     for place in other.transfer.outline():
-        there = here.get(place.id)
-        if there is not None and there.digest == place.digest:
+        present = here.get(place.id)
+        if present is not None and present.digest == place.digest:
             known += 1
-        elif there is None:
+        elif present is None:
             coming.append((place, place.id))
         elif rule == "skip":
             skipped.append(place.id)
         elif rule == "rename":
             name = prefix + place.id
-            if (there := here.get(name)) is not None and there.digest == place.digest:
+            if (present := here.get(name)) is not None and present.digest == place.digest:
                 known += 1
-            elif there is not None or not _can_name_a_place(name):
+            elif present is not None or not _can_name_a_place(name):
                 clashing.append(name)
                 unnamed.append(place)
             else:
@@ -116,41 +117,45 @@ def planned(map_: Map, other: Map, wanted: Mapping[str, Any], before: Sequence[O
             clashing.append(place.id)
             unnamed.append(place)
     if clashing:
-        conflicts.append(f"{len(clashing)} ids mean other frames here: {', '.join(clashing[:NAMED])}.")
+        conflicts.append(f"{len(clashing)} ids belong to other frames here: {_listed(clashing)}.")
     given = {name for _, name in coming}
     if len(given) < len(coming):
-        conflicts.append(f"{len(coming) - len(given)} places would get an id that another one has: choose a prefix.")
-    wished = [place for place, _ in coming] + unnamed
-    sequences, cameras = _other_names(map_, other, wanted, before, wished, conflicts)
+        conflicts.append(f"{len(coming) - len(given)} places would get the id of another place; choose another prefix.")
+    wanted = [place for place, _ in coming] + unnamed
+    sequences, cameras = _new_names(map_, other, options, before, wanted, conflicts)
     return Plan(coming, known, skipped, renamed, sequences, cameras, conflicts)
 
 
-def _other_names(
+def _new_names(
     map_: Map,
     other: Map,
-    wanted: Mapping[str, Any],
+    options: Mapping[str, Any],
     before: Sequence[Outline],
     coming: Sequence[Outline],
     conflicts: list[str],
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """New names for sequences and cameras that mean something else here; what cannot be solved is a conflict."""
-    rule, prefix = wanted["on_conflict"], wanted["prefix"]
+    """New names for sequences and cameras whose names are taken here; what cannot be renamed is added to conflicts."""
+    rule, prefix = options["on_conflict"], options["prefix"]
     ours = {place.sequence for place in before}
     shared = sorted({place.sequence for place in coming if place.sequence is not None} & (ours - {None}))
     sequences = {name: prefix + name for name in shared} if rule == "rename" else {}
     if shared and rule == "refuse":
-        conflicts.append(f"Both maps have the sequences {', '.join(shared[:NAMED])}.")
+        conflicts.append(f"Both maps have the sequences {_listed(shared)}.")
     if taken := [name for name in sequences.values() if name in ours or len(name) > 128]:
-        conflicts.append(f"There are sequences {', '.join(taken[:NAMED])} already, or their names are too long.")
+        conflicts.append(f"The names {_listed(taken)} of sequences are taken or too long; choose another prefix.")
     masks = {camera.name: camera.mask for camera in map_.cameras.all()}
     used = {place.camera for place in coming}
     unlike = [c for c in other.cameras.all() if c.name in used and c.name in masks and masks[c.name] != c.mask]
     cameras = {camera.name: prefix + camera.name for camera in unlike} if rule == "rename" else {}
     if unlike and rule != "rename":
-        conflicts.append(f"The cameras {', '.join(camera.name for camera in unlike[:NAMED])} have other masks here.")
+        conflicts.append(f"The cameras {_listed([camera.name for camera in unlike])} have other masks here.")
     if taken := [new for name, new in cameras.items() if len(new) > 64 or (new in masks and masks[new] is not None)]:
-        conflicts.append(f"There are cameras {', '.join(taken[:NAMED])} already, or their names are too long.")
+        conflicts.append(f"The names {_listed(taken)} of cameras are taken or too long; choose another prefix.")
     return sequences, cameras
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_LISTED])
 
 
 def _can_name_a_place(name: str) -> bool:
@@ -162,26 +167,30 @@ def _can_name_a_place(name: str) -> bool:
 
 
 def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Do, or go on with, what the job says: ``from``, ``on_conflict``, ``prefix``, ``dry_run``, ``sample``.
+    """Merge, or continue to merge, the map that the job's argument ``from`` names into the job's map.
+
+    The other arguments are ``on_conflict``, ``prefix``, ``dry_run`` and ``sample`` of the request.
 
     Raises:
-        UnknownMap, WrongEncoder, MergeConflict, EncoderNotInstalled, StorageFull, StorageFailure: the map is as
-            it was.
+        UnknownMap, WrongEncoder, MergeConflict, EncoderNotInstalled, StorageFull, StorageFailure: the map is what it
+            was before.
+        JobCancelled: likewise.
+        JobInterrupted: the next attempt continues.
     """
     map_ = context.map(engine.atlas)
     try:
         other = context.map(engine.atlas, context.arguments["from"])
-        check_encoders(map_, other)
+        check_same_encoder(map_, other)
     except PlacerecError as error:
         if "after" in context.notes:
             with engine.writing(map_.record.id):
-                _undo(context, map_, None, error)
+                _remove_copies(context, map_, None, error)
         raise
     if "after" not in context.notes:
         outline = map_.transfer.outline()
-        plan = planned(map_, other, context.arguments, outline)
+        plan = plan_merge(map_, other, context.arguments, outline)
         report = plan.report() | {
-            "overlap": overlap(engine, context, map_, other) if context.arguments["sample"] else None
+            "overlap": measure_overlap(engine, context, map_, other) if context.arguments["sample"] else None
         }
         if context.arguments["dry_run"]:
             return report
@@ -193,33 +202,33 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         cameras = _new_cameras(map_, other, plan)
         context.remember(after=after, ends=ends, report=report, cameras=cameras, coming=coming)
     try:
-        _take(engine, context, map_, other)
+        _copy_places(engine, context, map_, other)
     except JobInterrupted:
         raise
     except BaseException as error:
         with engine.writing(map_.record.id):
-            _undo(context, map_, other, error)
+            _remove_copies(context, map_, other, error)
         raise
     return dict(context.notes["report"]) | {"places": map_.count_places()}
 
 
 def _new_cameras(map_: Map, other: Map, plan: Plan) -> list[str]:
-    there = {camera.name for camera in map_.cameras.all()}
+    existing = {camera.name for camera in map_.cameras.all()}
     used = {place.camera for place, _ in plan.coming}
     names = [plan.cameras.get(camera.name, camera.name) for camera in other.cameras.all() if camera.name in used]
-    return [name for name in names if name not in there]
+    return [name for name in names if name not in existing]
 
 
-def _held_before(context: JobContext, map_: Map) -> list[Outline]:
+def _places_before(context: JobContext, map_: Map) -> list[Outline]:
     return [place for place in map_.transfer.outline() if place.number <= context.notes["after"]]
 
 
-def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
-    """Bring over what is not there yet, until all is."""
+def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
+    """Copy the places that are missing, and then those that changed in the other map meanwhile."""
     for _ in range(ROUNDS):
         context.check_cancelled()
         here = {place.id: place.digest for place in map_.transfer.outline()}
-        plan = planned(map_, other, context.arguments, _held_before(context, map_))
+        plan = plan_merge(map_, other, context.arguments, _places_before(context, map_))
         coming = [(place, name) for place, name in plan.coming if name in context.notes["coming"]]
         due = [(place, name) for place, name in coming if here.get(name) != place.digest]
         if not due:
@@ -230,36 +239,37 @@ def _take(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
             if name in context.notes["cameras"]:
                 map_.cameras.put(name, camera.mask)
         snapshot = other.snapshot()
-        for first in range(0, len(due), CHUNK):
+        for first in range(0, len(due), PLACES_PER_COMMIT):
             yield_to_requests(engine, context)
-            # No place may be enrolled under one of the ids between the look at them and the commit.
+            # No place may be enrolled under one of the ids between this check and the commit.
             with engine.writing(map_.record.id):
-                _adopt(context, map_, other, snapshot, _still_free(context, map_, due[first : first + CHUNK]))
-            context.progress(len(coming) - len(due) + min(first + CHUNK, len(due)), len(coming))
+                free = _still_free(context, map_, due[first : first + PLACES_PER_COMMIT])
+                _copy(context, map_, other, snapshot, free)
+            context.progress(len(coming) - len(due) + min(first + PLACES_PER_COMMIT, len(due)), len(coming))
 
 
 def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str]]) -> list[tuple[Outline, str]]:
-    """What may come under its name: nobody has enrolled another frame there since the merge began.
+    """Those of the places whose ids nobody has given to another frame since the merge began.
 
     Raises:
-        MergeConflict: somebody has, and such places are not to be skipped.
+        MergeConflict: an id was given to another frame, and the request does not say to skip such places.
     """
     free: list[tuple[Outline, str]] = []
     for place, name in due:
-        there = map_.digest(name)
-        if there is None or there.hex() == context.notes["coming"][name]:
+        digest = map_.digest(name)
+        if digest is None or digest.hex() == context.notes["coming"][name]:
             free.append((place, name))
         elif context.arguments["on_conflict"] != "skip":
-            raise MergeConflict(f"The place {name!r} was enrolled with another frame while the merge was under way.")
+            raise MergeConflict(f"The place {name!r} was enrolled with another frame during the merge.")
     return free
 
 
-def _adopt(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
-    """One commit."""
+def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: Sequence[tuple[Outline, str]]) -> None:
+    """Copy some places in one commit."""
     names, ends = context.notes["report"]["renamed"], context.notes["ends"]
     pictures = {place.id: other.picture(place.id) for place, _ in due}
-    # Read behind the pictures: a place that is still in its row shows the frame that was read.  What was changed or
-    # forgotten since it was listed is for the next round.
+    # This is read after the pictures: if a place still has its row, its picture is that of the same frame.  Places
+    # that were changed or forgotten since they were listed are left to the next round.
     found = other.transfer.find([place.id for place, _ in due])
     ready = [(p, name) for p, name in due if p.id in found and found[p.id][1] == p.row < snapshot.rows]
     rows = np.array([place.row for place, _ in ready], np.int64)
@@ -288,43 +298,44 @@ def _adopt(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: 
     map_.transfer.adopt(items)
 
 
-def _undo(context: JobContext, map_: Map, other: Map | None, error: BaseException) -> None:
-    """Take out again what came; the map is then as it was.
+def _remove_copies(context: JobContext, map_: Map, other: Map | None, error: BaseException) -> None:
+    """Remove what the merge copied, so that the map is what it was before.
+
+    Args:
+        other: the map that was merged; None if it is gone.
+        error: why the merge ended.
 
     Raises:
-        StorageFailure: that could not be done.
+        StorageFailure: the disk refuses, and copied places remain.
     """
     try:
         noted = {name: {bytes.fromhex(digest)} for name, digest in context.notes["coming"].items()}
-        with suppress(PlacerecError):  # the other map is gone: its places came as they were noted
-            for place, name in (
-                [] if other is None else planned(map_, other, context.arguments, _held_before(context, map_)).coming
-            ):
-                if name in noted:
-                    noted[name].add(place.digest)
-        came = {
+        if other is not None:
+            with suppress(PlacerecError):  # if the other map is gone, its places were copied as they are noted
+                for place, name in plan_merge(map_, other, context.arguments, _places_before(context, map_)).coming:
+                    if name in noted:
+                        noted[name].add(place.digest)
+        copied = {
             place.id: place.digest
             for place in map_.transfer.outline()
             if place.id in context.notes["coming"]
             and place.number > context.notes["after"]
             and place.digest in noted[place.id]
         }
-        map_.transfer.forget(came)
+        map_.transfer.forget(copied)
         for camera in context.notes["cameras"]:
             try:
                 map_.cameras.forget(camera)
             except UnknownCamera:
                 continue
     except UnknownMap:
-        return  # it was deleted, with all that had come
+        return  # the map was deleted, with everything that was copied
     except PlacerecError as further:
         raise StorageFailure(
-            f"The merge ended ({error or type(error).__name__}), and what it had brought could not be taken out again "
-            f"({further}): places of the map {context.arguments['from']} remain; merge it again, or forget them."
+            f"The merge failed ({error or type(error).__name__}), and the places that it had copied could not be "
+            f"removed ({further}): places of the map {context.arguments['from']} remain; merge it again or forget them."
         ) from error
 
-
-NAMED = 20
 
 _NO_REGIONS = Regions(
     np.empty((0, 4), np.int32),
@@ -333,14 +344,22 @@ _NO_REGIONS = Regions(
     np.empty(0, np.int32),
     np.empty((0, 0), np.float32),
 )
-"""What was found in a frame that is not at hand any more; a search does not look at it."""
+"""Stands for the regions of a frame that is no longer available; a search does not use them."""
 
 
-def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[str, Any]:
-    """How many of the other map's places this one recognizes, by a sample of them spread over it."""
+def measure_overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[str, Any]:
+    """Count how many of the other map's places this map recognizes, in a sample that is spread over the other map.
+
+    Returns:
+        JSON: counts by verdict, the median distance in metres between recognized places and their matches, and the
+        pairs with the highest scores.
+
+    Raises:
+        EncoderNotInstalled, StorageFailure, JobCancelled, JobInterrupted.
+    """
     encoder = engine.load_encoder(map_)
     outline, snapshot = other.transfer.outline(), other.snapshot()
-    outline = [place for place in outline if place.row < snapshot.rows]  # not what is being written in this very moment
+    outline = [place for place in outline if place.row < snapshot.rows]  # without places that are being written now
     chosen = [outline[i] for i in spread_order(len(outline))[: context.arguments["sample"]]]
     verdicts = {"recognized": 0, "ambiguous": 0, "unknown": 0}
     pairs: list[dict[str, Any]] = []
@@ -351,22 +370,22 @@ def overlap(engine: Engine, context: JobContext, map_: Map, other: Map) -> dict[
         rows = np.array([place.row for place in some], np.int64)
         descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
         encodings = [Encoding(d, cells, _NO_REGIONS, {}) for d, cells in zip(descriptors, local, strict=True)]
-        there = other.transfer.find([place.id for place in some])
+        stored = other.transfer.find([place.id for place in some])
         for place, located in zip(some, locate(map_, encoder, encodings, 1), strict=True):
             verdicts[located.judgement.verdict] += 1
-            if located.judgement.verdict != "recognized" or place.id not in there:
+            if located.judgement.verdict != "recognized" or place.id not in stored:
                 continue
             score, match = located.matches[0]
             pairs.append({"place": place.id, "match": match.id, "score": float(score)})
-            ours, theirs = match.pose, there[place.id][0].pose
+            ours, theirs = match.pose, stored[place.id][0].pose
             if ours is not None and theirs is not None and ours.kind() == theirs.kind():
                 apart.append(float(np.linalg.norm(ours.position() - theirs.position())))
-        context.progress(first + len(some), len(chosen), "compares the maps")
+        context.progress(first + len(some), len(chosen), "comparing the maps")
     pairs.sort(key=lambda pair: -pair["score"])
     return {
         "examined": len(chosen),
         "of": len(outline),
         **verdicts,
         "metres_apart": median(apart) if apart else None,
-        "pairs": pairs[:NAMED],
+        "pairs": pairs[:MOST_LISTED],
     }

@@ -1,4 +1,4 @@
-"""Leaving places out that their neighbours stand in for, and what that costs in recall."""
+"""The job that prunes a map: it removes places whose neighbours can stand in for them, and measures what is lost."""
 
 from __future__ import annotations
 
@@ -20,64 +20,70 @@ from service.jobs.context import JobContext, yield_to_requests
 KIND = "prune"
 
 DEPTH = 64
-"""So many of the best places of each query are kept in mind: what is left of them after pruning decides."""
+"""How many of the best matches of each query are remembered, so that it need not be searched again for each trial."""
 
 STEPS = 12
-"""Thresholds that are tried, from the gentlest on."""
+"""How many similarity thresholds are tried, the one that removes least first."""
 
 PAIRS_TOGETHER = 256
+"""How many pairs of places are compared at a time."""
 
-NAMED = 100
-"""Places that go are counted, and so many named."""
+MOST_LISTED = 100
+"""How many of the removed places the report lists at most."""
 
 
 def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Do what the job says: find what can go, measure what it costs and, unless ``dry_run``, forget it.
+    """Find the places that can be removed, measure the loss of recall, and remove them unless ``dry_run`` is set.
 
-    What is to go is written down before it goes, and goes in one COMMIT: an attempt after a kill finds that it went,
-    or lets it go, and never thins what was thinned.
+    The places are noted before they are removed, in one commit.  So an attempt after a restart removes the places
+    that were noted, if they are still there, and never plans again for a map that was pruned already.
 
     Raises:
-        UnknownMap, UnknownSequence, NothingToMeasure, EncoderNotInstalled, StorageFull, StorageFailure.
+        UnknownMap, UnknownSequence, NothingToMeasure, EncoderNotInstalled, StorageFull, StorageFailure: the map is
+            what it was before.
+        JobCancelled, JobInterrupted.
     """
     map_ = context.map(engine.atlas)
-    if (planned := context.notes.get("report")) is None:
-        planned, going = _plan(engine, context)
+    if (report := context.notes.get("report")) is None:
+        report, going = _plan(engine, context)
         if context.arguments["dry_run"]:
-            return planned
-        context.remember(report=planned, going=going)
+            return report
+        context.remember(report=report, going=going)
     digests = {place: bytes.fromhex(digest) for place, digest in context.notes["going"].items()}
-    if any(digests.get(place.id) == place.digest for place in map_.transfer.outline()):  # not done by an attempt before
-        context.check_cancelled()
-    context.progress(0, len(digests), "forgets the places")
+    if any(digests.get(place.id) == place.digest for place in map_.transfer.outline()):
+        context.check_cancelled()  # no earlier attempt has removed them
+    context.progress(0, len(digests), "removing places")
     with engine.writing(map_.record.id):
         map_.transfer.forget(digests)
     context.progress(len(digests), len(digests))
-    return dict(planned) | {"places_after": map_.count_places()}
+    return dict(report) | {"places_after": map_.count_places()}
 
 
 def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str, str]]:
-    """The report, and the digests of the places that go, by their ids."""
-    wanted = context.arguments
+    """The report, and the SHA-256 of the images of the places to remove, by id."""
+    options = context.arguments
     map_ = context.map(engine.atlas)
     own = SelfQueries(map_, engine.load_encoder(map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
-    asking = _named(names, wanted["queries"])
-    references = ~asking if wanted["queries"] is not None else np.ones(len(own), np.bool_)
-    trial = _try(engine, context, own, asking if wanted["queries"] is not None else references, references, wanted)
+    if options["queries"] is not None:
+        queries = _members(names, options["queries"])
+        references = ~queries
+    else:
+        queries = references = np.ones(len(own), np.bool_)
+    trial = _search(engine, context, own, queries, references, options["sample"])
     pairs = neighbour_pairs(own.where, own.neighborhood)
-    free = references & (_named(names, wanted["sequence"]) if wanted["sequence"] is not None else True)
+    removable = references & _members(names, options["sequence"]) if options["sequence"] is not None else references
     pairs = pairs[references[pairs].all(axis=1)]
     similarity = _similarities(engine, context, own, pairs)
-    choices = steps(similarity, STEPS) if wanted["similarity"] is None else [wanted["similarity"]]
+    choices = steps(similarity, STEPS) if options["similarity"] is None else [options["similarity"]]
     before = trial.found(references)
     tried: list[Thinning] = []
     for least in choices:
         context.check_cancelled()
-        # Places that must stay may stand in for others, but not the other way round.
-        kept = thinned(len(own), pairs, similarity, least, free)
+        # Places that must stay can stand in for others, but not the other way round.
+        kept = thinned(len(own), pairs, similarity, least, removable)
         tried.append(Thinning(least, kept, before, trial.found(kept & references)))
-    most_loss = 1.0 if wanted["similarity"] is not None else wanted["max_recall_loss"]
+    most_loss = 1.0 if options["similarity"] is not None else options["max_recall_loss"]
     chosen = best_thinning(tried, most_loss)
     going = (
         {} if chosen is None else {own.places[i].id: own.places[i].digest.hex() for i in np.flatnonzero(~chosen.kept)}
@@ -87,7 +93,7 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
         "places": len(own),
         "removed": len(going),
         "similarity": None if chosen is None else chosen.least,
-        "measured_on": "leave-one-out" if wanted["queries"] is None else wanted["queries"],
+        "measured_on": "leave-one-out" if options["queries"] is None else options["queries"],
         "queries": len(before),
         "recall_before": _share(before),
         "recall_after": _share(after),
@@ -96,14 +102,15 @@ def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str
             {"similarity": one.least, "removed": int((~one.kept).sum()), "recall": float(one.after.mean())}
             for one in tried
         ],
-        "named": list(going)[:NAMED],
+        "named": list(going)[:MOST_LISTED],
     }  # fmt: skip
     return report, going
 
 
-def _named(names: NDArray[np.str_], sequence: str | None) -> NDArray[np.bool_]:
-    chosen = np.zeros(len(names), np.bool_) if sequence is None else names == sequence
-    if sequence is not None and not chosen.any():
+def _members(names: NDArray[np.str_], sequence: str) -> NDArray[np.bool_]:
+    """Which places belong to a sequence; raises UnknownSequence if none does."""
+    chosen: NDArray[np.bool_] = names == sequence
+    if not chosen.any():
         raise UnknownSequence(f"The map has no sequence {sequence[:128]!r}.")
     return chosen
 
@@ -115,25 +122,31 @@ def _share(right: NDArray[np.bool_]) -> dict[str, Any]:
 def _similarities(
     engine: Engine, context: JobContext, own: SelfQueries, pairs: NDArray[np.int64]
 ) -> NDArray[np.float32]:
+    """How alike the two frames of each pair look, by the first stage; float32 [pairs]."""
     found = [np.empty(0, np.float32)]
     for first in range(0, len(pairs), PAIRS_TOGETHER):
         yield_to_requests(engine, context)
         found.append(own.first_stage_scores(pairs[first : first + PAIRS_TOGETHER]))
-        context.progress(min(first + PAIRS_TOGETHER, len(pairs)), len(pairs), "compares neighbours")
+        context.progress(min(first + PAIRS_TOGETHER, len(pairs)), len(pairs), "comparing neighbours")
     return np.concatenate(found)
 
 
-def _try(
+def _search(
     engine: Engine,
     context: JobContext,
     own: SelfQueries,
-    asking: NDArray[np.bool_],
+    queries: NDArray[np.bool_],
     references: NDArray[np.bool_],
-    wanted: Mapping[str, Any],
+    sample: int,
 ) -> Trial:
-    """Hold the frames that ask against the others, each without itself."""
-    candidates = np.flatnonzero(asking)
-    chosen = candidates[spread_order(len(candidates))[: wanted["sample"]]]
+    """Search for a sample of the queries among the references, for each query without itself.
+
+    Raises:
+        NothingToMeasure: no query has another frame of the same place among the references.
+        JobCancelled, JobInterrupted, StorageFailure.
+    """
+    candidates = np.flatnonzero(queries)
+    chosen = candidates[spread_order(len(candidates))[:sample]]
     depth, stage = min(DEPTH, max(1, len(own))), own.encoder.candidates
     found: list[tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]] = []
     everything = np.flatnonzero(references)
@@ -142,7 +155,7 @@ def _try(
         some = chosen[first : first + TOGETHER].tolist()
         for position, others, scores in own.search(some, references):
             if not own.near(position, everything[everything != position]).any():
-                continue  # nothing could be right
+                continue  # no answer could be right
             best = others[:depth]
             gains = np.zeros(len(best), np.float32)
             if stage:
@@ -157,11 +170,11 @@ def _try(
                 np.pad(gains, padding),
                 np.pad(right, padding),
             ))  # fmt: skip
-        context.progress(first + len(some), len(chosen), "asks")
+        context.progress(first + len(some), len(chosen), "searching")
     if not found:
         raise NothingToMeasure(
-            "No frame of the map has another one of the same place to be recognized by: there is nothing to prune, "
-            "or poses and sequences do not say which places are the same."
+            "No frame of the map has another frame of the same place by which it could be recognized: there is nothing "
+            "to prune, or poses and sequences do not tell which places are the same."
         )
     positions, scores, gains, right = (np.stack(column) for column in zip(*found, strict=True))
     return Trial(positions, scores, gains, right, stage)

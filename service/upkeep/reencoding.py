@@ -1,8 +1,8 @@
-"""A map made anew for another encoder, from the images that it keeps, while the old one serves.
+"""The job that re-encodes a map: it makes a new map for another encoder from the images that the old map keeps.
 
-The new map is made unlisted and is published by one rename when it holds exactly what the old one does at that
-moment, so that nobody ever meets half of it.  After a kill the job goes on with what is there: a place is in the new
-map with all that belongs to it, or not at all.
+The old map serves meanwhile.  The new map is not listed until one rename publishes it, at a time when it contains
+exactly the places of the old map.  After a restart the job continues with the places that are missing: each place is in
+the new map with everything that is stored of it, or not at all.
 """
 
 from __future__ import annotations
@@ -24,39 +24,42 @@ from service.jobs.context import JobContext, JobInterrupted, creation_time, enco
 
 KIND = "re-encode"
 
-CHUNK = 16
-"""Frames that are read, encoded and committed together: what a kill makes the job do again."""
+PLACES_PER_COMMIT = 16
+"""How many frames are read, encoded and committed together; a restart loses at most one such chunk."""
 
 ROUNDS = 8
-"""The job catches up with what was changed meanwhile so often; then nobody may change the map for a moment."""
+"""How often the job catches up with changes of the old map before it blocks further changes until it has finished."""
 
-NAMED = 20
-"""Places that could not be encoded are counted, and so many named."""
+MOST_LISTED = 20
+"""How many of the places that could not be encoded the result lists at most."""
 
 
 def check_images(map_: Map) -> None:
-    """See that every place of a map keeps its image.
+    """Check that a map keeps the image of each of its places.
 
     Raises:
-        ImagesMissing: some do not; says how many.
+        ImagesMissing: some images are missing.
     """
     if missing := map_.transfer.count_without_image():
         raise ImagesMissing(
             f"{missing} of the {map_.count_places()} places of the map {map_.record.id} keep no image, so they cannot "
-            "be encoded anew: send their frames again while the map keeps images, or forget them."
+            "be encoded again: enrol their frames again while the map keeps images, or forget them."
         )
 
 
 def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
-    """Do, or go on with, what the job ``context`` says: ``to``, the new map's id, and ``encoder``, its identity.
+    """Re-encode, or continue to re-encode, the job's map.
+
+    The job's arguments are ``to``, the id of the new map, and ``encoder``, the identity of its encoder.
 
     Raises:
-        UnknownMap, MapExists, ImagesMissing, UnknownEncoder, StorageFull, StorageFailure: nothing of the new map is
-            left.
+        UnknownMap, MapExists, ImagesMissing, UnknownEncoder, StorageFull, StorageFailure, JobCancelled: nothing of
+            the new map is left.
+        JobInterrupted: the next attempt continues.
     """
     target, identity = context.arguments["to"], context.arguments["encoder"]
     if (published := context.notes.get("result")) is not None and _is_published(engine, target, context.notes["made"]):
-        return dict(published)  # killed between the rename and the end of the job
+        return dict(published)  # the process was killed after the rename
     if not context.notes:
         if target in engine.atlas.unlisted():
             raise MapExists(f"A map {target!r} is being made.")
@@ -66,7 +69,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     except JobInterrupted:
         raise
     except BaseException:
-        with suppress(PlacerecError):  # it is at the next start
+        with suppress(PlacerecError):  # the next start removes it
             engine.atlas.abandon(target)
         raise
 
@@ -79,46 +82,47 @@ def _is_published(engine: Engine, target: str, made: str) -> bool:
 
 
 class _Reencoding:
-    """One attempt."""
+    """One attempt of the job: ``source`` is the old map, ``made`` the new one."""
 
     def __init__(self, engine: Engine, context: JobContext, target: str, identity: str) -> None:
         self.engine, self.context, self.target, self.identity = engine, context, target, identity
         self.source = context.map(engine.atlas)
         self.made = engine.atlas.unlisted().get(target) or self._create()
         self.left_out: dict[str, tuple[Outline, str]] = {}
-        """Places whose frame gives the new encoder nothing, by id, and why."""
+        """By id, the places whose frames the new encoder cannot encode, and why."""
 
     def _create(self) -> Map:
-        shape = next(s for s in self.engine.catalogue.describe() if s.identity == self.identity)
+        encoder = next(one for one in self.engine.catalogue.describe() if one.identity == self.identity)
         record = self.source.record
         return self.engine.atlas.create(
             self.target,
             self.identity,
-            shape.dimension,
+            encoder.dimension,
             record.settings(),
-            shape.local_shape,
+            encoder.local_shape,
             unlisted=True,
             precision="half" if record.precision == "full" else record.precision,
         )
 
     def run(self) -> Mapping[str, Any]:
+        """Copy until the maps are alike, and publish the new map; returns the result of the job."""
         for _ in range(ROUNDS):
             self._catch_up()
             with self.source.transfer.paused_writes():
-                if self._is_level():
+                if self._is_up_to_date():
                     return self._publish()
-        with self.source.transfer.paused_writes():  # it is changed faster than it can be encoded
+        with self.source.transfer.paused_writes():  # the old map changes faster than it can be encoded
             self._catch_up()
-            if not self._is_level():
-                raise RuntimeError("the new map is not what the old one is")
+            if not self._is_up_to_date():
+                raise RuntimeError("the new map differs from the old map, although nobody could change either")
             return self._publish()
 
     def _differences(self) -> tuple[list[Outline], dict[str, Outline], dict[str, bytes]]:
-        """What has to be brought over, what is there already (by id), and what must go (digests by id)."""
+        """The places to copy, the places of the new map by id, and the digests of those to remove by id."""
         ours, theirs = self.source.transfer.outline(), {place.id: place for place in self.made.transfer.outline()}
-        present = {place.id for place in ours}
+        ids = {place.id for place in ours}
         due = [place for place in ours if not (self._is_left_out(place) or _is_same(place, theirs.get(place.id)))]
-        gone = {place.id: place.digest for place in theirs.values() if place.id not in present}
+        gone = {place.id: place.digest for place in theirs.values() if place.id not in ids}
         self.context.progress(len(ours) - len(due), len(ours))
         return due, theirs, gone
 
@@ -126,31 +130,31 @@ class _Reencoding:
         known = self.left_out.get(place.id)
         return known is not None and known[0].same_frame(place)
 
-    def _is_level(self) -> bool:
+    def _is_up_to_date(self) -> bool:
         due, _, gone = self._differences()
         return not due and not gone
 
     def _catch_up(self) -> None:
-        """Bring the new map to where the old one is, or was when this began."""
+        """Copy to the new map what differs in the old map now."""
         due, theirs, gone = self._differences()
-        if bare := sum(place.picture != "image" for place in due):
-            raise ImagesMissing(f"{bare} places of the map {self.source.record.id} keep no image by now.")
-        # A frame whose camera is another one now, or that shows another picture, is enrolled from the start.
+        if missing := sum(place.picture != "image" for place in due):
+            raise ImagesMissing(f"{missing} places of the map {self.source.record.id} no longer keep an image.")
+        # A place that has another frame or camera now is encoded again.
         stale = {p.id: theirs[p.id].digest for p in due if p.id in theirs and not p.same_frame(theirs[p.id])}
         self.made.transfer.forget({**gone, **stale})
         total = self.source.count_places()
-        for first in range(0, len(due), CHUNK):
+        for first in range(0, len(due), PLACES_PER_COMMIT):
             self.context.check_cancelled()
-            chunk = due[first : first + CHUNK]
+            chunk = due[first : first + PLACES_PER_COMMIT]
             known = [place for place in chunk if place.id in theirs and place.id not in stale]
-            self._move([place for place in chunk if place not in known], known)
+            self._copy([place for place in chunk if place not in known], known)
             self.context.progress(total - len(due) + first + len(chunk), total)
 
-    def _move(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
-        """Commit some places: new ones with their frames encoded, known ones with their fields and order as of now."""
+    def _copy(self, new: Sequence[Outline], known: Sequence[Outline]) -> None:
+        """Copy places in one commit: encode the frames of new ones, update the fields and order of known ones."""
         images = {place.id: self.source.picture(place.id) for place in new}
-        # Read behind the images: a place that is still in its row shows the frame that was read.  What was changed
-        # or forgotten since it was listed is found by the next round.
+        # This is read after the images: if a place still has its row, its image is that of the same frame.  Places
+        # that were changed or forgotten since they were listed are left to the next round.
         fields = self.source.transfer.find([place.id for place in (*new, *known)])
         ready = [place for place in new if place.id in fields and fields[place.id][1] == place.row]
         frames = [images[place.id] or b"" for place in ready]
@@ -163,7 +167,7 @@ class _Reencoding:
                     raise outcome
                 encoding = outcome.encoding
                 if not len(encoding.regions):
-                    raise NoRegions("The frame shows this encoder nothing to remember.")
+                    raise NoRegions("The encoder finds no regions in the frame.")
             except (InvalidImage, NoRegions) as error:
                 self.left_out[place.id] = (place, str(error))
                 continue
@@ -190,7 +194,7 @@ class _Reencoding:
     def _mask(self, camera: str | None) -> Mask | None:
         try:
             return self.source.cameras.mask(camera)
-        except UnknownCamera:  # forgotten since; its places stay as they are
+        except UnknownCamera:  # it was forgotten since the place was enrolled
             return None
 
     def _publish(self) -> Mapping[str, Any]:
@@ -199,7 +203,7 @@ class _Reencoding:
         for camera in self.source.cameras.all():
             if camera.name not in masks or masks[camera.name] != camera.mask:
                 self.made.cameras.put(camera.name, camera.mask)
-        named = [{"id": place.id, "detail": why} for place, why in list(self.left_out.values())[:NAMED]]
+        named = [{"id": place.id, "detail": why} for place, why in list(self.left_out.values())[:MOST_LISTED]]
         result = {
             "map": self.target,
             "encoder": self.identity,

@@ -1,4 +1,4 @@
-"""Upkeep of maps: making one anew for another encoder, health, pruning, merging."""
+"""Routes that re-encode, rebuild, examine, prune and merge maps."""
 
 from __future__ import annotations
 
@@ -45,26 +45,28 @@ router = APIRouter(
     route_class=StrictRoute,
     dependencies=[Depends(single_values)],
 )
-ASKING_PROBLEMS = (UnsupportedMediaType, JobQueueFull, errors.StorageFull)
+JOB_PROBLEMS = (UnsupportedMediaType, JobQueueFull, errors.StorageFull)
 
 
 class HealthParameters(Parameters):
-    """How thorough, and how long, a report on a map's health is."""
+    """How thorough and how long a health report is."""
 
     seconds: float = Field(
         default=5.0,
         gt=0,
         le=20,
         allow_inf_nan=False,
-        description="Seconds to look at the map's frames; of a large map only a part is looked at then.",
+        description="Seconds for examining the map's frames; of a large map only a part is examined in that time.",
     )
-    limit: int = Field(default=20, ge=1, le=1000, description="Most places, gaps and stretches that are named each.")
+    limit: int = Field(
+        default=20, ge=1, le=1000, description="How many places, gaps and stretches are listed at most, each."
+    )
 
 
 def submit(
     engine: Engine, jobs: Jobs, response: Response, kind: str, arguments: dict[str, Any], map_: Map, *others: Map
 ) -> JobView:
-    """Ask for a job of a registered kind, on this map and none that comes under its id later.
+    """Submit a job of a registered kind on a map; the job fails if a later map has taken the place of one of the maps.
 
     Raises:
         JobQueueFull, StorageFull, StorageFailure.
@@ -79,34 +81,32 @@ def submit(
     "/re-encode",
     status_code=202,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(
-        *ASKING_PROBLEMS, errors.MapExists, TooManyMaps, errors.UnknownEncoder, ImagesMissing
-    ),
+    responses=problem_documentation(*JOB_PROBLEMS, errors.MapExists, TooManyMaps, errors.UnknownEncoder, ImagesMissing),
 )
 def reencode_map(
-    map_id: MapId, wanted: Reencoding, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
+    map_id: MapId, options: Reencoding, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
-    """Make a map anew, under another id, for another encoder or for the masks as they are now.
+    """Make a new map from the images of this map, for another encoder or with the cameras' present masks.
 
-    It has to keep the images of all its places. The old map serves meanwhile; what is changed in it
-    is caught up with. The new one is listed when it is whole, never before.
+    The map must keep the images of all its places. It serves meanwhile, and changes to it are copied, too. The new
+    map is listed only when it is complete.
     """
-    check_map_id(wanted.to)
-    principal.require(wanted.to)
+    check_map_id(options.to)
+    principal.require(options.to)
     map_ = engine.atlas.get(map_id)
-    identity = engine.resolve(wanted.encoder)
+    identity = engine.resolve(options.encoder)
     reencoding.check_images(map_)
-    check_new_map(engine, jobs, wanted.to)
-    return submit(engine, jobs, response, reencoding.KIND, {"to": wanted.to, "encoder": identity}, map_)
+    check_new_map(engine, jobs, options.to)
+    return submit(engine, jobs, response, reencoding.KIND, {"to": options.to, "encoder": identity}, map_)
 
 
 @router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
 def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Make what a map is searched by, codes and lists, anew from its checksummed descriptors.
+    """Rebuild the search index of a map, its codes and lists, from the checksummed descriptors.
 
-    Searches go on in what is there until the new ones are put in their place, from one moment to the next. For a
-    map whose places are not what they were when its codes were learnt, or whose caches somebody put back from a
-    backup. A map that is searched exactly has nothing to be made.
+    Searches use the old index until the new one replaces it. This is useful if the map has changed much since its
+    codes were learnt, or if its index files come from a backup. A map that is searched exactly has no index to
+    rebuild.
     """
     return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
 
@@ -119,11 +119,11 @@ async def check_health(
     statistics: StatisticsDep,
     one_at_a_time: Annotated[CapacityLimiter, Depends(FromState("health_examinations"))],
 ) -> MapHealth:
-    """See how a map does, and where somebody should go again.
+    """Report the health of a map, and which stretches of it should be recorded again.
 
-    Told are places that never match and places that match everything, gaps along each sequence, and how the
-    answers changed from week to week. Answers are counted in memory and written down now and then: a crash
-    loses the last of them.
+    The report lists places that never match, places that match too often, gaps in each sequence, and how the answers
+    changed from week to week. Answers are counted in memory and saved from time to time: a crash loses the last
+    counts.
     """
     map_ = await engine.map(map_id)
     try:
@@ -139,47 +139,49 @@ async def check_health(
     "/prune",
     status_code=202,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*ASKING_PROBLEMS, errors.UnknownSequence),
+    responses=problem_documentation(*JOB_PROBLEMS, errors.UnknownSequence),
 )
-def prune_map(map_id: MapId, wanted: Pruning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Forget places that their neighbours stand in for; at first only report what that would cost in recall.
+def prune_map(map_id: MapId, options: Pruning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
+    """Remove places whose neighbours can stand in for them; by default, only report how much recall would be lost.
 
-    A place goes only if a place that stays is the same place by the map's settings and looks alike. With
-    `"dry_run": false` they go, all in one commit, for good.
+    A place is removed only if a place that stays is the same place by the map's settings and looks alike. With
+    `"dry_run": false` the places are removed for good, all in one commit.
     """
     map_ = engine.atlas.get(map_id)
-    there = map_.transfer.sequence_ends()
-    for name in (wanted.sequence, wanted.queries):
-        if name is not None and name not in there:
+    sequences = map_.transfer.sequence_ends()
+    for name in (options.sequence, options.queries):
+        if name is not None and name not in sequences:
             raise errors.UnknownSequence(f"The map has no sequence {name!r}.")
-    if wanted.queries is not None and wanted.queries == wanted.sequence:
-        raise InvalidRequest("queries: the frames that are asked for are not pruned; name another sequence.")
-    return submit(engine, jobs, response, pruning.KIND, wanted.model_dump(), map_)
+    if options.queries is not None and options.queries == options.sequence:
+        raise InvalidRequest(
+            "queries: a sequence whose frames are the queries cannot be pruned; name another sequence."
+        )
+    return submit(engine, jobs, response, pruning.KIND, options.model_dump(), map_)
 
 
 @router.post(
     "/merge",
     status_code=202,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*ASKING_PROBLEMS, errors.WrongEncoder, MergeConflict),
+    responses=problem_documentation(*JOB_PROBLEMS, errors.WrongEncoder, MergeConflict),
 )
 def merge_map(
-    map_id: MapId, wanted: Merging, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
+    map_id: MapId, options: Merging, engine: EngineDep, jobs: JobsDep, principal: PrincipalDep, response: Response
 ) -> JobView:
-    """Take the places of another map of the same encoder into this one; at first only report.
+    """Copy the places of another map of the same encoder into this one; by default, only report what would be copied.
 
-    The report says what would come, what stands against it, and how many of the other map's places this one
-    recognizes. With `"dry_run": false` they come, with their pictures, without being encoded again; poses are
-    taken as they are, so both maps have to be in one frame of reference.
+    The report says what would be copied, which conflicts prevent it, and how many of the other map's places this map
+    recognizes. With `"dry_run": false` the places are copied with their pictures and are not encoded again. Poses are
+    copied as they are, so both maps must use the same frame of reference.
     """
-    if wanted.source == map_id:
+    if options.source == map_id:
         raise InvalidRequest("from: a map cannot be merged with itself.")
-    principal.require(wanted.source)
-    map_, other = engine.atlas.get(map_id), engine.atlas.get(wanted.source)
-    merging.check_encoders(map_, other)
-    arguments = wanted.model_dump(by_alias=True) | {"prefix": wanted.prefix or f"{wanted.source}-"}
-    if not wanted.dry_run:
-        plan = merging.planned(map_, other, arguments, map_.transfer.outline())
+    principal.require(options.source)
+    map_, other = engine.atlas.get(map_id), engine.atlas.get(options.source)
+    merging.check_same_encoder(map_, other)
+    arguments = options.model_dump(by_alias=True) | {"prefix": options.prefix or f"{options.source}-"}
+    if not options.dry_run:
+        plan = merging.plan_merge(map_, other, arguments, map_.transfer.outline())
         if plan.conflicts:
             raise MergeConflict(" ".join(plan.conflicts))
     return submit(engine, jobs, response, merging.KIND, arguments, map_, other)

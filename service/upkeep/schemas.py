@@ -1,4 +1,4 @@
-"""Upkeep: what is asked of a map besides answering, and what is said of its health."""
+"""JSON of re-encoding, pruning and merging maps, and of the report on their health."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 
 
 class Reencoding(BaseModel):
-    """A map to be made anew for another encoder."""
+    """Which new map is made from a map, and for which encoder."""
 
     model_config = ConfigDict(
         extra="forbid", json_schema_extra={"examples": [{"to": "lab-2", "encoder": "m-region-vlad"}]}
@@ -23,55 +23,66 @@ class Reencoding(BaseModel):
 
     to: str = Field(max_length=256, description="Id of the new map.")
     encoder: str | None = Field(
-        default=None, max_length=256, description="Name or full identity; the default encoder if left out."
+        default=None,
+        max_length=256,
+        description="Name or full identity of the encoder; the default encoder if left out.",
     )
 
 
 class Pruning(BaseModel):
-    """Places to be forgotten because their neighbours stand in for them."""
+    """Which places are removed because their neighbours can stand in for them."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"max_recall_loss": 0.01}]})
 
-    dry_run: bool = Field(strict=True, default=True, description="Only report what would go, and what it would cost.")
-    max_recall_loss: Share = Field(default=0.01, description="What it may cost: share of the queries asked.")
+    dry_run: bool = Field(
+        strict=True,
+        default=True,
+        description="Only report which places would be removed, and how much recall would be lost.",
+    )
+    max_recall_loss: Share = Field(default=0.01, description="How much recall may be lost, as a share of the queries.")
     similarity: float | None = Field(
         strict=True,
         default=None,
         allow_inf_nan=False,
-        description="How alike two frames of one place must look (score by the first stage) for one to stand in for "
-        "the other. Left out, it is chosen by what it costs; given, `max_recall_loss` does not count.",
+        description="How alike two frames of one place must look (score of the first stage) for one to stand in for "
+        "the other. If left out, it is chosen by the loss of recall; if given, `max_recall_loss` is ignored.",
     )
-    sequence: Sequence | None = Field(default=None, description="Only places of this traverse may go.")
+    sequence: Sequence | None = Field(default=None, description="Only places of this traverse may be removed.")
     queries: Sequence | None = Field(
         default=None,
-        description="Measure the cost with the frames of this traverse, which is then neither searched nor pruned. "
-        "Left out, each frame is asked for without itself, which flatters: its neighbours were taken with it.",
+        description="The traverse whose frames are the queries; it is neither searched nor pruned. If left out, every "
+        "frame is a query for which the map is searched without that frame. This overestimates recall, since the "
+        "neighbouring frames were taken with it.",
     )
-    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="Most frames to ask.")
+    sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="How many queries are asked at most.")
 
 
 class Merging(BaseModel):
-    """Another map whose places are to come into this one."""
+    """Which map is merged into this one, and how conflicts are solved."""
 
     model_config = ConfigDict(extra="forbid", populate_by_name=True, json_schema_extra={"examples": [{"from": "hall"}]})
 
-    source: str = Field(alias="from", max_length=256, description="Id of the other map; it stays as it is.")
+    source: str = Field(alias="from", max_length=256, description="Id of the other map, which is not changed.")
     dry_run: bool = Field(
-        strict=True, default=True, description="Only report what would come, and how far the maps overlap."
+        strict=True, default=True, description="Only report what would be copied, and how far the maps overlap."
     )
     on_conflict: Literal["refuse", "rename", "skip"] = Field(
         default="refuse",
-        description="Where an id means another frame here, both maps have a sequence of one name, or a camera has "
-        "another mask: `refuse` the merge; `rename` what comes, by `prefix`; `skip` such places, and put those of the "
-        "same sequence behind the ones here.",
+        description="What to do if an id belongs to another frame here, both maps have a sequence of the same name, or "
+        "a camera has another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, "
+        "and append places of a sequence to the sequence of the same name.",
     )
     prefix: str | None = Field(
         default=None,
         pattern=r"^[A-Za-z0-9][A-Za-z0-9._~-]{0,63}$",
-        description="Put before names on conflict; the other map's id and a hyphen if left out.",
+        description="Put before names on conflict; if left out, the other map's id and a hyphen.",
     )
     sample: int = Field(
-        strict=True, default=200, ge=0, le=10_000, description="Most places by which the overlap is measured."
+        strict=True,
+        default=200,
+        ge=0,
+        le=10_000,
+        description="How many places the overlap is measured with at most; 0: it is not measured.",
     )
 
 
@@ -83,24 +94,24 @@ class WeekView(BaseModel):
     recognized: int
     ambiguous: int
     unknown: int
-    blank: int = Field(description="Of the unknown: nothing could be compared.")
+    blank: int = Field(description="How many of the unknown frames had nothing to compare.")
     unknown_rate: float | None
     mean_score: float | None
     mean_decision: float | None
-    scores: list[int] = Field(description="How many best scores lay in each twentieth of 0 to 1.")
+    scores: list[int] = Field(description="How many best scores lay in each twentieth of the range from 0 to 1.")
 
 
 class TrendView(BaseModel):
-    """A straight line through the weeks."""
+    """A straight line fitted to the weeks."""
 
     per_week: float
     error: float = Field(description="Standard error of `per_week`.")
     weeks: int
-    significant: bool = Field(description="More than chance makes likely: the slope is over three standard errors.")
+    significant: bool = Field(description="Whether the slope is larger than three standard errors.")
 
 
 class AnswersView(BaseModel):
-    """What the map answered since the counting began."""
+    """The map's answers since the counting began."""
 
     since: Timestamp | None
     queries: int
@@ -108,7 +119,7 @@ class AnswersView(BaseModel):
     ambiguous: int
     unknown: int
     weeks: list[WeekView]
-    score_trend: TrendView | None = Field(description="Null with fewer than four weeks of twenty queries.")
+    score_trend: TrendView | None = Field(description="Null unless at least four weeks have twenty queries each.")
     unknown_trend: TrendView | None
 
 
@@ -116,16 +127,18 @@ class SilentPlaces(BaseModel):
     """Places that were never the best match."""
 
     count: int
-    by_chance: float = Field(description="How many there would be had the queries been for all places alike.")
+    by_chance: float = Field(
+        description="How many would be expected if the queries were spread evenly over all places."
+    )
     places: list[str] = Field(description="Some of them, in the order of enrolment.")
 
 
 class HubView(BaseModel):
-    """A place that stands out among the best matches of others."""
+    """A place that is a match unusually often."""
 
     place: str
     count: int
-    expected: float = Field(description="What it would be if all places were alike.")
+    expected: float = Field(description="The count that would be expected if all places were alike.")
 
 
 class AliasView(BaseModel):
@@ -135,43 +148,53 @@ class AliasView(BaseModel):
     other: str
     score: float
     own: float | None = Field(
-        description="Best score of a frame of the same place; null if none is among the 400 most alike."
+        description="The best score of another frame of the same place; null if none is among the 400 best matches."
     )
 
 
 class AliasingView(BaseModel):
-    """Places that match everything."""
+    """Places that look like other places."""
 
-    examined: int = Field(description="So many places were held against the map, …")
-    of: int = Field(description="… of so many.")
-    neighbours: int = Field(description="Of each the so many most alike others were counted.")
-    skewness: float = Field(description="Of the counts: 0 if all places are alike; over 2 a few draw all.")
-    hubs: list[HubView] = Field(description="Among the map's own frames.")
-    aliases: list[AliasView] = Field(description="The most alike first.")
+    examined: int = Field(description="How many places were compared with the map.")
+    of: int = Field(description="How many places the map has.")
+    neighbours: int = Field(description="How many of the most alike other places were counted for each place.")
+    skewness: float = Field(
+        description="Skewness of the counts: 0 if all are alike; over 2 if a few are neighbours of most."
+    )
+    hubs: list[HubView] = Field(description="The places that are among the most alike of unusually many others.")
+    aliases: list[AliasView] = Field(
+        description="Places that look more like another place than like their own; the most alike come first."
+    )
     alias_count: int
-    unsure: list[HubView] = Field(description="Best matches of queries that were not recognized, where they pile up.")
+    unsure: list[HubView] = Field(
+        description="The places that are unusually often the best match of queries that were not recognized."
+    )
 
 
 class GapView(BaseModel):
-    """Two frames that follow each other, and are farther apart than is ordinary for their sequence."""
+    """Two successive frames that are farther apart than is usual in their sequence."""
 
     sequence: str
     before: str
     after: str
-    measure: Measure = Field(description="Metres, seconds, or how alike they look (score by the first stage).")
+    measure: Measure = Field(
+        description="Distance in metres, time in seconds, or similarity (score of the first stage)."
+    )
     value: float
-    median: float = Field(description="Of all steps of the sequence.")
-    severity: float = Field(description="How many times the median, or the median how many times it.")
+    median: float = Field(description="The median over all steps of the sequence.")
+    severity: float = Field(
+        description="How many times larger than the median the value is; for similarity, how many times smaller."
+    )
 
 
 class StretchView(BaseModel):
-    """Where somebody should go again."""
+    """A stretch of a sequence that should be recorded again."""
 
     sequence: str
     first: str
     last: str
     reasons: list[Reason]
-    weight: float = Field(description="How much speaks for it; they are in this order.")
+    weight: float = Field(description="How strong the reasons are; stretches are listed in this order.")
 
 
 HEALTH_EXAMPLE: dict[str, Any] = {
@@ -216,16 +239,16 @@ HEALTH_EXAMPLE: dict[str, Any] = {
 
 
 class MapHealth(BaseModel):
-    """How a map does, by its own frames and by what it answered."""
+    """The health of a map, judged by its own frames and by its answers."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [HEALTH_EXAMPLE]})
 
     map: str
     places: int
-    complete: bool = Field(description="False: the time was up before all of the map was looked at.")
+    complete: bool = Field(description="False if the time was up before all of the map was examined.")
     answers: AnswersView
-    never_matched: SilentPlaces | None = Field(description="Null as long as nobody has asked.")
+    never_matched: SilentPlaces | None = Field(description="Null as long as the map has not been queried.")
     aliasing: AliasingView
-    gaps: list[GapView] = Field(description="The most severe first.")
+    gaps: list[GapView] = Field(description="The most severe gaps come first.")
     gap_count: int
-    retraverse: list[StretchView] = Field(description="Stretches to go again, what is most needed first.")
+    retraverse: list[StretchView] = Field(description="Stretches that should be recorded again, the most urgent first.")

@@ -1,4 +1,4 @@
-"""The engine without HTTP and without its event loop, for jobs that encode nothing, and maps of made-up descriptors."""
+"""The runtime without HTTP and without its event loop, for jobs that encode nothing on maps of random descriptors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENCODER = "some@" + "0" * 64
 
 @contextmanager
 def runtime_at(folder: Path) -> Iterator[Runtime]:
-    """The real thing, but for its event loop: a merge encodes nothing."""
+    """A runtime whose event loop does not run."""
     runtime = Runtime(Settings(data_dir=folder / "data"), Metrics())
     runtime.jobs.start()
     try:
@@ -35,20 +35,21 @@ def runtime_at(folder: Path) -> Iterator[Runtime]:
         runtime.engine.close()
 
 
-def enrolments(first: int, count: int, name: str, sequence: str) -> list[Enrolment]:
+def enrolments(first: int, count: int, name: str, sequence: str, dimension: int = 8) -> list[Enrolment]:
+    """Places with random descriptors, numbered from ``first`` on."""
     random = np.random.default_rng(first)
     made = []
     for number in range(first, first + count):
         picture = f"picture {number}".encode()
         fields = PlaceFields(pose=Pose(x=number, y=0), sequence=sequence, metadata={"number": number})
-        descriptor = random.normal(size=8).astype(np.float32)
+        descriptor = random.normal(size=dimension).astype(np.float32)
         digest = number.to_bytes(32, "big")
         made.append(Enrolment(f"{name}{number}", fields, descriptor, 5, digest, thumbnail=picture))
     return made
 
 
 def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
-    """All that a map holds: places, order, pictures and descriptors."""
+    """Everything that a map stores: places, their order, pictures and descriptors."""
     map_ = engine.atlas.get(map_id)
     outline, snapshot = map_.transfer.outline(), map_.snapshot()
     rows = np.array([place.row for place in outline], np.int64)

@@ -1,9 +1,8 @@
-"""Maps calibrated over HTTP: by labelled frames, by a second traverse, by themselves; and what is refused."""
+"""Calibrating maps over HTTP by labelled frames, by a second traverse and by their own frames; refused requests."""
 
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,16 @@ import pytest
 from core.errors import RevisionMismatch
 from core.judgement.verdict import Calibration
 from core.storage import Map
-from service.maps import calibration as calibrating
+from service.maps import calibration
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from tests.service.engines import ENCODER, end_of, runtime_at
+from tests.service.map_jobs import finished
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
 PLACES = 16
 PROMISE = {"rule": "precision", "value": 0.85}
-"""Sixteen right answers cannot promise much more."""
+"""Sixteen right answers are too few for a higher precision."""
 APART = 20.0  # metres: over three times the radius of a place, so that places are no neighbours
 
 
@@ -62,15 +62,15 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
     assert dry["stored"] is False
     assert server.client.get(f"/v1/maps/{walked}").json() == before.json()
 
-    told = calibrate(server.client, walked, dry_run=False).json()
-    assert told["stored"] is True and told["calibration"] == dry["calibration"]
-    assert told["previous"] == before.json()["calibration"]
+    report = calibrate(server.client, walked, dry_run=False).json()
+    assert report["stored"] is True and report["calibration"] == dry["calibration"]
+    assert report["previous"] == before.json()["calibration"]
     after = server.client.get(f"/v1/maps/{walked}").json()
-    assert after["calibration"] == told["calibration"]
+    assert after["calibration"] == report["calibration"]
     assert after["calibration"]["source"] == "sequence:tuesday"
     assert (after["calibration"]["frames"], after["revision"]) == (PLACES + 6, before.json()["revision"] + 1)
 
-    measured = told["measurement"]
+    measured = report["measurement"]
     assert (measured["known"], measured["unknown"]) == (PLACES, PLACES + 6)
     assert measured["auc_roc"] > 0.8 and measured["auc_roc_right"] > 0.8
     held = measured["cross_validated"]
@@ -79,9 +79,9 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
     assert held["reliability"]["answers"] == 2 * PLACES + 6
     thresholds = [point["threshold"] for point in measured["points"]]
     assert thresholds == sorted(thresholds)
-    assert "22 frames" in told["warnings"][0]
+    assert "22 frames" in report["warnings"][0]
     answer = server.query(walked, jpeg(3))
-    assert answer["threshold"] == told["calibration"]["threshold"]
+    assert answer["threshold"] == report["calibration"]["threshold"]
 
     reset = server.client.patch(f"/v1/maps/{walked}", json={"calibration": None})
     assert reset.json()["calibration"]["source"] == "encoder-default"
@@ -89,9 +89,9 @@ def test_a_second_traverse_calibrates_and_its_threshold_judges(server: Server, w
 
 def test_stated_pairs_stand_in_for_poses(server: Server, walked: str) -> None:
     pairs = {f"t{number}": f"m{number}" for number in range(PLACES)} | {f"t{PLACES}": None}
-    told = calibrate(server.client, walked, pairs=pairs).json()["measurement"]
-    assert (told["frames"], told["known"], told["unknown"]) == (PLACES + 1, PLACES, PLACES + 1)
-    assert told["right"] >= 0.8 * PLACES
+    report = calibrate(server.client, walked, pairs=pairs).json()["measurement"]
+    assert (report["frames"], report["known"], report["unknown"]) == (PLACES + 1, PLACES, PLACES + 1)
+    assert report["right"] >= 0.8 * PLACES
     too_much = calibrate(server.client, walked, pairs=pairs, target={"rule": "precision", "value": 0.99})
     assert "promise" in assert_problem(too_much, 422, "calibration-impossible")["detail"]
     turned = {f"t{number}": f"m{(number + 8) % PLACES}" for number in range(PLACES)}
@@ -103,9 +103,9 @@ def test_labelled_frames(server: Server, walked: str) -> None:
     files = {f"f{number}": encoded(seen_again(scene(number), 100 + number)) for number in range(14)}
     files |= {f"stranger{number}": jpeg(200 + number) for number in range(4)}
     labels = [{"file": name, "place": f"m{name[1:]}" if name[0] == "f" else None} for name in files]
-    told = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.1})
-    assert told.status_code == 200, told.text
-    report = told.json()
+    response = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.1})
+    assert response.status_code == 200, response.text
+    report = response.json()
     assert report["measurement"]["known"] == 14 and report["measurement"]["unknown"] == 18
     assert report["calibration"]["source"] == "frames"
     strict = labelled(server.client, walked, labels, files, target={"rule": "false_accept_rate", "value": 0.01}).json()
@@ -130,25 +130,22 @@ def test_labelled_frames_of_a_camera(server: Server, walked: str) -> None:
     assert_problem(plain, 422, "calibration-impossible")
 
 
-def test_the_map_itself_with_a_warning(server: Server, map_id: str) -> None:
+def test_the_own_frames_of_a_map_calibrate_it_with_a_warning(server: Server, map_id: str) -> None:
     for number in range(12):
         for step in range(2):
             data = encoded(seen_again(scene(number), step)) if step else jpeg(number)
             server.enrol(map_id, f"p{number}-{step}", data, x=APART * number + step, y=0)
-    told = calibrate(server.client, map_id, method="map", sequence=None, target={"rule": "mean_of_negatives"}).json()
-    assert told["calibration"]["source"] == "map"
-    assert "one walk" in told["warnings"][0]
-    assert told["measurement"]["frames"] == 24
+    report = calibrate(server.client, map_id, method="map", sequence=None, target={"rule": "mean_of_negatives"}).json()
+    assert report["calibration"]["source"] == "map"
+    assert "one walk" in report["warnings"][0]
+    assert report["measurement"]["frames"] == 24
 
 
 def test_a_job_does_it_in_the_background(server: Server, walked: str) -> None:
     asked = calibrate(server.client, walked, background=True)
     assert asked.status_code == 202, asked.text
     assert asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"
-    until = time.monotonic() + 60
-    while (job := server.client.get(asked.headers["location"]).json())["state"] in ("queued", "running"):
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    job = finished(server, asked.json())
     assert job["state"] == "succeeded", job
     assert job["result"] == calibrate(server.client, walked).json()
 
@@ -192,7 +189,7 @@ def test_orders_that_do_not_fit(client: httpx.Client, walked: str, fields: dict[
     assert_problem(calibrate(client, walked, **fields), 422, "invalid-request")
 
 
-def test_names_that_are_not_there(client: httpx.Client, walked: str) -> None:
+def test_unknown_names(client: httpx.Client, walked: str) -> None:
     assert_problem(calibrate(client, "nowhere"), 404, "unknown-map")
     assert_problem(calibrate(client, walked, sequence="sunday"), 404, "unknown-sequence")
     assert_problem(calibrate(client, walked, pairs={"t1": "m99"}), 404, "unknown-place")
@@ -213,7 +210,7 @@ def test_forms_that_do_not_fit(client: httpx.Client, walked: str) -> None:
     assert_problem(no_order, 422, "invalid-request")
 
 
-def test_bodies_that_are_none(client: httpx.Client, walked: str) -> None:
+def test_bodies_that_are_no_orders(client: httpx.Client, walked: str) -> None:
     path = f"/v1/maps/{walked}/calibrate"
     json_type = {"Content-Type": "application/json"}
     assert_problem(client.post(path, content=b"{", headers=json_type), 400, "malformed-body")
@@ -229,43 +226,43 @@ def test_an_edit_in_between_is_noticed(client: httpx.Client, walked: str) -> Non
 
 
 def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The job, a restart between its commit and its end, and an order that came too late; without HTTP."""
+    """A job that finds another calibration, and one that finds other edits; without HTTP."""
     with runtime_at(tmp_path) as runtime:
         lab = runtime.engine.atlas.create("lab", ENCODER, 8)
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
         found = manual.model_copy(update={"source": "map", "threshold": 0.25})
 
-        def measured(map_: Map, *_: object) -> CalibrationReport:
+        def measure(map_: Map, *_: object) -> CalibrationReport:
             if happens is not None:
                 map_.edit({"calibration": happens})
             return CalibrationReport.model_construct(
                 map="lab", encoder=ENCODER, method="map", stored=True, calibration=found, previous=manual, warnings=[]
             )
 
-        monkeypatch.setattr(calibrating, "measured", measured)
+        monkeypatch.setattr(calibration, "measure", measure)
         monkeypatch.setattr(runtime.engine, "load_encoder", lambda _: None)
-        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        wanted = calibration.job_arguments(lab, CalibrationOrder(method="map"), None)
         happens: Calibration | None = manual
-        job = end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted))
+        job = end_of(runtime, runtime.jobs.submit(calibration.KIND, "lab", arguments=wanted))
         assert job.problem is not None and job.problem["type"] == "urn:placerec:problem:revision-mismatch"
         assert lab.record.calibration == manual
 
         happens = None
         lab.edit({"description": "any other change does not matter"})
-        wanted = calibrating.arguments_of(lab, CalibrationOrder(method="map"), None)
+        wanted = calibration.job_arguments(lab, CalibrationOrder(method="map"), None)
         lab.edit({"description": "nor one that comes later"})
-        assert end_of(runtime, runtime.jobs.submit(calibrating.KIND, "lab", arguments=wanted)).state == "succeeded"
+        assert end_of(runtime, runtime.jobs.submit(calibration.KIND, "lab", arguments=wanted)).state == "succeeded"
         assert lab.record.calibration == found
 
         with pytest.raises(RevisionMismatch):
-            calibrating.store(lab, manual, manual, None)
+            calibration.store(lab, manual, manual, None)
         with pytest.raises(RevisionMismatch):
-            calibrating.store(lab, manual, found, lab.record.revision - 1)
-        calibrating.store(lab, manual, found, lab.record.revision)
+            calibration.store(lab, manual, found, lab.record.revision - 1)
+        calibration.store(lab, manual, found, lab.record.revision)
         assert lab.record.calibration == manual
 
 
-def test_what_takes_longer_than_the_request_may_is_given_up(server: Server, walked: str) -> None:
+def test_a_request_that_runs_out_of_time_stores_nothing(server: Server, walked: str) -> None:
     before = server.client.get(f"/v1/maps/{walked}").json()["calibration"]
     response = server.client.post(
         f"/v1/maps/{walked}/calibrate",

@@ -1,4 +1,4 @@
-"""Cameras and their masks over HTTP: kept, applied to frames of both kinds, refused where they make no sense."""
+"""Cameras and their masks over HTTP: stored, applied to enrolled frames and queries, refused if they are invalid."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MASK: dict[str, Any] = {"polygons": [[[0, LOWER], [1, LOWER], [1, 1], [0, 1]]]}
 
 
 def behind(number: int, vehicle: int) -> bytes:
-    """A scene of which the lower part shows the vehicle from which it is seen."""
+    """A scene whose lower part shows the vehicle of the camera."""
     pixels = scene(number)
     height, width = pixels.shape[:2]
     start = round(LOWER * height)
@@ -98,7 +98,7 @@ def test_a_batch_names_the_camera_of_each_frame(server: Server, map_id: str) -> 
     assert answers["items"][0]["answer"]["matches"][0]["place"]["id"] == "a"
 
 
-def test_a_camera_that_is_not_there_is_refused(server: Server, map_id: str) -> None:
+def test_an_unknown_camera_is_refused(server: Server, map_id: str) -> None:
     refused = server.enrol(map_id, "p", behind(1, 50), camera="front")
     assert_problem(refused, 404, "unknown-camera")
     url = f"/v1/maps/{map_id}/query"
@@ -141,17 +141,3 @@ def test_a_map_has_a_limit_of_cameras(client: httpx.Client, map_id: str) -> None
 @pytest.mark.parametrize("name", ["-front", "a" * 65, "fr:ont"])
 def test_a_camera_needs_a_name_of_the_form(client: httpx.Client, map_id: str, name: str) -> None:
     assert_problem(put(client, map_id, name, None), 422, "invalid-request")
-
-
-def test_cameras_outlive_the_process(tmp_path: Any) -> None:
-    running = Server(tmp_path).wait()
-    running.create_map("lab")
-    put(running.client, "lab", "front", MASK)
-    assert running.enrol("lab", "p", behind(1, 50), camera="front").status_code == 201
-    running.kill()
-    again = Server(tmp_path).wait()
-    try:
-        assert again.client.get("/v1/maps/lab/cameras/front").json()["mask"] == MASK
-        assert again.enrol("lab", "p", behind(1, 50), camera="front").json()["change"] == "unchanged"
-    finally:
-        assert again.stop() == 0

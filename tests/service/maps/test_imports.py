@@ -1,4 +1,4 @@
-"""What comes of a file of a map when the task that takes it in is cancelled, as the server does when it stops."""
+"""Imports whose task is cancelled, as the server does when it stops."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def received(runtime: Runtime, data: bytes) -> ReceivedFile:
 
 
 class Gate:
-    """Keeps calls of a function waiting, from the first one on."""
+    """A function whose calls wait until the gate is opened."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
@@ -51,7 +51,7 @@ class Gate:
         return self._function(*arguments)
 
     async def cancelled_there(self, task: asyncio.Task[Any]) -> None:
-        """Cancel a task whose thread waits here, and see that it waits, too."""
+        """Cancel a task whose thread waits at the gate, and check that the task waits, too."""
         async with asyncio.timeout(10):
             while not self.reached.is_set():
                 await asyncio.sleep(0.001)
@@ -66,13 +66,17 @@ class Gate:
 
 
 @pytest.mark.anyio
-async def test_cancelled_while_it_arrives(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cancelled_while_the_file_arrives(
+    tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with runtime_at(tmp_path) as runtime:
         gate = Gate(write_at)
         monkeypatch.setattr(imports, "write_at", gate)
         task = asyncio.create_task(received(runtime, content))
         await gate.cancelled_there(task)
-        with (tmp_path / "another").open("xb") as another:  # which would get the number of a file that was closed
+        with (tmp_path / "another").open(
+            "xb"
+        ) as another:  # it would get the descriptor of a file that was closed too early
             await gate.open(task)
             assert another.tell() == 0
         assert (tmp_path / "another").read_bytes() == b""
@@ -93,7 +97,9 @@ async def test_cancelled_while_the_map_is_built(
     tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with runtime_at(tmp_path) as runtime:
-        monkeypatch.setattr(runtime.imports, "check_encoder", lambda _: None)  # its maps are made up
+        monkeypatch.setattr(
+            runtime.imports, "check_encoder", lambda _: None
+        )  # the encoder of the test maps does not exist
         monkeypatch.setattr(building, "CHUNK_BYTES", 1)
         gate = Gate(descriptors.append)
         with monkeypatch.context() as disk:
@@ -102,7 +108,7 @@ async def test_cancelled_while_the_map_is_built(
             await gate.cancelled_there(task)
             await gate.open(task)
         assert list((tmp_path / "data" / "imports").iterdir()) == []
-        assert list((tmp_path / "data" / "maps").iterdir()) == [], "broken off after the first of three commits"
+        assert list((tmp_path / "data" / "maps").iterdir()) == [], "it stopped after the first of three commits"
         arrived = await received(runtime, content)
         await runtime.imports.build(arrived)
         assert runtime.engine.atlas.get("lab").count_places() == 3

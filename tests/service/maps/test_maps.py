@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
+from pathlib import Path
 
 import httpx
 import pytest
 
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
 
@@ -260,19 +261,20 @@ def test_verifying(server: Server, map_id: str) -> None:
     assert report["checked_bytes"] > 2 * dimension + cells * values
 
 
-def test_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path_factory: pytest.TempPathFactory) -> None:
-    folder = tmp_path_factory.mktemp("damaged")
-    server = Server(folder).wait()
+def test_after_a_kill_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path: Path) -> None:
+    server, mask = Server(tmp_path).wait(), {"polygons": [[[0, 0.6], [1, 0.6], [1, 1], [0, 1]]]}
     for name in ("bad", "good"):
         server.create_map(name)
         assert server.enrol(name, "p1", jpeg(1)).status_code == 201
-    assert server.stop() == 0
-    segment = next((folder / "data" / "maps" / "bad").glob("*.seg"))
+    assert server.client.put("/v1/maps/good/cameras/front", json={"mask": mask}).status_code == 201
+    assert server.enrol("good", "masked", jpeg(2), camera="front").status_code == 201
+    server.kill()
+    segment = next((tmp_path / "data" / "maps" / "bad").glob("*.seg"))
     content = bytearray(segment.read_bytes())
     content[len(content) // 2] ^= 1
     segment.write_bytes(content)
 
-    server = Server(folder).wait()
+    server = Server(tmp_path).wait()
     client = server.client
     problem = assert_problem(client.get("/v1/maps/bad"), 503, "map-quarantined")
     assert "damaged" in problem["detail"]
@@ -281,6 +283,8 @@ def test_a_damaged_map_is_quarantined_and_the_others_serve(tmp_path_factory: pyt
     assert [item["id"] for item in listing["quarantined"]] == ["bad"]
     assert client.get("/readyz").json()["quarantined"][0]["id"] == "bad"
     assert server.query("good", jpeg(1))["matches"][0]["place"]["id"] == "p1"
+    assert client.get("/v1/maps/good/cameras/front").json()["mask"] == mask
+    assert server.enrol("good", "masked", jpeg(2), camera="front").json()["change"] == "unchanged"
     assert "placerec_quarantined_maps 1.0" in client.get("/metrics").text
     report = client.post("/v1/maps/bad/verify").json()
     assert not report["ok"] and report["problems"]
@@ -297,10 +301,8 @@ def test_how_a_map_is_searched_is_shown_and_chosen(server: Server) -> None:
         server.enrol("tiers", f"p{index}", jpeg(index))
     view = server.client.patch(path, json={"index": "compact"}, headers={"If-Match": "*"}).json()
     assert (view["index"]["setting"], view["index"]["wanted"]) == ("compact", "compact")
-    deadline = time.monotonic() + 60
-    while (view := server.client.get(path).json())["index"]["state"] == "building":
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    wait_until(lambda: server.client.get(path).json()["index"]["state"] != "building")
+    view = server.client.get(path).json()
     assert (view["index"]["tier"], view["index"]["rows_indexed"]) == ("compact", 3)
     assert view["index"]["recall"] == {"at_1": 1.0, "queries": 128, "shortlist": 100, "places": 3}
     files = view["storage"]["descriptors"] + view["storage"]["index"] + view["storage"]["database"]

@@ -1,21 +1,16 @@
-"""Rebuilding what a map is searched by, and verifying it, as jobs over HTTP."""
+"""Rebuilding the search index of a map, and verifying a map, as jobs over HTTP."""
 
 from __future__ import annotations
 
-import time
-
+from tests.service.map_jobs import enrol_many, finished, wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import enrol_many, finished
 
 
 def test_a_map_is_rebuilt_and_verified_in_the_background(server: Server) -> None:
     enrol_many(server, "rebuilt", 24, keep="none")
     assert server.client.patch("/v1/maps/rebuilt", json={"index": "compact"}).status_code == 200
-    until = time.monotonic() + 60
-    while server.client.get("/v1/maps/rebuilt").json()["index"]["state"] == "building":
-        assert time.monotonic() < until
-        time.sleep(0.05)
+    wait_until(lambda: server.client.get("/v1/maps/rebuilt").json()["index"]["state"] != "building")
     before = server.query("rebuilt", jpeg(3) + b"\x00" * 4)["matches"]
     asked = server.client.post("/v1/maps/rebuilt/rebuild")
     assert asked.status_code == 202 and asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"

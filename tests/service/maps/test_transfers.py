@@ -1,4 +1,4 @@
-"""Maps as files over HTTP: downloads that go on, uploads that are all or nothing, whatever ends in between."""
+"""Exports and imports over HTTP: interrupted downloads continue, and an import makes a complete map or none."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from core.storage.archives.manifest import group_names
 from core.storage.archives.reading import Archive, check
 from tests.core.storage.archives.files import Parts, changed, line_changed, named, parts_of, sealed
 from tests.service.encoders import install_coarse_encoder
+from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import wait_until
 
 TAR = {"Content-Type": "application/x-tar"}
 _ids = itertools.count()
 
 
 def new_id() -> str:
-    return f"brought-{next(_ids)}"
+    return f"imported-{next(_ids)}"
 
 
 def export(server: Server, map_id: str, **headers: str) -> httpx.Response:
@@ -37,7 +37,7 @@ def export(server: Server, map_id: str, **headers: str) -> httpx.Response:
     return server.client.get(f"/v1/maps/{map_id}/export", headers=sent)
 
 
-def bring(server: Server, content: bytes, map_id: str | None = None, **params: str) -> httpx.Response:
+def import_file(server: Server, content: bytes, map_id: str | None = None, **params: str) -> httpx.Response:
     sent = {**params, **({} if map_id is None else {"id": map_id})}
     return server.client.post("/v1/maps/import", params=sent, content=content, headers=TAR)
 
@@ -48,14 +48,14 @@ def places(server: Server, map_id: str) -> list[Any]:
 
 
 def staged(server: Server) -> list[str]:
-    """What lies in the folders of transfers and, unlisted, among the maps."""
+    """The files of imports, and the unlisted maps."""
     found = [*server.data_dir.glob("imports/*"), *server.data_dir.glob("imports/.*"), *server.data_dir.glob("maps/.*")]
     return [path.name for path in found]
 
 
 @pytest.fixture(scope="module")
 def source(server: Server) -> str:
-    """A map that keeps images; nobody changes it."""
+    """A map that keeps images; no test changes it."""
     server.create_map("to-move", keep="image", description="three rooms")
     assert server.client.put("/v1/maps/to-move/cameras/front", json={"mask": None}).status_code in (200, 201)
     for number in range(3):
@@ -66,13 +66,13 @@ def source(server: Server) -> str:
 
 @pytest.fixture(scope="module")
 def content(server: Server, source: str) -> bytes:
-    """Its file."""
+    """The export file of the map."""
     return export(server, source).content
 
 
 def test_a_map_comes_back_under_another_id(server: Server, source: str, content: bytes) -> None:
     name = new_id()
-    made = bring(server, content, name)
+    made = import_file(server, content, name)
     assert made.status_code == 201 and made.headers["location"] == f"/v1/maps/{name}"
     ours, theirs = (server.client.get(f"/v1/maps/{map_id}") for map_id in (source, name))
     assert theirs.headers["etag"] == made.headers["etag"]
@@ -89,9 +89,9 @@ def test_a_map_comes_back_under_another_id(server: Server, source: str, content:
     assert staged(server) == []
 
 
-def test_a_download_is_of_one_moment(server: Server, content: bytes) -> None:
+def test_a_download_shows_the_map_as_it_was_when_it_began(server: Server, content: bytes) -> None:
     name = new_id()
-    assert bring(server, content, name).status_code == 201
+    assert import_file(server, content, name).status_code == 201
     first = export(server, name)
     tag, size = first.headers["etag"], int(first.headers["content-length"])
     assert first.status_code == 200 and len(first.content) == size and first.headers["accept-ranges"] == "bytes"
@@ -102,7 +102,7 @@ def test_a_download_is_of_one_moment(server: Server, content: bytes) -> None:
     assert head.status_code == 200 and head.content == b""
     assert (head.headers["etag"], head.headers["content-length"]) == (tag, str(size))
     assert export(server, name, if_none_match=tag).status_code == 304
-    # The map changes, and is deleted: the rest is that of the first moment all the same.
+    # The map is changed and then deleted: the rest of the download is not affected.
     assert server.enrol(name, "later", jpeg(8)).status_code == 201
     part = export(server, name, range="bytes=1000-1999", if_range=tag)
     assert part.status_code == 206 and part.headers["content-range"] == f"bytes 1000-1999/{size}"
@@ -123,17 +123,17 @@ def _size(content: bytes) -> int:
     return int(content[124:135], 8)
 
 
-def test_a_moment_that_is_not_kept(server: Server, source: str) -> None:
+def test_an_export_that_is_not_kept(server: Server, source: str) -> None:
     assert_problem(export(server, source, range="bytes=5-", if_match='"0123"'), 412, "export-gone")
     whole = export(server, source, range="bytes=5-", if_range='"0123"')
     assert whole.status_code == 200 and len(whole.content) == int(whole.headers["content-length"])
 
 
 def test_taken_ids(server: Server, source: str, content: bytes) -> None:
-    assert_problem(bring(server, content), 409, "map-exists")
-    assert_problem(bring(server, content, source), 409, "map-exists")
-    assert_problem(bring(server, content, "../x"), 422, "invalid-identifier")
-    assert_problem(bring(server, content, "import"), 422, "invalid-identifier")
+    assert_problem(import_file(server, content), 409, "map-exists")
+    assert_problem(import_file(server, content, source), 409, "map-exists")
+    assert_problem(import_file(server, content, "../x"), 422, "invalid-identifier")
+    assert_problem(import_file(server, content, "import"), 422, "invalid-identifier")
     assert staged(server) == []
 
 
@@ -143,15 +143,15 @@ def test_encoders(server: Server, content: bytes) -> None:
     def elsewhere(manifest: dict[str, Any], _parts: Parts) -> None:
         manifest["map"]["encoder"] = "m-region-vlad@" + "0" * 64
 
-    problem = assert_problem(bring(server, changed(content, elsewhere), name), 409, "wrong-encoder")
+    problem = assert_problem(import_file(server, changed(content, elsewhere), name), 409, "wrong-encoder")
     assert "not installed" in problem["detail"]
-    assert_problem(bring(server, content, name, encoder="coarse"), 409, "wrong-encoder")
+    assert_problem(import_file(server, content, name, encoder="coarse"), 409, "wrong-encoder")
 
     def reshaped(manifest: dict[str, Any], parts: Parts) -> None:
         manifest["map"]["dimension"] //= 2
 
-    assert_problem(bring(server, changed(content, reshaped), name), 422, "invalid-archive")
-    assert bring(server, content, name, encoder="m-region-vlad").status_code == 201
+    assert_problem(import_file(server, changed(content, reshaped), name), 422, "invalid-archive")
+    assert import_file(server, content, name, encoder="m-region-vlad").status_code == 201
 
 
 def _no_picture(manifest: dict[str, Any], parts: Parts) -> None:
@@ -175,7 +175,7 @@ def _endless_picture(manifest: dict[str, Any], parts: Parts) -> None:
 
 
 def test_hostile_files(server: Server, content: bytes) -> None:
-    """A few of each kind; ``tests/core/storage/archives`` has them all."""
+    """One of each kind; ``tests/core/storage/archives`` has them all."""
     manifest, parts = parts_of(content)
     for made, slug in (
         (b"", "invalid-archive"),
@@ -189,7 +189,7 @@ def test_hostile_files(server: Server, content: bytes) -> None:
         (named(json.dumps({**manifest, "version": 9}).encode(), parts), "archive-too-new"),
     ):
         name = new_id()
-        assert_problem(bring(server, made, name), 422, slug)
+        assert_problem(import_file(server, made, name), 422, slug)
         assert_problem(server.client.get(f"/v1/maps/{name}"), 404, "unknown-map")
         assert staged(server) == []
     text = server.client.post("/v1/maps/import", content=content, headers={"Content-Type": "text/plain"})
@@ -215,7 +215,7 @@ def test_digests(server: Server, content: bytes) -> None:
 
 
 def begun(server: Server, target: str, announced: int, first: bytes) -> socket.socket:
-    """A request of which only the beginning is sent."""
+    """A connection on which only the beginning of a request was sent."""
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=20)
     head = f"POST {target} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/x-tar\r\n"
     connection.sendall(f"{head}Content-Length: {announced}\r\n\r\n".encode() + first)
@@ -231,10 +231,10 @@ def begun(server: Server, target: str, announced: int, first: bytes) -> socket.s
         ("id=never-moved&encoder=coarse", 0, b"409"),
     ],
 )
-def test_what_cannot_be_is_refused_before_the_rest_is_sent(
+def test_an_import_is_refused_before_the_rest_is_sent(
     server: Server, content: bytes, query: str, announced: int, status: bytes
 ) -> None:
-    """All but the last byte is sent, and as much more as is gathered before it is looked at."""
+    """All but the last byte is sent, or as much more as the server gathers before it looks at it."""
     first = content[:-1] if not announced else content + bytes((2 << 20) - len(content))
     with begun(server, f"/v1/maps/import?{query}", announced or len(content), first) as connection:
         if announced:
@@ -246,7 +246,7 @@ def test_what_cannot_be_is_refused_before_the_rest_is_sent(
 
 
 def _settled(server: Server) -> list[str]:
-    """What is left a moment later."""
+    """What is left after a while."""
     until = time.monotonic() + 10
     while (left := staged(server)) and time.monotonic() < until:
         time.sleep(0.02)
@@ -262,16 +262,16 @@ def test_an_upload_that_breaks_off_leaves_nothing(server: Server, content: bytes
 
 def test_as_a_job(server: Server, source: str, content: bytes) -> None:
     name = new_id()
-    asked = bring(server, content, name, background="true")
+    asked = import_file(server, content, name, background="true")
     assert asked.status_code == 202 and asked.headers["location"] == f"/v1/jobs/{asked.json()['id']}"
     done = server.client.get(f"{asked.headers['location']}?wait=30").json()
     assert done["state"] == "succeeded" and done["result"]["places"] == 3, done
     assert done["progress"]["done"] == done["progress"]["total"] == 3
     assert places(server, name) == places(server, source)
-    bad = bring(server, line_changed(content, "places-000001.jsonl", 1, regions=-1), new_id(), background="true")
+    bad = import_file(server, line_changed(content, "places-000001.jsonl", 1, regions=-1), new_id(), background="true")
     failed = server.client.get(f"{bad.headers['location']}?wait=30").json()
     assert failed["state"] == "failed" and failed["problem"]["type"] == "urn:placerec:problem:invalid-archive"
-    assert_problem(bring(server, content, name, background="true"), 409, "map-exists")
+    assert_problem(import_file(server, content, name, background="true"), 409, "map-exists")
     wait_until(lambda: staged(server) == [])
 
 
@@ -280,14 +280,14 @@ MANY = 8_000
 
 @pytest.fixture(scope="module")
 def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a service that may be killed."""
+    """The folder of a service that is killed."""
     folder = tmp_path_factory.mktemp("apart")
     install_coarse_encoder(folder / "models")
     return folder
 
 
 def large(server: Server) -> bytes:
-    """The file of a map of many places of the coarse encoder, made up."""
+    """The export file of a map of many places of the coarse encoder, with random descriptors."""
     server.create_map("seed", encoder="coarse", keep="none")
     assert server.enrol("seed", "p", jpeg(1)).status_code == 201
     manifest, parts = parts_of(export(server, "seed").content)
@@ -308,12 +308,12 @@ def large(server: Server) -> bytes:
 
 @pytest.mark.timeout(300)  # the service is started twice
 def test_killed_at_every_stage(apart: Path) -> None:
-    """While a file arrives, a request builds one and a job another: nothing half is there, and the job goes on."""
+    """Killed while a file arrives, a request makes a map and a job another: no map is incomplete, the job continues."""
     settings = {"export_seconds": 1, "max_exports": 1, "max_imports": 3, "max_import_bytes": 1 << 28}
     server = Server(apart, settings).wait()
     content = large(server)
     _limits(server)
-    job = bring(server, content, "by-job", background="true").headers["location"]
+    job = import_file(server, content, "by-job", background="true").headers["location"]
     making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
     wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
     arriving = begun(server, "/v1/maps/import?id=arriving", len(content), content[: len(content) // 2])
@@ -321,7 +321,7 @@ def test_killed_at_every_stage(apart: Path) -> None:
     wait_until(lambda: server.client.get(job).json()["progress"]["done"] > 200)
     assert server.client.get("/v1/maps").json()["items"] == []
     assert_problem(server.client.post("/v1/maps", json={"id": "by-request"}), 409, "map-exists")
-    second = bring(server, content, "second")
+    second = import_file(server, content, "second")
     assert "retry-after" in second.headers
     assert_problem(second, 503, "too-many-imports")
     server.kill()
@@ -337,7 +337,7 @@ def test_killed_at_every_stage(apart: Path) -> None:
     assert done["state"] == "succeeded" and done["attempt"] == 2 and done["result"]["places"] == MANY, done
     assert server.client.get("/v1/maps/by-job").json()["places"] == MANY
     # Cancelled, nothing is left.
-    other = bring(server, content, "other", background="true").headers["location"]
+    other = import_file(server, content, "other", background="true").headers["location"]
     wait_until(lambda: server.client.get(other).json()["progress"]["done"] > 200)
     assert server.client.post(f"{other}/cancel").status_code == 200
     assert server.client.get(f"{other}?wait=30").json()["state"] == "cancelled"
@@ -353,7 +353,7 @@ def test_killed_at_every_stage(apart: Path) -> None:
 
 
 def _limits(server: Server) -> None:
-    """Files have 256 MiB at most; moments of maps are kept for a second, and one at a time."""
+    """Files may have 256 MiB; exports are kept for a second, and one at a time."""
     with begun(server, "/v1/maps/import", 1 << 29, b"") as connection:
         assert connection.recv(100).startswith(b"HTTP/1.1 413")
     for name in ("a", "b"):
@@ -361,8 +361,8 @@ def _limits(server: Server) -> None:
     tag = export(server, "a").headers["etag"]
     assert export(server, "a", if_match=tag).status_code == 200
     assert server.enrol("a", "p", jpeg(1)).status_code == 201
-    assert export(server, "b").status_code == 200, "the moment of a makes room: nobody reads it"
-    wait_until(lambda: export(server, "a", if_match=tag).status_code != 503)  # that of b is being let go of
+    assert export(server, "b").status_code == 200, "the export of a is removed, since nobody reads it"
+    wait_until(lambda: export(server, "a", if_match=tag).status_code != 503)  # until the export of b has ended
     assert_problem(export(server, "a", if_match=tag), 412, "export-gone")
     wait_until(lambda: not any(server.data_dir.glob("exports/*")))
     for name in ("a", "b"):

@@ -11,9 +11,9 @@ import httpx
 
 from tests.service.conftest import TIGHT
 from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.map_jobs import finished, reaching, wait_until
 from tests.service.scenes import blank, encoded, jpeg
 from tests.service.server import Server, assert_problem
-from tests.service.upkeep.upkeeping import finished, reaching, wait_until
 
 
 def frames(count: int, offset: int = 0) -> list[bytes]:

@@ -17,10 +17,10 @@ import httpx
 import pytest
 
 from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.map_jobs import finished, places
 from tests.service.places.test_bulk_enrolment import traverse
 from tests.service.scenes import jpeg
 from tests.service.server import Server
-from tests.service.upkeep.upkeeping import finished, places
 
 SECONDS = 5.0
 FRAMES = [jpeg(number, 160, 120) for number in range(6)]

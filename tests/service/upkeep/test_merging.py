@@ -1,8 +1,8 @@
-"""A merge that is stopped in the middle: it goes on behind what came, or takes all of that out again."""
+"""A merge that is interrupted: it continues after a restart, or removes everything that it copied."""
 
 from __future__ import annotations
 
-import time
+import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -15,18 +15,21 @@ from core.errors import StorageFull
 from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, MapSettings
 from core.storage.transfer import Transfer
+from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.context import creation_time
+from service.jobs.records import Job
 from service.upkeep import merging
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of
+from tests.service.map_jobs import wait_until
 
-COUNT = 5 * merging.CHUNK
+COUNT = 5 * merging.PLACES_PER_COMMIT
 WANTED: dict[str, Any] = {"from": "hall", "dry_run": False, "on_conflict": "rename", "prefix": "h.", "sample": 0}
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two maps that share a sequence's name and one place's id."""
+    """Two maps that share the name of a sequence and the id of a place."""
     with runtime_at(tmp_path) as runtime:
         for name, first, count in (("lab", 1, 70), ("hall", 1001, COUNT)):
             map_ = runtime.engine.atlas.create(name, ENCODER, 8, MapSettings(keep="thumbnail"))
@@ -39,16 +42,21 @@ def folder(tmp_path: Path) -> Path:
 
 def after_two_commits(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Any], None]) -> None:
     """Let something happen in the middle of the merge, once."""
-    adopt, calls = merging._adopt, 0
+    copy, calls = merging._copy, 0
 
     def counted(context: Any, *arguments: Any) -> None:
         nonlocal calls
         calls += 1
         if calls == 3:
             happens(context)
-        adopt(context, *arguments)
+        copy(context, *arguments)
 
-    monkeypatch.setattr(merging, "_adopt", counted)
+    monkeypatch.setattr(merging, "_copy", counted)
+
+
+def merged(runtime: Runtime) -> Job:
+    """The job that merges the two maps, when it has ended."""
+    return end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
 
 
 def check_merged(engine: Engine, before: list[tuple[Any, ...]], theirs: list[tuple[Any, ...]]) -> None:
@@ -65,10 +73,10 @@ def check_merged(engine: Engine, before: list[tuple[Any, ...]], theirs: list[tup
     assert engine.atlas.verify("lab").ok
 
 
-def test_all_comes_over(folder: Path) -> None:
+def test_all_places_are_copied(folder: Path) -> None:
     with runtime_at(folder) as runtime:
         before, theirs = state_of(runtime.engine, "lab"), state_of(runtime.engine, "hall")
-        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        done = merged(runtime)
         assert done.state == "succeeded" and done.result is not None
         assert done.result["renamed"] == {"places": 1, "sequences": {"monday": "h.monday"}, "cameras": {}}
         check_merged(runtime.engine, before, theirs)
@@ -76,14 +84,12 @@ def test_all_comes_over(folder: Path) -> None:
         check_merged(runtime.engine, before, theirs)
 
 
-def test_a_stop_in_the_middle_and_a_start_bring_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_in_the_middle_and_a_start_copy_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
         before, theirs = state_of(runtime.engine, "lab"), state_of(runtime.engine, "hall")
         after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED)
-        until = time.monotonic() + 20
-        while not runtime.jobs.stopping and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_until(lambda: runtime.jobs.stopping)
     with runtime_at(folder) as runtime:
         assert end_of(runtime, job).state == "succeeded"
         assert runtime.jobs.get(job.id).attempt == 2
@@ -115,13 +121,15 @@ def test_a_full_disk_in_the_middle_leaves_the_map_as_it_was(folder: Path, monkey
     with runtime_at(folder) as runtime:
         before = state_of(runtime.engine, "lab")
         after_two_commits(monkeypatch, fill)
-        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        failed = merged(runtime)
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:storage-full"
         assert state_of(runtime.engine, "lab") == before
 
 
-def test_what_could_not_be_taken_out_again_is_told(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_problem_says_that_copied_places_could_not_be_removed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fill(_: Any) -> None:
         def refuse(*_: Any) -> int:
             raise StorageFull("No room even to forget.")
@@ -131,7 +139,7 @@ def test_what_could_not_be_taken_out_again_is_told(folder: Path, monkeypatch: py
 
     with runtime_at(folder) as runtime:
         after_two_commits(monkeypatch, fill)
-        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        failed = merged(runtime)
         assert failed.problem is not None and "remain" in failed.problem["detail"]
 
 
@@ -148,12 +156,8 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
 
         after_two_commits(monkeypatch, vanish)
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED)
-        until = time.monotonic() + 20
-        while not (runtime.jobs.stopping or runtime.jobs.get(job.id).ended) and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_until(lambda: runtime.jobs.stopping or runtime.jobs.get(job.id).ended)
     if when != "meanwhile":
-        import shutil
-
         shutil.rmtree(folder / "data" / "maps" / "hall")
     with runtime_at(folder) as runtime:
         failed = end_of(runtime, job)
@@ -165,12 +169,14 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
 def test_the_map_itself_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
         after_two_commits(monkeypatch, lambda _: runtime.engine.atlas.delete("lab"))
-        failed = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        failed = merged(runtime)
         assert failed.state == "failed" and failed.problem is not None
-        assert failed.problem["type"] == "urn:placerec:problem:unknown-map", "nothing remains that came"
+        assert failed.problem["type"] == "urn:placerec:problem:unknown-map", "no copied place remains"
 
 
-def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with runtime_at(folder) as runtime:
         hall = runtime.engine.atlas.get("hall")
         (newer,) = enrolments(7000, 1, "h", "monday")
@@ -181,7 +187,7 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
             hall.forget("h1200")
 
         after_two_commits(monkeypatch, change)
-        done = end_of(runtime, runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED))
+        done = merged(runtime)
         assert done.state == "succeeded"
         lab = runtime.engine.atlas.get("lab")
         assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
@@ -190,7 +196,7 @@ def test_what_changes_in_the_other_map_meanwhile_comes_as_it_is(folder: Path, mo
 
 
 @pytest.mark.parametrize("rule", ["rename", "skip"])
-def test_what_somebody_enrols_meanwhile_is_never_replaced(
+def test_a_place_that_somebody_enrols_meanwhile_is_never_replaced(
     folder: Path, monkeypatch: pytest.MonkeyPatch, rule: str
 ) -> None:
     with runtime_at(folder) as runtime:
@@ -222,9 +228,7 @@ def test_it_does_not_go_on_into_another_map_of_the_same_id(
         maps = {name: creation_time(runtime.engine.atlas.get(name)) for name in ("lab", "hall")}
         after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
-        until = time.monotonic() + 20
-        while not runtime.jobs.stopping and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_until(lambda: runtime.jobs.stopping)
     atlas = Atlas(folder / "data")
     atlas.delete(which)
     atlas.create(which, ENCODER, 8).enrol(enrolments(8000, 3, "n", "monday"))
@@ -233,6 +237,6 @@ def test_it_does_not_go_on_into_another_map_of_the_same_id(
         failed = end_of(runtime, job)
         assert failed.problem is not None and failed.problem["type"] == "urn:placerec:problem:unknown-map"
         if which == "hall":
-            assert state_of(runtime.engine, "lab") == before, "what came of the map that was deleted is taken out again"
+            assert state_of(runtime.engine, "lab") == before, "what was copied of the deleted map is removed"
         else:
             assert [entry[0].id for entry in state_of(runtime.engine, "lab")] == ["n8000", "n8001", "n8002"]

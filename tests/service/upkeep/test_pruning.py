@@ -1,4 +1,4 @@
-"""A pruning that is killed: what was to go goes once, and no more than that."""
+"""A pruning that is interrupted: the places that it chose are removed once, and no others."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from service.engine.engine import Engine
 from service.jobs.context import JobInterrupted
 from service.upkeep import pruning
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
-from tests.service.upkeep.upkeeping import wait_until
+from tests.service.map_jobs import wait_until
 
 GOING = ("l1", "l3", "l5")
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A map of eight places; what is to go is settled, for nothing can be encoded here."""
+    """A map of eight places and a made-up plan to remove three, since nothing can be encoded here."""
     with runtime_at(tmp_path) as runtime:
         runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
     planned = 0
@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def plan(engine: Engine, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
         nonlocal planned
         planned += 1
-        assert planned == 1, "a second plan would thin what was thinned"
+        assert planned == 1, "a second plan would prune the pruned map again"
         there = engine.atlas.get("lab").transfer.outline()
         return {"removed": 3}, {place.id: place.digest.hex() for place in there if place.id in GOING}
 
@@ -57,7 +57,7 @@ def test_a_kill_around_the_commit(folder: Path, monkeypatch: pytest.MonkeyPatch,
         assert left == ["l0", "l2", "l4", "l6", "l7"]
 
 
-def test_a_place_that_shows_something_else_by_now_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_place_that_has_another_frame_by_now_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
         lab = runtime.engine.atlas.get("lab")
         plan = pruning._plan

@@ -1,4 +1,4 @@
-"""A map made anew for another encoder, while the old one serves, over kills and changes."""
+"""Re-encoding a map while the old one serves: kills, changes and cancelling in between; jobs listed and followed."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import httpx
 import pytest
 
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder, install_two_stage_encoder
+from tests.service.map_jobs import asked, enrol_many, finished, places, reaching
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text
-from tests.service.upkeep.upkeeping import asked, enrol_many, finished, places, reaching
 
 PLACES = 6
 
@@ -30,7 +30,7 @@ def start(server: Server, name: str, to: str, encoder: str = TWO_STAGES) -> dict
     return asked(server, name, "re-encode", to=to, encoder=encoder)
 
 
-def test_a_map_is_made_anew(server: Server) -> None:
+def test_a_map_is_re_encoded(server: Server) -> None:
     fill(server, "anew")
     server.client.patch("/v1/maps/anew/places/p1", json={"sequence": "tuesday"})  # last of its sequence from now on
     server.client.put("/v1/maps/anew/cameras/front", json={"mask": {"polygons": [[[0, 0.9], [1, 0.9], [1, 1]]]}})
@@ -59,7 +59,7 @@ def test_a_map_is_made_anew(server: Server) -> None:
 
 
 def test_the_order_within_a_sequence_is_kept(server: Server) -> None:
-    """Frames apart in a sequence decide who is a rival: the same in the map made anew."""
+    """The distance of two frames in a sequence decides whether they are rivals; it is the same in the new map."""
     server.create_map("order", encoder=COARSE, keep="image", same_place_frames=1)
     for number in range(4):
         assert server.enrol("order", f"p{number}", jpeg(number), sequence="monday").status_code == 201
@@ -82,7 +82,9 @@ def test_the_order_within_a_sequence_is_kept(server: Server) -> None:
         ({"to": "free", "more": 1}, 422, "invalid-request"),
     ],
 )
-def test_what_cannot_be_done_is_refused(server: Server, body: dict[str, Any], status: int, slug: str) -> None:
+def test_a_request_that_cannot_be_fulfilled_is_refused(
+    server: Server, body: dict[str, Any], status: int, slug: str
+) -> None:
     if server.client.get("/v1/maps/bare").status_code == 404:
         fill(server, "bare", 2, keep="thumbnail")
     problem = assert_problem(server.client.post("/v1/maps/bare/re-encode", json=body), status, slug)
@@ -102,7 +104,7 @@ def test_a_name_that_is_taken_is_refused(server: Server) -> None:
     )
 
 
-def test_frames_that_show_the_new_encoder_nothing_are_named(server: Server) -> None:
+def test_frames_in_which_the_new_encoder_finds_nothing_are_listed(server: Server) -> None:
     server.create_map("dim", encoder="m-region-vlad", keep="image")
     assert server.enrol("dim", "clear", jpeg(1)).status_code == 201
     empty = finished(server, start(server, "dim", "dim-2", COARSE))
@@ -121,7 +123,7 @@ MANY = 160
 
 @pytest.mark.timeout(300)  # the service is started several times
 def test_kills_and_changes_in_between(folder: Path) -> None:
-    """Killed twice while it is made, and changed meanwhile: never listed before it is whole, and whole in the end."""
+    """The service is killed twice and the old map changed meanwhile: the new map is listed only when it is complete."""
     server = Server(folder).wait()
     enrol_many(server, "lab", MANY)
     job = start(server, "lab", "lab-2")
@@ -152,39 +154,51 @@ def test_kills_and_changes_in_between(folder: Path) -> None:
     assert [path.name for path in sorted((folder / "data" / "maps").iterdir())] == ["lab", "lab-2"]
 
 
-def test_cancelling_leaves_nothing_and_queries_go_on(folder: Path) -> None:
-    server = Server(folder).wait()
-    enrol_many(server, "lab", MANY)
-    job = start(server, "lab", "lab-2")
+def is_on_disk(server: Server, name: str) -> bool:
+    """Whether anything is left of a map, listed or not."""
+    return any(name in path.name for path in (server.data_dir / "maps").iterdir())
+
+
+def test_a_cancelled_job_leaves_nothing_and_the_old_map_serves_meanwhile(server: Server) -> None:
+    enrol_many(server, "cancelling", MANY)
+    job = start(server, "cancelling", "cancelled-map")
     reaching(server, job, 16)
-    assert server.query("lab", jpeg(1))["matches"], "the old map serves meanwhile"
-    assert_problem(
-        server.client.post("/v1/maps/lab/re-encode", json={"to": "lab-2", "encoder": COARSE}), 409, "map-exists"
-    )
+    assert server.query("cancelling", jpeg(1))["matches"]
+    request = {"to": "cancelled-map", "encoder": COARSE}
+    assert_problem(server.client.post("/v1/maps/cancelling/re-encode", json=request), 409, "map-exists")
     cancelled = server.client.post(f"/v1/jobs/{job['id']}/cancel")
     assert cancelled.status_code == 200 and cancelled.json()["cancelling"]
     assert finished(server, job)["state"] == "cancelled"
-    assert server.client.get("/v1/maps/lab-2").status_code == 404
-    assert [path.name for path in (folder / "data" / "maps").iterdir()] == ["lab"]
-    again = start(server, "lab", "lab-2")
-    began = time.monotonic()
-    assert server.stop() == 0
-    assert time.monotonic() - began < 9, "a job under way does not hold the service back"
-    server = Server(folder).wait()
-    assert finished(server, again)["state"] == "succeeded"
-    assert server.stop() == 0
+    assert server.client.get("/v1/maps/cancelled-map").status_code == 404
+    assert not is_on_disk(server, "cancelled-map") and is_on_disk(server, "cancelling")
 
 
-def test_the_source_is_deleted_meanwhile(folder: Path) -> None:
-    server = Server(folder).wait()
-    enrol_many(server, "lab", MANY)
-    job = start(server, "lab", "lab-2")
+def test_the_old_map_is_deleted_meanwhile(server: Server) -> None:
+    enrol_many(server, "vanishing", MANY)
+    job = start(server, "vanishing", "vanishing-2")
     reaching(server, job, 16)
-    assert server.client.delete("/v1/maps/lab").status_code == 204
+    assert server.client.delete("/v1/maps/vanishing").status_code == 204
     failed = finished(server, job)
     assert failed["state"] == "failed"
     assert failed["problem"]["type"] == "urn:placerec:problem:unknown-map"
-    assert list((folder / "data" / "maps").iterdir()) == []
+    assert not is_on_disk(server, "vanishing")
+
+
+def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(folder: Path) -> None:
+    server = Server(folder).wait()
+    enrol_many(server, "lab", MANY)
+    job = start(server, "lab", "lab-2")
+    reaching(server, job, 1)
+    with httpx.Client(base_url=server.client.base_url, timeout=30) as watcher:
+        with watcher.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
+            stream = response.iter_lines()
+            next(stream)
+            began = time.monotonic()
+            assert server.stop() == 0
+            list(stream)
+        assert time.monotonic() - began < 9
+    server = Server(folder).wait()
+    assert finished(server, job)["state"] == "succeeded"
     assert server.stop() == 0
 
 
@@ -220,18 +234,3 @@ def test_listing_and_reading_jobs(server: Server) -> None:
     assert_problem(server.client.get(f"/v1/jobs/{jobs[0]['id']}?wait=1000"), 422, "invalid-request")
     assert_problem(server.client.post("/v1/jobs/none/cancel"), 404, "unknown-job")
     assert_problem(server.client.post(f"/v1/jobs/{jobs[0]['id']}/cancel"), 409, "job-ended")
-
-
-def test_the_stream_ends_when_the_service_stops(folder: Path) -> None:
-    server = Server(folder).wait()
-    enrol_many(server, "lab", MANY)
-    job = start(server, "lab", "lab-2")
-    reaching(server, job, 1)
-    with httpx.Client(base_url=server.client.base_url, timeout=30) as watcher:
-        with watcher.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
-            stream = response.iter_lines()
-            next(stream)
-            began = time.monotonic()
-            assert server.stop() == 0
-            list(stream)
-        assert time.monotonic() - began < 9

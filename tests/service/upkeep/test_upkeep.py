@@ -12,10 +12,13 @@ import httpx
 import numpy as np
 import pytest
 
+from core.storage import MapSettings
+from service.queries.statistics import map_key
 from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
+from tests.service.engines import enrolments, runtime_at
+from tests.service.map_jobs import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, typed
-from tests.service.upkeep.upkeeping import asked, enrol_frames, enrol_many, finished, places, reaching, wait_until
 
 
 def between(seed: int, share: float) -> bytes:
@@ -31,7 +34,7 @@ def dense(count: int, per_scene: int = 4) -> list[bytes]:
 # Health
 
 
-def test_health_of_a_map_that_nobody_asked(server: Server) -> None:
+def test_health_of_a_map_that_was_never_queried(server: Server) -> None:
     server.create_map("fresh", encoder=COARSE)
     report = server.client.get("/v1/maps/fresh/health").json()
     assert report["places"] == 0 and report["complete"] and report["never_matched"] is None
@@ -82,13 +85,15 @@ def test_a_new_map_of_the_same_name_begins_with_nothing(server: Server) -> None:
         assert server.client.delete("/v1/maps/again").status_code == 204
 
 
-def test_gaps_and_where_to_go_again(server: Server) -> None:
+def test_gaps_and_stretches_to_record_again(server: Server) -> None:
     server.create_map("gapped", encoder=COARSE, same_place_radius=1.2)
     positions = [0, 1, 2, 3, 4, 5, 25, 26, 27, 28, 29]  # metres; nobody filmed from 5 to 25
+    frames = dense(len(positions))
     for n, x in enumerate(positions):
         stamp = f"2026-11-20T10:00:{n:02}Z"
-        frame = dense(40)[n]
-        assert server.enrol("gapped", f"p{n}", frame, x=x, y=0, sequence="monday", timestamp=stamp).status_code == 201
+        assert (
+            server.enrol("gapped", f"p{n}", frames[n], x=x, y=0, sequence="monday", timestamp=stamp).status_code == 201
+        )
     report = server.client.get("/v1/maps/gapped/health").json()
     (gap,) = [gap for gap in report["gaps"] if gap["measure"] == "distance"]
     assert (gap["sequence"], gap["before"], gap["after"]) == ("monday", "p5", "p6")
@@ -100,8 +105,8 @@ def test_gaps_and_where_to_go_again(server: Server) -> None:
     assert server.client.get("/v1/maps/gapped/health?limit=1").json()["gap_count"] == report["gap_count"]
 
 
-def test_twins_are_named(server: Server) -> None:
-    """Two spots far apart that look the same, while frames of the same spot look different."""
+def test_places_that_look_alike_are_listed(server: Server) -> None:
+    """Two places far apart look the same, while frames of the same place look different."""
     server.create_map("twins", encoder=COARSE, same_place_radius=1.2)
     frames = {0: 1, 1: 2, 40: 1, 41: 3}
     for x, seed in frames.items():
@@ -114,7 +119,7 @@ def test_twins_are_named(server: Server) -> None:
 
 
 @pytest.mark.parametrize("query", ["seconds=0", "seconds=99", "limit=0", "limit=1001", "more=1", "seconds=nan"])
-def test_health_takes_no_odd_parameters(server: Server, traverse: str, query: str) -> None:
+def test_health_refuses_invalid_parameters(server: Server, traverse: str, query: str) -> None:
     assert_problem(server.client.get(f"/v1/maps/{traverse}/health?{query}"), 422, "invalid-request")
     assert_problem(server.client.get("/v1/maps/none/health"), 404, "unknown-map")
 
@@ -122,24 +127,24 @@ def test_health_takes_no_odd_parameters(server: Server, traverse: str, query: st
 # Pruning
 
 
-def test_pruning_tells_first_and_then_does_what_it_told(server: Server) -> None:
+def test_pruning_first_reports_and_then_does_what_it_reported(server: Server) -> None:
     server.create_map("dense", encoder=COARSE, same_place_radius=2.5)
     enrol_frames(server, "dense", dense(32), sequence="monday")
     before = places(server, "dense")
-    told = finished(server, asked(server, "dense", "prune", max_recall_loss=0.1))["result"]
+    report = finished(server, asked(server, "dense", "prune", max_recall_loss=0.1))["result"]
     assert places(server, "dense") == before, "a dry run changes nothing"
-    assert 0 < told["removed"] < 32 and told["recall_loss"] <= 0.1
-    assert told["measured_on"] == "leave-one-out" and told["queries"] == 32
-    assert told["recall_before"]["low"] <= told["recall_before"]["value"] <= told["recall_before"]["high"]
-    removed = [one["removed"] for one in told["tried"]]
-    assert removed[0] <= told["removed"] <= removed[-1]
+    assert 0 < report["removed"] < 32 and report["recall_loss"] <= 0.1
+    assert report["measured_on"] == "leave-one-out" and report["queries"] == 32
+    assert report["recall_before"]["low"] <= report["recall_before"]["value"] <= report["recall_before"]["high"]
+    removed = [one["removed"] for one in report["tried"]]
+    assert removed[0] <= report["removed"] <= removed[-1]
     done = finished(server, asked(server, "dense", "prune", max_recall_loss=0.1, dry_run=False))
     assert done["state"] == "succeeded"
     after = places(server, "dense")
-    assert {name: done["result"][name] for name in told} == told
-    assert len(after) == done["result"]["places_after"] == 32 - told["removed"]
+    assert {name: done["result"][name] for name in report} == report
+    assert len(after) == done["result"]["places_after"] == 32 - report["removed"]
     gone = set(before) - set(after)
-    assert gone == set(told["named"])
+    assert gone == set(report["named"])
     for name in gone:  # the place itself is still found: by its neighbour
         x = before[name]["pose"]["x"]
         assert any(abs(place["pose"]["x"] - x) <= 2.5 for place in after.values())
@@ -160,12 +165,12 @@ def test_pruning_measured_on_another_traverse(server: Server) -> None:
     assert len(left) == 24 - done["removed"]
 
 
-def test_only_places_of_a_sequence_go(server: Server) -> None:
+def test_only_places_of_the_given_sequence_are_removed(server: Server) -> None:
     server.create_map("partly", encoder=COARSE, same_place_radius=2.5)
     enrol_frames(server, "partly", dense(12), "a", sequence="monday")
     enrol_frames(server, "partly", [frame + b"\x00" for frame in dense(12)], "b", sequence="tuesday")
     done = finished(server, asked(server, "partly", "prune", sequence="tuesday", similarity=0.1, dry_run=False))
-    assert done["result"]["removed"] == 12, "each has its like in the other traverse"
+    assert done["result"]["removed"] == 12, "each has its counterpart in the other traverse"
     assert set(places(server, "partly")) == {f"a{n}" for n in range(12)}
 
 
@@ -187,7 +192,7 @@ def test_pruning_what_cannot_be_pruned(server: Server) -> None:
 # Merging
 
 
-def test_merging_tells_first_and_then_does_it(server: Server) -> None:
+def test_merging_first_reports_and_then_copies(server: Server) -> None:
     server.create_map("east", encoder=TWO_STAGES, keep="thumbnail")
     server.create_map("west", encoder=TWO_STAGES, keep="image")
     enrol_frames(server, "east", [jpeg(n) for n in range(5)], "e", sequence="monday")
@@ -195,13 +200,13 @@ def test_merging_tells_first_and_then_does_it(server: Server) -> None:
     for n, frame in enumerate(west):
         fields: dict[str, Any] = {"x": 3 + n, "y": 0.5, "sequence": "tuesday", "metadata": {"n": n}}
         assert server.enrol("west", f"w{n}", frame, **fields).status_code == 201
-    believing = {"calibration": {"threshold": 0.0, "margin": 0.0}}  # the encoder of the tests has none of its own
+    believing = {"calibration": {"threshold": 0.0, "margin": 0.0}}  # the test encoder is not calibrated
     assert server.client.patch("/v1/maps/east", json=believing).status_code == 200
     before = places(server, "east")
-    told = finished(server, asked(server, "east", "merge", **{"from": "west"}))["result"]
+    report = finished(server, asked(server, "east", "merge", **{"from": "west"}))["result"]
     assert places(server, "east") == before
-    assert told["coming"] == 6 and told["conflicts"] == [] and told["known"] == 0
-    overlap = told["overlap"]
+    assert report["coming"] == 6 and report["conflicts"] == [] and report["known"] == 0
+    overlap = report["overlap"]
     assert overlap["examined"] == overlap["of"] == 6
     assert overlap["recognized"] + overlap["ambiguous"] + overlap["unknown"] == 6
     assert {"w0", "w1"} >= {pair["place"] for pair in overlap["pairs"] if pair["match"] in ("e3", "e4")} != set()
@@ -209,13 +214,15 @@ def test_merging_tells_first_and_then_does_it(server: Server) -> None:
     assert done["state"] == "succeeded" and done["result"]["places"] == 11, done
     after, theirs = places(server, "east"), places(server, "west")
     assert {name: place for name, place in after.items() if name in before} == before
-    assert {name: place for name, place in after.items() if name in theirs} == theirs, "with all that is kept of it"
+    assert {name: place for name, place in after.items() if name in theirs} == theirs, (
+        "with everything that is stored of them"
+    )
     for n, frame in enumerate(west):
         assert server.query("east", frame)["matches"][0]["place"]["id"] == f"w{n}"
     assert server.client.get("/v1/maps/east/places/w0/thumbnail").status_code == 200
     assert server.client.post("/v1/maps/east/verify").json()["ok"]
     again = finished(server, asked(server, "east", "merge", dry_run=False, **{"from": "west"}))["result"]
-    assert again["coming"] == 0 and again["known"] == 6 and again["places"] == 11, "twice is once"
+    assert again["coming"] == 0 and again["known"] == 6 and again["places"] == 11, "merging twice copies nothing again"
 
 
 def conflicting(server: Server, one: str, other: str) -> None:
@@ -232,8 +239,8 @@ def test_conflicts_are_refused_renamed_or_skipped(server: Server) -> None:
     refused = server.client.post("/v1/maps/ours/merge", json={"from": "theirs", "dry_run": False})
     problem = assert_problem(refused, 409, "merge-conflict")
     assert "3 ids" in problem["detail"] and "monday" in problem["detail"] and "front" in problem["detail"]
-    told = finished(server, asked(server, "ours", "merge", **{"from": "theirs"}))["result"]
-    assert len(told["conflicts"]) == 3
+    report = finished(server, asked(server, "ours", "merge", **{"from": "theirs"}))["result"]
+    assert len(report["conflicts"]) == 3
     before = places(server, "ours")
 
     skipping = {"from": "theirs", "on_conflict": "skip", "dry_run": False}
@@ -297,13 +304,18 @@ MANY = 640
 
 @pytest.mark.timeout(300)  # the service is started several times
 def test_a_kill_in_the_middle_of_a_merge(folder: Path) -> None:
+    with runtime_at(folder) as runtime:
+        identity = runtime.engine.resolve(COARSE)
+        encoder = next(one for one in runtime.engine.catalogue.describe() if one.identity == identity)
+        settings = MapSettings(keep="thumbnail")
+        for name, first, count, sequence in (("lab", 1, 64, "monday"), ("hall", 1001, MANY, "tuesday")):
+            map_ = runtime.engine.atlas.create(name, identity, encoder.dimension, settings, encoder.local_shape)
+            map_.enrol(enrolments(first, count, name[0], sequence, encoder.dimension))
     server = Server(folder).wait()
-    enrol_many(server, "lab", 64, keep="thumbnail")
-    enrol_many(server, "hall", MANY, keep="thumbnail", name="h", sequence="tuesday")
     answered = 0
 
     def ask() -> None:
-        """Robots that ask without a pause: the merge stands back for each, and takes its time."""
+        """A robot that queries without a pause: the merge gives way to each query, and so takes long."""
         nonlocal answered
         with suppress(httpx.TransportError), httpx.Client(base_url=server.client.base_url, timeout=30) as client:
             while client.post("/v1/maps/lab/query", content=jpeg(3), headers=typed(jpeg(3))).status_code == 200:
@@ -312,7 +324,7 @@ def test_a_kill_in_the_middle_of_a_merge(folder: Path) -> None:
     robots = [threading.Thread(target=ask) for _ in range(3)]
     for robot in robots:
         robot.start()
-    wait_until(lambda: answered >= len(robots))  # all of them ask by now
+    wait_until(lambda: answered >= len(robots))  # all of them have begun
     before = answered
     job = asked(server, "lab", "merge", dry_run=False, sample=0, **{"from": "hall"})
     reaching(server, job, 64)
@@ -342,6 +354,6 @@ def test_counts_survive_a_restart(folder: Path) -> None:
     assert server.client.get("/v1/maps/lab/health").json()["answers"]["queries"] == 1
     server.query("lab", jpeg(1))
     assert server.stop() == 0
-    server = Server(folder).wait()
-    assert server.client.get("/v1/maps/lab/health").json()["answers"]["queries"] == 2
-    assert server.stop() == 0
+    with runtime_at(folder) as runtime:
+        counted = runtime.statistics.read(map_key(runtime.engine.atlas.get("lab")))
+        assert sum(week.queries for week in counted.weeks) == 2

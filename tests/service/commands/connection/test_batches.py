@@ -16,9 +16,9 @@ from service.commands.connection.client import Refused, Service
 from service.commands.console import Failure
 from service.commands.traverse import Frame
 from tests.service.commands.connection.test_client import problem
+from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server
-from tests.service.upkeep.upkeeping import wait_until
 
 
 class Mischief(httpx.AsyncBaseTransport):

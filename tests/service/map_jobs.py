@@ -1,4 +1,4 @@
-"""Maps to look after, and jobs to wait for."""
+"""Maps of many places that are quickly made, and waiting for the jobs of maps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.service.server import Server
 
 
 def finished(server: Server, job: Mapping[str, Any], seconds: float = 90) -> dict[str, Any]:
-    """A job when it has ended."""
+    """Wait until a job has ended; the job as it is then."""
     until = time.monotonic() + seconds
     while True:
         found: dict[str, Any] = server.client.get(f"/v1/jobs/{job['id']}?wait=20").json()
@@ -23,7 +23,7 @@ def finished(server: Server, job: Mapping[str, Any], seconds: float = 90) -> dic
 
 
 def reaching(server: Server, job: Mapping[str, Any], least: int) -> dict[str, Any]:
-    """A job when it has come so far, or has ended."""
+    """Wait until a job has done so much, or has ended; the job as it is then."""
     until = time.monotonic() + 60
     while True:
         found: dict[str, Any] = server.client.get(f"/v1/jobs/{job['id']}").json()
@@ -33,15 +33,15 @@ def reaching(server: Server, job: Mapping[str, Any], least: int) -> dict[str, An
 
 
 def wait_until(holds: Callable[[], bool]) -> None:
-    """Wait for what must come to hold."""
-    end = time.monotonic() + 30
+    """Wait for a condition that must become true."""
+    end = time.monotonic() + 60
     while not holds():
-        assert time.monotonic() < end, "it never came to hold"
+        assert time.monotonic() < end, "the condition did not become true"
         time.sleep(0.005)
 
 
 def asked(server: Server, map_id: str, what: str, **body: Any) -> dict[str, Any]:
-    """The job that was asked for."""
+    """Submit a job for a map by POST; the job."""
     response = server.client.post(f"/v1/maps/{map_id}/{what}", json=body)
     assert response.status_code == 202, response.text
     job: dict[str, Any] = response.json()
@@ -57,7 +57,7 @@ def places(server: Server, map_id: str) -> dict[str, dict[str, Any]]:
 
 
 def enrol_frames(server: Server, map_id: str, frames: Sequence[bytes], name: str = "p", **fields: Any) -> None:
-    """Places one metre apart, in batches; fields are those of every place."""
+    """Enrol places one metre apart, in batches; each place gets the fields."""
     for first in range(0, len(frames), 64):
         numbers = range(first, min(first + 64, len(frames)))
         files = {f"f{n}": (f"f{n}", frames[n], "image/jpeg") for n in numbers}
@@ -68,7 +68,7 @@ def enrol_frames(server: Server, map_id: str, frames: Sequence[bytes], name: str
 
 
 def enrol_many(server: Server, map_id: str, count: int, keep: str = "image", name: str = "p", **fields: Any) -> None:
-    """A map of many places that is quickly made: eight pictures, each as several places of different bytes."""
+    """Make a map of many places quickly: eight pictures, each enrolled several times with different bytes."""
     server.create_map(map_id, encoder=COARSE, keep=keep)
     drawn = [jpeg(number) for number in range(8)]
     frames = [drawn[n % 8] + b"\x00" * (n + 1) for n in range(count)]
