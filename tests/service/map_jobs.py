@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from tests.service.encoders import COARSE
-from tests.service.scenes import jpeg
+from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server
 
 
@@ -73,3 +75,13 @@ def enrol_many(server: Server, map_id: str, count: int, keep: str = "image", nam
     drawn = [jpeg(number) for number in range(8)]
     frames = [drawn[n % 8] + b"\x00" * (n + 1) for n in range(count)]
     enrol_frames(server, map_id, frames, name, **({"sequence": "monday"} | fields))
+
+
+def walk_frames(count: int, per_scene: int = 4) -> list[bytes]:
+    """Frames as of a walk: several in each scene, each a little more like the next scene."""
+    return [_between(n // per_scene, (n % per_scene) / per_scene / 3) for n in range(count)]
+
+
+def _between(seed: int, share: float) -> bytes:
+    mixed = (1 - share) * scene(seed).astype(np.float32) + share * scene(seed + 1).astype(np.float32)
+    return encoded(np.asarray(mixed, np.uint8))

@@ -1,13 +1,16 @@
-"""A merge that is interrupted: it continues after a restart, or removes everything that it copied."""
+"""Merging over HTTP, and a merge that is interrupted: it continues after a restart, or removes what it copied."""
 
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -20,8 +23,158 @@ from service.engine.engine import Engine
 from service.jobs.context import creation_time
 from service.jobs.records import Job
 from service.upkeep import merging
+from tests.service.encoders import COARSE, TWO_STAGES, install_coarse_encoder
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at, state_of
-from tests.service.map_jobs import wait_until
+from tests.service.map_jobs import asked, enrol_frames, finished, places, reaching, wait_until
+from tests.service.scenes import encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem, typed
+
+
+def test_merging_first_reports_and_then_copies(server: Server) -> None:
+    server.create_map("east", encoder=TWO_STAGES, keep="thumbnail")
+    server.create_map("west", encoder=TWO_STAGES, keep="image")
+    enrol_frames(server, "east", [jpeg(n) for n in range(5)], "e", sequence="monday")
+    west = [encoded(seen_again(scene(n), 3)) for n in range(3, 9)]
+    for n, frame in enumerate(west):
+        fields: dict[str, Any] = {"x": 3 + n, "y": 0.5, "sequence": "tuesday", "metadata": {"n": n}}
+        assert server.enrol("west", f"w{n}", frame, **fields).status_code == 201
+    believing = {"calibration": {"threshold": 0.0, "margin": 0.0}}  # the test encoder is not calibrated
+    assert server.client.patch("/v1/maps/east", json=believing).status_code == 200
+    before = places(server, "east")
+    report = finished(server, asked(server, "east", "merge", **{"from": "west"}))["result"]
+    assert places(server, "east") == before
+    assert report["coming"] == 6 and report["conflicts"] == [] and report["known"] == 0
+    overlap = report["overlap"]
+    assert overlap["examined"] == overlap["of"] == 6
+    assert overlap["recognized"] + overlap["ambiguous"] + overlap["unknown"] == 6
+    assert {"w0", "w1"} >= {pair["place"] for pair in overlap["pairs"] if pair["match"] in ("e3", "e4")} != set()
+    done = finished(server, asked(server, "east", "merge", dry_run=False, **{"from": "west"}))
+    assert done["state"] == "succeeded" and done["result"]["places"] == 11, done
+    after, theirs = places(server, "east"), places(server, "west")
+    assert {name: place for name, place in after.items() if name in before} == before
+    assert {name: place for name, place in after.items() if name in theirs} == theirs, (
+        "with everything that is stored of them"
+    )
+    for n, frame in enumerate(west):
+        assert server.query("east", frame)["matches"][0]["place"]["id"] == f"w{n}"
+    assert server.client.get("/v1/maps/east/places/w0/thumbnail").status_code == 200
+    assert server.client.post("/v1/maps/east/verify").json()["ok"]
+    again = finished(server, asked(server, "east", "merge", dry_run=False, **{"from": "west"}))["result"]
+    assert again["coming"] == 0 and again["known"] == 6 and again["places"] == 11, "merging twice copies nothing again"
+
+
+def conflicting(server: Server, one: str, other: str) -> None:
+    for name, shift in ((one, 0), (other, 10)):
+        server.create_map(name, encoder=COARSE)
+        polygon = [[0, 0.9], [1, 0.9], [1, 1 - shift / 100]]
+        mask = {"mask": {"polygons": [polygon]}}
+        assert server.client.put(f"/v1/maps/{name}/cameras/front", json=mask).status_code == 201
+        enrol_frames(server, name, [jpeg(n + shift) for n in range(3)], sequence="monday", camera="front")
+
+
+def test_conflicts_are_refused_renamed_or_skipped(server: Server) -> None:
+    conflicting(server, "ours", "theirs")
+    refused = server.client.post("/v1/maps/ours/merge", json={"from": "theirs", "dry_run": False})
+    problem = assert_problem(refused, 409, "merge-conflict")
+    assert "3 ids" in problem["detail"] and "monday" in problem["detail"] and "front" in problem["detail"]
+    report = finished(server, asked(server, "ours", "merge", **{"from": "theirs"}))["result"]
+    assert len(report["conflicts"]) == 3
+    before = places(server, "ours")
+
+    skipping = {"from": "theirs", "on_conflict": "skip", "dry_run": False}
+    done = finished(server, asked(server, "ours", "merge", **skipping))
+    assert done["result"]["skipped"] == {"count": 3, "places": ["p0", "p1", "p2"]} and done["result"]["coming"] == 0
+    assert places(server, "ours") == before
+
+    renaming = {"from": "theirs", "on_conflict": "rename", "prefix": "t.", "dry_run": False}
+    done = finished(server, asked(server, "ours", "merge", **renaming))
+    assert done["state"] == "succeeded", done
+    assert done["result"]["renamed"] == {
+        "places": 3,
+        "sequences": {"monday": "t.monday"},
+        "cameras": {"front": "t.front"},
+    }
+    after = places(server, "ours")
+    assert list(after) == ["p0", "p1", "p2", "t.p0", "t.p1", "t.p2"]
+    assert after["t.p1"]["sequence"] == "t.monday" and after["t.p1"]["camera"] == "t.front"
+    masks = [
+        server.client.get(f"/v1/maps/{m}/cameras/{c}").json()["mask"]
+        for m, c in (("ours", "t.front"), ("theirs", "front"))
+    ]
+    assert masks[0] == masks[1]
+
+
+def test_sequences_of_one_name_are_joined_in_order_when_skipping(server: Server) -> None:
+    for name, first in (("head", 0), ("tail", 3)):
+        server.create_map(name, encoder=COARSE, same_place_frames=1)
+        for n in range(first, first + 3):
+            assert server.enrol(name, f"p{n}", jpeg(n), sequence="monday").status_code == 201
+    done = finished(server, asked(server, "head", "merge", dry_run=False, on_conflict="skip", **{"from": "tail"}))
+    assert done["state"] == "succeeded" and done["result"]["places"] == 6
+    report = server.client.get("/v1/maps/head/health").json()
+    assert report["places"] == 6
+    sequences = server.client.get("/v1/maps/head/sequences").json()["items"]
+    assert [(s["name"], s["places"]) for s in sequences] == [("monday", 6)]
+
+
+def test_merging_what_cannot_be_merged(server: Server, traverse: str) -> None:
+    server.create_map("coarse-one", encoder=COARSE)
+    post = server.client.post
+    assert_problem(post("/v1/maps/coarse-one/merge", json={"from": traverse}), 409, "wrong-encoder")
+    assert_problem(post("/v1/maps/coarse-one/merge", json={"from": "coarse-one"}), 422, "invalid-request")
+    assert_problem(post("/v1/maps/coarse-one/merge", json={"from": "none"}), 404, "unknown-map")
+    assert_problem(post("/v1/maps/coarse-one/merge", json={}), 422, "invalid-request")
+    assert_problem(post("/v1/maps/coarse-one/merge", json={"from": "x", "prefix": "/"}), 422, "invalid-request")
+    assert_problem(post("/v1/maps/coarse-one/merge", json={"from": "x", "on_conflict": "odd"}), 422, "invalid-request")
+
+
+MANY = 640
+
+
+@pytest.mark.timeout(300)  # the service is started twice
+def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
+    install_coarse_encoder(tmp_path / "models")
+    with runtime_at(tmp_path) as runtime:
+        identity = runtime.engine.resolve(COARSE)
+        encoder = next(one for one in runtime.engine.catalogue.describe() if one.identity == identity)
+        settings = MapSettings(keep="thumbnail")
+        for name, first, count, sequence in (("lab", 1, 64, "monday"), ("hall", 1001, MANY, "tuesday")):
+            map_ = runtime.engine.atlas.create(name, identity, encoder.dimension, settings, encoder.local_shape)
+            map_.enrol(enrolments(first, count, name[0], sequence, encoder.dimension))
+    server = Server(tmp_path).wait()
+    answered = 0
+
+    def ask() -> None:
+        """A robot that queries without a pause: the merge gives way to each query, and so takes long."""
+        nonlocal answered
+        with suppress(httpx.TransportError), httpx.Client(base_url=server.client.base_url, timeout=30) as client:
+            while client.post("/v1/maps/lab/query", content=jpeg(3), headers=typed(jpeg(3))).status_code == 200:
+                answered += 1
+
+    robots = [threading.Thread(target=ask) for _ in range(3)]
+    for robot in robots:
+        robot.start()
+    wait_until(lambda: answered >= len(robots))  # all of them have begun
+    before = answered
+    job = asked(server, "lab", "merge", dry_run=False, sample=0, **{"from": "hall"})
+    reaching(server, job, 64)
+    wait_until(lambda: answered > before + len(robots))
+    going = server.client.get(f"/v1/jobs/{job['id']}").json()
+    server.kill()
+    assert going["state"] == "running" and going["progress"]["done"] < MANY, (going, answered - before)
+    for robot in robots:
+        robot.join(30)
+    server = Server(tmp_path).wait()
+    done = finished(server, job)
+    assert (done["state"], done["attempt"]) == ("succeeded", 2), done
+    here, there = places(server, "lab"), places(server, "hall")
+    assert len(here) == 64 + MANY == done["result"]["places"]
+    assert {name: here[name] for name in there} == there
+    assert server.client.post("/v1/maps/lab/verify").json()["ok"]
+    assert server.stop() == 0
+
+
+# Interrupted, without HTTP
 
 COUNT = 5 * merging.PLACES_PER_COMMIT
 WANTED: dict[str, Any] = {"from": "hall", "dry_run": False, "on_conflict": "rename", "prefix": "h.", "sample": 0}

@@ -1,4 +1,4 @@
-"""A pruning that is interrupted: the places that it chose are removed once, and no others."""
+"""Pruning over HTTP, and a pruning that is interrupted: the places that it chose are removed once, and no others."""
 
 from __future__ import annotations
 
@@ -12,8 +12,74 @@ from core.storage.transfer import Transfer
 from service.engine.engine import Engine
 from service.jobs.context import JobInterrupted
 from service.upkeep import pruning
+from tests.service.encoders import COARSE
 from tests.service.engines import ENCODER, end_of, enrolments, runtime_at
-from tests.service.map_jobs import wait_until
+from tests.service.map_jobs import asked, enrol_frames, finished, places, wait_until, walk_frames
+from tests.service.scenes import encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem
+
+
+def test_pruning_first_reports_and_then_does_what_it_reported(server: Server) -> None:
+    server.create_map("dense", encoder=COARSE, same_place_radius=2.5)
+    enrol_frames(server, "dense", walk_frames(32), sequence="monday")
+    before = places(server, "dense")
+    report = finished(server, asked(server, "dense", "prune", max_recall_loss=0.1))["result"]
+    assert places(server, "dense") == before, "a dry run changes nothing"
+    assert 0 < report["removed"] < 32 and report["recall_loss"] <= 0.1
+    assert report["measured_on"] == "leave-one-out" and report["queries"] == 32
+    assert report["recall_before"]["low"] <= report["recall_before"]["value"] <= report["recall_before"]["high"]
+    removed = [one["removed"] for one in report["tried"]]
+    assert removed[0] <= report["removed"] <= removed[-1]
+    done = finished(server, asked(server, "dense", "prune", max_recall_loss=0.1, dry_run=False))
+    assert done["state"] == "succeeded"
+    after = places(server, "dense")
+    assert {name: done["result"][name] for name in report} == report
+    assert len(after) == done["result"]["places_after"] == 32 - report["removed"]
+    gone = set(before) - set(after)
+    assert gone == set(report["named"])
+    for name in gone:  # the place itself is still found: by its neighbour
+        x = before[name]["pose"]["x"]
+        assert any(abs(place["pose"]["x"] - x) <= 2.5 for place in after.values())
+    assert server.client.post("/v1/maps/dense/verify").json()["ok"]
+
+
+def test_pruning_measured_on_another_traverse(server: Server) -> None:
+    server.create_map("second", encoder=COARSE, same_place_radius=2.5)
+    enrol_frames(server, "second", walk_frames(16), sequence="monday")
+    again = [encoded(seen_again(scene(n // 4), n)) for n in range(0, 16, 2)]
+    for n, frame in enumerate(again):
+        assert server.enrol("second", f"q{n}", frame, x=2 * n, y=0.1, sequence="tuesday").status_code == 201
+    job = asked(server, "second", "prune", queries="tuesday", similarity=0.1, dry_run=False)
+    done = finished(server, job)["result"]
+    assert done["measured_on"] == "tuesday" and done["queries"] == 8 and done["removed"] > 0
+    left = places(server, "second")
+    assert {name for name in left if name.startswith("q")} == {f"q{n}" for n in range(8)}
+    assert len(left) == 24 - done["removed"]
+
+
+def test_only_places_of_the_given_sequence_are_removed(server: Server) -> None:
+    server.create_map("partly", encoder=COARSE, same_place_radius=2.5)
+    enrol_frames(server, "partly", walk_frames(12), "a", sequence="monday")
+    enrol_frames(server, "partly", [frame + b"\x00" for frame in walk_frames(12)], "b", sequence="tuesday")
+    done = finished(server, asked(server, "partly", "prune", sequence="tuesday", similarity=0.1, dry_run=False))
+    assert done["result"]["removed"] == 12, "each has its counterpart in the other traverse"
+    assert set(places(server, "partly")) == {f"a{n}" for n in range(12)}
+
+
+def test_pruning_what_cannot_be_pruned(server: Server) -> None:
+    server.create_map("sparse", encoder=COARSE, same_place_radius=0.5)
+    enrol_frames(server, "sparse", [jpeg(n) for n in range(3)], sequence="monday")
+    failed = finished(server, asked(server, "sparse", "prune"))
+    assert failed["state"] == "failed"
+    assert failed["problem"]["type"] == "urn:placerec:problem:nothing-to-measure"
+    post = server.client.post
+    assert_problem(post("/v1/maps/sparse/prune", json={"sequence": "none"}), 404, "unknown-sequence")
+    assert_problem(post("/v1/maps/sparse/prune", json={"max_recall_loss": 2}), 422, "invalid-request")
+    both = {"sequence": "monday", "queries": "monday"}
+    assert_problem(post("/v1/maps/sparse/prune", json=both), 422, "invalid-request")
+    assert_problem(post("/v1/maps/none/prune", json={}), 404, "unknown-map")
+    assert_problem(post("/v1/maps/sparse/prune", json={"odd": 1}), 422, "invalid-request")
+
 
 GOING = ("l1", "l3", "l5")
 

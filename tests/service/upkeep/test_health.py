@@ -1,0 +1,122 @@
+"""The health report of a map, over HTTP."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.queries.statistics import map_key
+from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.engines import runtime_at
+from tests.service.map_jobs import enrol_frames, enrol_many, walk_frames
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem
+
+
+def test_health_of_a_map_that_was_never_queried(server: Server) -> None:
+    server.create_map("fresh", encoder=COARSE)
+    report = server.client.get("/v1/maps/fresh/health").json()
+    assert report["places"] == 0 and report["complete"] and report["never_matched"] is None
+    assert report["answers"]["queries"] == 0 and report["answers"]["since"] is None
+    enrol_frames(server, "fresh", [jpeg(n) for n in range(8)], sequence="monday")
+    report = server.client.get("/v1/maps/fresh/health").json()
+    assert report["places"] == report["aliasing"]["of"] == report["aliasing"]["examined"] == 8
+    assert report["gaps"] == [] and report["never_matched"] is None
+
+
+def test_health_of_a_single_place(server: Server) -> None:
+    server.create_map("single", encoder=COARSE)
+    enrol_frames(server, "single", [jpeg(1)])
+    response = server.client.get("/v1/maps/single/health")
+    assert response.status_code == 200, response.text
+    aliasing = response.json()["aliasing"]
+    assert (aliasing["examined"], aliasing["aliases"], aliasing["hubs"]) == (1, [], [])
+
+
+def test_health_counts_what_was_answered(server: Server) -> None:
+    server.create_map("counted", encoder=COARSE)
+    enrol_frames(server, "counted", [jpeg(n) for n in range(6)], sequence="monday")
+    verdicts = []
+    for seed in (0, 0, 1, 2, 40):
+        answer = server.query("counted", encoded(seen_again(scene(seed), 1)))
+        verdicts.append(answer["verdict"])
+        if seed < 6:
+            assert answer["matches"][0]["place"]["id"] == f"p{seed}"
+    stranger = answer["matches"][0]["place"]["id"]
+    server.query("counted", encoded(blank()))
+    report = server.client.get("/v1/maps/counted/health").json()
+    answers = report["answers"]
+    assert answers["queries"] == 6 and answers["unknown"] == verdicts.count("unknown") + 1
+    (week,) = answers["weeks"]
+    assert week["blank"] == 1 and sum(week["scores"]) == 5 and answers["score_trend"] is None
+    matched = {"p0", "p1", "p2", stranger}
+    assert report["never_matched"]["places"] == [f"p{n}" for n in range(6) if f"p{n}" not in matched]
+    assert report["never_matched"]["by_chance"] == pytest.approx(6 * np.exp(-5 / 6))
+
+
+def test_a_new_map_of_the_same_name_begins_with_nothing(server: Server) -> None:
+    for _ in range(2):
+        server.create_map("again", encoder=COARSE)
+        enrol_frames(server, "again", [jpeg(n) for n in range(2)])
+        assert server.client.get("/v1/maps/again/health").json()["answers"]["queries"] == 0
+        server.query("again", jpeg(1))
+        assert server.client.get("/v1/maps/again/health").json()["answers"]["queries"] == 1
+        assert server.client.delete("/v1/maps/again").status_code == 204
+
+
+def test_gaps_and_stretches_to_record_again(server: Server) -> None:
+    server.create_map("gapped", encoder=COARSE, same_place_radius=1.2)
+    positions = [0, 1, 2, 3, 4, 5, 25, 26, 27, 28, 29]  # metres; nobody filmed from 5 to 25
+    frames = walk_frames(len(positions))
+    for n, x in enumerate(positions):
+        stamp = f"2026-11-20T10:00:{n:02}Z"
+        assert (
+            server.enrol("gapped", f"p{n}", frames[n], x=x, y=0, sequence="monday", timestamp=stamp).status_code == 201
+        )
+    report = server.client.get("/v1/maps/gapped/health").json()
+    (gap,) = [gap for gap in report["gaps"] if gap["measure"] == "distance"]
+    assert (gap["sequence"], gap["before"], gap["after"]) == ("monday", "p5", "p6")
+    assert (gap["value"], gap["median"], gap["severity"]) == (20.0, 1.0, 20.0)
+    first = report["retraverse"][0]
+    assert "distance-gap" in first["reasons"] and first["sequence"] == "monday"
+    order = [f"p{n}" for n in range(11)]
+    assert order.index(first["first"]) <= 5 and order.index(first["last"]) >= 6
+    assert server.client.get("/v1/maps/gapped/health?limit=1").json()["gap_count"] == report["gap_count"]
+
+
+def test_places_that_look_alike_are_listed(server: Server) -> None:
+    """Two places far apart look the same, while frames of the same place look different."""
+    server.create_map("twins", encoder=COARSE, same_place_radius=1.2)
+    frames = {0: 1, 1: 2, 40: 1, 41: 3}
+    for x, seed in frames.items():
+        frame = encoded(seen_again(scene(seed), x))
+        assert server.enrol("twins", f"at{x}", frame, x=x, y=0, sequence="monday").status_code == 201
+    aliases = server.client.get("/v1/maps/twins/health").json()["aliasing"]["aliases"]
+    pairs = {(alias["place"], alias["other"]) for alias in aliases}
+    assert {("at0", "at40"), ("at40", "at0")} <= pairs
+    assert all(alias["own"] < alias["score"] for alias in aliases)
+
+
+@pytest.mark.parametrize("query", ["seconds=0", "seconds=99", "limit=0", "limit=1001", "more=1", "seconds=nan"])
+def test_health_refuses_invalid_parameters(server: Server, traverse: str, query: str) -> None:
+    assert_problem(server.client.get(f"/v1/maps/{traverse}/health?{query}"), 422, "invalid-request")
+    assert_problem(server.client.get("/v1/maps/none/health"), 404, "unknown-map")
+
+
+def test_counts_survive_a_restart(tmp_path: Path) -> None:
+    install_coarse_encoder(tmp_path / "models")
+    server = Server(tmp_path, {"statistics_seconds": 0.2}).wait()
+    enrol_many(server, "lab", 4)
+    server.query("lab", jpeg(1))
+    time.sleep(1.0)
+    server.kill()
+    server = Server(tmp_path).wait()
+    assert server.client.get("/v1/maps/lab/health").json()["answers"]["queries"] == 1
+    server.query("lab", jpeg(1))
+    assert server.stop() == 0
+    with runtime_at(tmp_path) as runtime:
+        counted = runtime.statistics.read(map_key(runtime.engine.atlas.get("lab")))
+        assert sum(week.queries for week in counted.weeks) == 2
