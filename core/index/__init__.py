@@ -12,7 +12,7 @@ Nothing here knows where descriptors or codes are kept.
 * :mod:`core.kernels.codes`: the compiled loops over codes; :mod:`core.index.selection`: the best of many estimates.
 * :mod:`core.index.table`: :class:`CodeTable`, the codes of a map, append-only, and the search over them.
 * :mod:`core.kernels.packed`: exact products with descriptors kept in six bits a value.
-* :mod:`core.index.exact`: exact products with descriptors in half or single precision; :mod:`core.index.ranking`: rows
+* :mod:`core.index.exact`: exact products with descriptors in half or single precision; :mod:`core.index.exact`: rows
   in their order.
 * :mod:`core.index.lists`: :class:`InvertedLists`, rows by the nearest of some hundreds of centres.
 """

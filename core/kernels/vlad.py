@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from core.kernels.bit_masks import BLOCK, lowest_bit, reaching
+from core.kernels.regions import BLOCK, lowest_bit, reaching
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})

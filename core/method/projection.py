@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.products import ConstantMatrix
-from core.kernels.projections import finish_rows
+from core.kernels.projections import ConstantMatrix, finish_rows
 from core.method.equations import unit_length
 
 Array = NDArray[np.float32]

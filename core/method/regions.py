@@ -2,7 +2,7 @@
 
 A region is an 8-connected group of cells of one feature map whose activations have the same quantised level
 ``floor(activation / step)``; level 0 and below is background.  ``equations.py`` states this in plain NumPy; here the
-compiled loops of ``core.kernels.components`` and ``core.kernels.boxes`` compute it.
+compiled loops of ``core.kernels.regions`` and ``core.kernels.regions`` compute it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.boxes import projected_within, sums_within
-from core.kernels.components import DOUBLES, INTEGERS, SINGLES, bits_shape, strongest
+from core.kernels.regions import DOUBLES, INTEGERS, SINGLES, bits_shape, projected_within, strongest, sums_within
 
 Activations = NDArray[np.float32]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.products import ConstantMatrix
+from core.kernels.projections import ConstantMatrix
 from core.kernels.vlad import aggregated
 from core.method.equations import Normalization
 

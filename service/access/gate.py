@@ -1,5 +1,8 @@
 """Access control: requests and WebSocket handshakes are let in or refused before any byte of a body is read.
 
+The gate asks for a key, its role and its maps, and bounds the rate of each caller.  Where there are no keys yet, it
+refuses what a web page makes a browser send, since a browser on this machine sends whatever any page asks it to.
+
 As soon as a key was ever created, everything needs a key that ``service.access.roles`` does not declare open.  That
 includes unknown paths, so that a caller without a key learns nothing about what exists.
 """
@@ -7,11 +10,16 @@ includes unknown paths, so that a caller without a key learns nothing about what
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
 import re
-from collections.abc import Iterable, Mapping
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
+from urllib.parse import urlsplit
 
 from fastapi.routing import APIRoute, APIWebSocketRoute, iter_route_contexts
 from starlette.requests import Request
@@ -21,14 +29,169 @@ from starlette.websockets import WebSocket
 
 from service.access.audit import ASKER, Asker, Refusals, asker_of, note_change
 from service.access.keyring import Keyring
-from service.access.rates import Rates, network_of
 from service.access.roles import ANONYMOUS, NOBODY, OPERATIONS, OWNER, UNLISTED, Principal, Rule, covers
-from service.access.web_origins import check_host, check_page
-from service.errors.faults import Fault, KeyRefused, MapForbidden, RoleTooLow
+from service.errors.faults import Fault, ForeignPage, KeyRefused, MapForbidden, RateExceeded, RoleTooLow
 from service.errors.problems import KINDS, problem_response
 from service.settings import PREFIX, Settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import request_id
+
+MOST_CALLERS = 4096
+"""Buckets that are kept; the least recently used one makes room for another."""
+
+FAILURES_PER_SECOND, FAILURE_BURST = 1.0, 10
+"""How many wrong keys one address may try."""
+
+
+class Buckets:
+    """Token buckets by name.  A bucket holds up to ``burst`` tokens, and ``rate`` tokens are added each second.
+
+    Args:
+        rate: tokens a second; 0 means that there is no limit.
+        clock: seconds, never going back.
+    """
+
+    def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self.rate, self.burst, self._clock = rate, max(1, burst), clock
+        self._full_at: OrderedDict[str, float] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._full_at)
+
+    def take(self, name: str) -> float:
+        """Take a token and return 0.0; if there is none, return the seconds until there will be one."""
+        if not self.rate:
+            return 0.0
+        now = self._clock()
+        # The state of a bucket is one number: when it will be full again.
+        full_at = max(self._full_at.get(name, now), now) + 1 / self.rate
+        lacking = full_at - now - self.burst / self.rate
+        if lacking > 1e-9:
+            return lacking
+        self._full_at[name] = full_at
+        self._full_at.move_to_end(name)
+        if len(self._full_at) > MOST_CALLERS:
+            self._full_at.popitem(last=False)
+        return 0.0
+
+
+class Rates:
+    """The limits of one service.
+
+    Args:
+        rate, burst: the limit of each key, or of each address while there are no keys.
+    """
+
+    def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._requests = Buckets(rate, burst, clock)
+        self._failures = Buckets(FAILURES_PER_SECOND, FAILURE_BURST, clock)
+
+    def admit(self, caller: str) -> None:
+        """Count a request.
+
+        Raises:
+            RateExceeded: the request exceeds the rate; it is not counted.
+        """
+        wait = self.wait(caller)
+        if wait:
+            raise RateExceeded(
+                f"More than {self._requests.rate:g} requests a second were sent. Wait before you send the next one.",
+                wait,
+            )
+
+    def wait(self, caller: str) -> float:
+        """Count a request and return 0.0, or return the seconds to wait until it can be counted."""
+        return self._requests.take(caller)
+
+    def admit_failure(self, address: str | None) -> None:
+        """Count a wrong key.
+
+        Raises:
+            RateExceeded: this address has sent too many; valid keys from it are still accepted.
+        """
+        wait = self._failures.take(network_of(address))
+        if wait:
+            raise RateExceeded("Too many wrong keys were sent from this address. Wait before you try again.", wait)
+
+
+@lru_cache(MOST_CALLERS)
+def network_of(address: str | None) -> str:
+    """The addresses that count as one caller: an IPv4 address, or the /64 network of an IPv6 address."""
+    try:
+        parsed = ipaddress.ip_address(address or "")
+    except ValueError:
+        return address or "unknown"
+    if isinstance(parsed, ipaddress.IPv6Address):
+        return str(parsed.ipv4_mapped or ipaddress.ip_network((parsed, 64), strict=False))
+    return str(parsed)
+
+
+Headers = list[tuple[bytes, bytes]]
+
+OWN_SITES = frozenset({b"same-origin", b"none"})
+"""Values of ``Sec-Fetch-Site``: a page of this service, and an address that a person typed."""
+
+
+def check_page(headers: Headers) -> None:
+    """Refuse requests from pages of other origins.
+
+    Raises:
+        ForeignPage: the headers say that the request comes from such a page.
+    """
+    host = origin = site = None
+    for name, value in headers:
+        if name == b"origin":
+            origin = value
+        elif name == b"sec-fetch-site":
+            site = value
+        elif name == b"host":
+            host = value
+    if site is not None and site not in OWN_SITES:
+        raise ForeignPage(
+            "The request comes from a web page of another site, which is refused while the service has no keys."
+        )
+    if origin is not None and _host_of(origin) != (host or b"").lower():
+        raise ForeignPage(
+            "The request comes from a web page of another origin, which is refused while the service has no keys."
+        )
+
+
+def _host_of(origin: bytes) -> bytes | None:
+    """The host and port of an Origin header; None if it is not an origin."""
+    try:
+        return urlsplit(origin.decode("latin-1")).netloc.lower().encode("latin-1")
+    except ValueError:
+        return None
+
+
+def check_host(headers: Headers) -> None:
+    """Refuse requests that are addressed to another host name than this machine's own.
+
+    Raises:
+        ForeignPage: the Host header names another host, or there are two.
+    """
+    named = [value for name, value in headers if name == b"host"]
+    if len(named) > 1 or (named and not is_loopback_host(named[0])):
+        raise ForeignPage(
+            "While the service has no keys, it answers only requests to localhost or 127.0.0.1. "
+            "Create a key to use it under another name."
+        )
+
+
+@lru_cache(64)
+def is_loopback_host(host: bytes) -> bool:
+    """Whether a Host header is a loopback name or address."""
+    try:
+        name = urlsplit(f"//{host.decode('ascii')}").hostname or ""
+    except ValueError:
+        return False
+    if name == "localhost" or name.endswith(".localhost"):
+        return True
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
+
 
 WEBSOCKET = "WEBSOCKET"
 

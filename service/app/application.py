@@ -16,10 +16,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from service.access.audit import audit_file
-from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
+from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
-from service.access.rates import Rates
 from service.app import routes as root
 from service.app.gauges import gauges
 from service.app.runtime import Runtime

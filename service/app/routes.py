@@ -18,7 +18,7 @@ from service.app.runtime import Runtime
 from service.app.schemas import EncoderPage, Health, Readiness, Version
 from service.errors.faults import NotReady
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, FromState, PrincipalDep, single_values
+from service.http.routing import EngineDep, FromState, PrincipalDep, single_values
 from service.maps.schemas import QuarantinedMap
 from service.worker_threads import in_thread
 

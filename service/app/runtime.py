@@ -83,7 +83,7 @@ class Runtime:
         )
 
     def publish(self, state: State) -> None:
-        """Make the parts available to the routes, which find them by name (``service.http.dependencies.FromState``)."""
+        """Make the parts available to the routes, which find them by name (``service.http.routing.FromState``)."""
         state.runtime = self
         state.engine, state.jobs, state.sessions = self.engine, self.jobs, self.sessions
         state.staging, state.batch_order = self.staging, self.batch_order

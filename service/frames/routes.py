@@ -28,7 +28,9 @@ from service.frames.schemas import (
     RegionsParameters,
     RegionsView,
 )
-from service.http.dependencies import (
+from service.http.headers import preferred
+from service.http.openapi import BINARY, form_body, frame_body
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     milliseconds_since,
@@ -36,8 +38,6 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.headers import preferred
-from service.http.openapi import BINARY, form_body, frame_body
 from service.http.uploads import read_frame, read_pair
 from service.queries.explanations import draw_explanation, explain_pair, scaled_for_drawing
 from service.worker_threads import in_thread

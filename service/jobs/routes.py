@@ -17,7 +17,7 @@ from core.storage.pagination import Listing, decode_number, encode_cursor
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
-from service.http.dependencies import FromState, PrincipalDep, single_values
+from service.http.routing import FromState, PrincipalDep, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
 from service.jobs.jobs import Jobs

@@ -41,8 +41,8 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import json_size, parse_json
-from service.http.dependencies import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.headers import expected_revision
+from service.http.routing import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
 from service.jobs.context import JobContext, creation_time, yield_to_requests

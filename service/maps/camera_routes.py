@@ -11,8 +11,7 @@ from core import errors
 from core.places import Camera
 from service.errors.faults import UnsupportedMediaType
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, MapId, json_body, single_values
-from service.http.route_classes import StrictRoute
+from service.http.routing import EngineDep, MapId, StrictRoute, json_body, single_values
 from service.maps.schemas import CameraDefinition, CameraList, CameraView
 
 router = APIRouter(

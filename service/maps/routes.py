@@ -15,10 +15,9 @@ from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, IfMatch, MapId, Page, PrincipalDep, json_body, single_values
 from service.http.headers import entity_tag, expected_revision
 from service.http.openapi import json_patch
-from service.http.route_classes import StrictRoute
+from service.http.routing import EngineDep, IfMatch, MapId, Page, PrincipalDep, StrictRoute, json_body, single_values
 from service.http.schemas import PageParameters
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView

@@ -30,10 +30,9 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import intake_of
-from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, single_values
 from service.http.headers import check_match, entity_tag, is_known, named_tags, wanted_slice
 from service.http.openapi import BINARY
-from service.http.route_classes import StrictRoute
+from service.http.routing import EngineDep, FromState, MapId, PrincipalDep, StrictRoute, single_values
 from service.http.schemas import Parameters
 from service.http.uploads import media_type
 from service.jobs.routes import JobsDep, accepted

@@ -22,7 +22,8 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import (
+from service.http.openapi import form_body, frame_body, json_patch
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     FromState,
@@ -30,6 +31,7 @@ from service.http.dependencies import (
     Page,
     PlaceId,
     SequenceName,
+    StrictRoute,
     frame_for_map,
     json_body,
     milliseconds_since,
@@ -37,8 +39,6 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.openapi import form_body, frame_body, json_patch
-from service.http.route_classes import StrictRoute
 from service.http.uploads import json_part, read_many
 from service.jobs.jobs import Jobs
 from service.jobs.routes import JobsDep, accepted

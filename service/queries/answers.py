@@ -16,7 +16,7 @@ from core.storage import Map
 from service.engine.engine import Engine
 from service.engine.microbatches import Encoded
 from service.engine.searches import Recognized
-from service.http.dependencies import FromState, rounded
+from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
 from service.queries.schemas import EstimatedPose, Match, QueryAnswer
 from service.queries.statistics import QueryStatistics, map_key

@@ -22,7 +22,8 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import (
+from service.http.openapi import frame_body
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     MapId,
@@ -32,7 +33,6 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.openapi import frame_body
 from service.http.uploads import parse_metadata
 from service.places.enrolment import FrameToEnrol, describe_frame, digest_of
 from service.places.schemas import PlaceView

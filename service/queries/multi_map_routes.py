@@ -18,7 +18,8 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation, request_problem
-from service.http.dependencies import (
+from service.http.openapi import frames_body
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     PrincipalDep,
@@ -27,7 +28,6 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.openapi import frames_body
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView

@@ -18,19 +18,19 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import (
+from service.http.openapi import BINARY, form_body, frame_body
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     FromState,
     MapId,
+    QuickRoute,
     frame_for_map,
     milliseconds_since,
     rounded,
     single_values,
     started,
 )
-from service.http.openapi import BINARY, form_body, frame_body
-from service.http.route_classes import QuickRoute
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
 from service.queries.answers import StatisticsDep, counted_answer

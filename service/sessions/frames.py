@@ -13,7 +13,7 @@ from core.storage import Map
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
-from service.http.dependencies import rounded
+from service.http.routing import rounded
 from service.places.schemas import PlaceView
 from service.queries.answers import counted_answer
 from service.queries.schemas import QueryAnswer

@@ -18,12 +18,14 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import (
+from service.http.openapi import frame_body
+from service.http.routing import (
     DeadlineDep,
     EngineDep,
     FromState,
     MapId,
     Page,
+    StrictRoute,
     frame_for_map,
     json_body,
     milliseconds_since,
@@ -31,8 +33,6 @@ from service.http.dependencies import (
     single_values,
     started,
 )
-from service.http.openapi import frame_body
-from service.http.route_classes import StrictRoute
 from service.queries.answers import StatisticsDep
 from service.sessions.frames import process_frame, session_report, session_view
 from service.sessions.schemas import FrameParameters, NewSession, SessionAnswer, SessionPage, SessionReport, SessionView

@@ -23,8 +23,7 @@ from service.errors.faults import (
     UnsupportedMediaType,
 )
 from service.errors.problems import problem_documentation
-from service.http.dependencies import EngineDep, FromState, MapId, PrincipalDep, json_body, single_values
-from service.http.route_classes import StrictRoute
+from service.http.routing import EngineDep, FromState, MapId, PrincipalDep, StrictRoute, json_body, single_values
 from service.http.schemas import Parameters
 from service.jobs.context import creation_time
 from service.jobs.jobs import Jobs

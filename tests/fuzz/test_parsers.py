@@ -32,7 +32,7 @@ from service.http.multipart import FormReader
 from service.http.schemas import validated
 from service.places.parameters import EnrolParameters
 from service.queries.filters import FilterParameters, parse_box, parsed_json
-from service.telemetry.traces import read_trace
+from service.telemetry.requests import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 
 FEW = settings(max_examples=60, deadline=10_000, suppress_health_check=[HealthCheck.too_slow], derandomize=True)

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownPlace
 from core.index import Codes, CodeTable, InvertedLists
-from core.index.exact import Rows
-from core.index.ranking import ranked
+from core.index.exact import Rows, ranked
 from core.method.agreement import ScatteredCells
 from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local

@@ -18,10 +18,9 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from service.access.gate import WEBSOCKET, Endpoint, endpoints_of
+from service.access.gate import WEBSOCKET, Endpoint, endpoints_of, is_loopback_host
 from service.access.keys import KeyStore
 from service.access.roles import OPERATIONS, covers
-from service.access.web_origins import is_loopback_host
 from service.app.application import create_app
 from service.commands.connection.client import Target, open_service
 from service.settings import Settings

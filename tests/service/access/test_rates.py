@@ -7,8 +7,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from service.access.gate import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
 from service.access.keys import KeyStore
-from service.access.rates import FAILURE_BURST, FAILURES_PER_SECOND, MOST_CALLERS, Buckets, Rates, network_of
 from service.app.application import create_app
 from service.errors.faults import RateExceeded
 from service.settings import Settings

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from service.telemetry.traces import read_trace
+from service.telemetry.requests import read_trace
 from tests.service.server import Server
 
 TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from service.http.route_classes import KEPT, LONGEST_KEPT, _Reader
+from service.http.routing import KEPT, LONGEST_KEPT, _Reader
 from service.queries.parameters import QueryParameters
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem, typed
