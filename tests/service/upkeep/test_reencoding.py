@@ -186,7 +186,7 @@ def test_the_old_map_is_deleted_meanwhile(server: Server) -> None:
 
 def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(folder: Path) -> None:
     server = Server(folder).wait()
-    enrol_many(server, "lab", MANY)
+    enrol_many(server, "lab", 64)
     job = start(server, "lab", "lab-2")
     reaching(server, job, 1)
     with httpx.Client(base_url=server.client.base_url, timeout=30) as watcher:
