@@ -14,6 +14,12 @@ from tests.service.server import Server
 FIXED = 4
 
 
+@pytest.fixture(autouse=True)
+def frequent_housekeeping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fleet looks after the map every half second; it ends only after such a pause."""
+    monkeypatch.setattr("benchmarks.fleet.HOUSEKEEPING_SECONDS", 0.5)
+
+
 def plan(server: Server, map_id: str) -> Plan:
     for number in range(FIXED):
         assert server.enrol(map_id, f"fixed-{number}", jpeg(number)).status_code == 201
@@ -45,9 +51,9 @@ def test_a_place_that_is_lost_or_comes_back_is_reported(server: Server, map_id: 
 
 def test_operators_enrol_and_delete_and_the_counts_agree(server: Server, map_id: str) -> None:
     pictures = [Picture(jpeg(number), jpeg(number)) for number in range(40)]
-    fleet = Fleet(Plan(str(server.client.base_url), map_id, pictures * 4, [], {}, 1, 1, rate=2, enrol_rate=8))
+    fleet = Fleet(Plan(str(server.client.base_url), map_id, pictures * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
     asyncio.run(fleet.fill())
-    assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 80
+    assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 160
     asyncio.run(fleet.work(2.0, exports=False))
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"]
     assert fleet.seen.statuses["enrol one 201"] and fleet.seen.statuses["delete place 204"]
