@@ -14,6 +14,12 @@ from tests.service.server import Server
 FIXED = 4
 
 
+@pytest.fixture(autouse=True)
+def frequent_housekeeping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fleet looks after the map every half second; it ends only after such a pause."""
+    monkeypatch.setattr("benchmarks.fleet.HOUSEKEEPING_SECONDS", 0.5)
+
+
 def plan(server: Server, map_id: str) -> Plan:
     for number in range(FIXED):
         assert server.enrol(map_id, f"fixed-{number}", jpeg(number)).status_code == 201
@@ -47,7 +53,7 @@ def test_operators_enrol_and_delete_and_the_counts_agree(server: Server, map_id:
     scenes = [Scene(jpeg(number), jpeg(number)) for number in range(40)]
     fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 4, [], {}, 1, 1, rate=2, enrol_rate=8))
     asyncio.run(fleet.fill())
-    assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 80
+    assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 160
     asyncio.run(fleet.work(2.0, exports=False))
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"]
     assert fleet.seen.statuses["enrol one 201"] and fleet.seen.statuses["delete place 204"]
