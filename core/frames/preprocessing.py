@@ -77,3 +77,18 @@ def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
     sampled = np.ascontiguousarray(pixels[::stride, ::stride])
     counted = sampled.reshape(-1, 3) if mask is None else sampled[~mask.covered(*sampled.shape[:2])]
     return float(largest_deviation(counted)) if len(counted) else 0.0
+
+
+def second_look(pixels: Pixels) -> Pixels:
+    """Imitate a second visit: the frame shifted by 8 % of its width, darker and with less contrast.
+
+    Args:
+        pixels: uint8 [H, W, 3].
+
+    Returns:
+        uint8 [H, W, 3].
+    """
+    height, width = pixels.shape[:2]
+    aside = pixels[:, round(0.08 * width) :]
+    darker = cv2.convertScaleAbs(aside, alpha=0.75, beta=6)
+    return np.asarray(cv2.resize(darker, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -15,13 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
-from core.frames.preprocessing import Pixels
 from core.judgement.curves import auc_pr, auc_roc, falling
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
@@ -51,21 +49,6 @@ BLOCKS = 5
 
 MOST_POINTS = 101
 """A reported curve has at most this many points."""
-
-
-def second_look(pixels: Pixels) -> Pixels:
-    """Imitate a second visit: the frame shifted by 8 % of its width, darker and with less contrast.
-
-    Args:
-        pixels: uint8 [H, W, 3].
-
-    Returns:
-        uint8 [H, W, 3].
-    """
-    height, width = pixels.shape[:2]
-    aside = pixels[:, round(0.08 * width) :]
-    darker = cv2.convertScaleAbs(aside, alpha=0.75, beta=6)
-    return np.asarray(cv2.resize(darker, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def fit_encoder_calibration(unknown: Scores, known: Scores, neighbours: int, source: str) -> Calibration:

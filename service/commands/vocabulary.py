@@ -228,7 +228,8 @@ def _calibrate(
     paths: Sequence[Path],
     bar: Progress,
 ) -> Calibration:
-    from core.judgement.calibration import fit_encoder_calibration, second_look
+    from core.frames.preprocessing import second_look
+    from core.judgement.calibration import fit_encoder_calibration
     from core.judgement.verdict import Calibration
     from core.method.encoder import Encoder
 

@@ -2,15 +2,237 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import json
+import re
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from core.places import Camera, check_map_id
-from core.recognition.selection import Selection
+from core.judgement.priors import Box, Constraint, Disc, Facing, Period
+from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
+from core.recognition.selection import TRUST, Conditions, RecentFrames, Selection
+from core.storage.attributes import Scalar
+from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
-from service.http.schemas import EncoderAssertion, Matches
-from service.queries.filters import FilterParameters, parsed_json
+from service.http.schemas import EncoderAssertion, Matches, validated
+from service.places.parameters import PlaceDescription
+
+MOST_NAMES = 100
+"""The most sequences, and the most keys of metadata, that one query may name."""
+
+Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
+KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
+
+_NAMES: TypeAdapter[list[str]] = TypeAdapter(Annotated[list[Sequence], Field(min_length=1, max_length=MOST_NAMES)])
+_DEGREES = re.compile(r"[+-]?\d{1,3}(\.\d+)?")
+
+
+class FilterParameters(PlaceDescription):
+    """What is known of the place: filters on the places that may be found, or soft priors."""
+
+    radius: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="Metres: the place lies within this distance of the given position.",
+        examples=[25.0],
+    )
+    heading_tolerance: float | None = Field(
+        default=None,
+        ge=0,
+        le=180,
+        allow_inf_nan=False,
+        description="Degrees: the heading of the place differs by at most this much from `heading`.",
+    )
+    bbox: str | None = Field(
+        default=None,
+        max_length=200,
+        description="west,south,east,north in degrees; a west greater than east crosses the antimeridian.",
+        examples=["179.9,-17.1,-179.9,-16.9"],
+    )
+    sequences: str | None = Field(
+        default=None,
+        max_length=20_000,
+        description="The place belongs to one of these traverses: names separated by commas, or a JSON array of texts.",
+        examples=["monday,tuesday"],
+    )
+    after: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or later.")
+    before: Timestamp | None = Field(default=None, description="The place was enrolled with this timestamp or earlier.")
+    where: str | None = Field(
+        default=None,
+        max_length=100_000,
+        description="A JSON object: the place's metadata has these values under these keys, at its top level. Numbers "
+        f"are compared as numbers; texts may have at most {LONGEST_INDEXED} characters.",
+        examples=['{"floor": 2, "light": "day"}'],
+    )
+    soft: str | None = Field(
+        default=None,
+        max_length=200,
+        description=f"Which of {', '.join(KINDS)} are not filters but priors, which weigh the places; separated by "
+        "commas.",
+        examples=["position,heading"],
+    )
+    prior_trust: float | None = Field(
+        default=None,
+        ge=0,
+        lt=1,
+        description=f"The probability that the soft parameters are right; {TRUST} if left out. The odds of a place "
+        "that contradicts them are multiplied by at least 1 - prior_trust.",
+    )
+    exclude_frames: int | None = Field(
+        default=None, ge=0, le=10**9, description="Leave out so many of the last places of the frame's own sequence."
+    )
+    exclude_seconds: float | None = Field(
+        default=None,
+        ge=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="Leave out the places of the frame's own sequence that were taken within so many seconds of the "
+        "frame, or that have no timestamp.",
+    )
+
+    def position(self) -> Pose | None:
+        """The position of the frame, without a heading; None if no coordinate is given.
+
+        Raises:
+            InvalidRequest: the position is incomplete, or both metric and geographic.
+        """
+        names = ("x", "y", "z", "latitude", "longitude")
+        given = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return validated(Pose, given) if given else None
+
+    def selection(self) -> Selection | None:
+        """The filters and priors of the query; None if there are none.
+
+        Raises:
+            InvalidRequest: the parameters contradict each other, or one of them is malformed.
+        """
+        geometry = self._geometry()
+        sequences, metadata = self._sequences(), self._metadata()
+        given = {*geometry, *(["sequences"] if sequences else []), *(["where"] if metadata else [])}
+        soft = self._soft(given)
+        made = Selection(
+            _conditions(given - soft, geometry, sequences, metadata),
+            _conditions(soft, geometry, sequences, metadata),
+            TRUST if self.prior_trust is None else self.prior_trust,
+            self._recent(),
+        )
+        return made if made else None
+
+    def _geometry(self) -> dict[Kind, Constraint]:
+        found: dict[Kind, Constraint] = {}
+        if self.radius is not None:
+            centre = self.position()
+            if centre is None:
+                raise InvalidRequest("radius: it needs a position, x and y or latitude and longitude.")
+            found["position"] = Disc(centre, self.radius)
+        if self.heading_tolerance is not None:
+            if self.heading is None:
+                raise InvalidRequest("heading_tolerance: it needs a heading.")
+            found["heading"] = Facing(self.heading, self.heading_tolerance)
+        if self.bbox is not None:
+            found["bbox"] = parse_box(self.bbox)
+        if self.after is not None or self.before is not None:
+            if self.after is not None and self.before is not None and self.after > self.before:
+                raise InvalidRequest("after: the time is later than that of before.")
+            after, before = (None if moment is None else microseconds(moment) for moment in (self.after, self.before))
+            found["time"] = Period(after, before)
+        return found
+
+    def _sequences(self) -> tuple[str, ...] | None:
+        if self.sequences is None:
+            return None
+        names: Any = self.sequences.split(",")
+        if self.sequences.startswith("["):
+            names = parsed_json(self.sequences, "sequences")
+        try:
+            return tuple(_NAMES.validate_python(names, strict=True))
+        except ValidationError as error:
+            raise InvalidRequest(f"sequences: give the names of 1 to {MOST_NAMES} traverses.") from error
+
+    def _metadata(self) -> dict[str, Scalar]:
+        if self.where is None:
+            return {}
+        found = parsed_json(self.where, "where")
+        if not isinstance(found, dict) or not 0 < len(found) <= MOST_NAMES:
+            raise InvalidRequest(f"where: the value is not a JSON object with 1 to {MOST_NAMES} keys.")
+        for key, value in found.items():
+            if isinstance(value, dict | list):
+                raise InvalidRequest(f"where: the value of {key[:80]!r} must be a text, number, true, false or null.")
+            if isinstance(value, str) and len(value) > LONGEST_INDEXED:
+                raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
+        return found
+
+    def _soft(self, given: set[str]) -> set[str]:
+        if self.soft is None:
+            if self.prior_trust is not None:
+                raise InvalidRequest("prior_trust: it needs soft, which names the parameters to which it applies.")
+            return set()
+        names = set(self.soft.split(","))
+        if unknown := sorted(names - set(KINDS)):
+            raise InvalidRequest(f"soft: {unknown[0][:80]!r} is not one of {', '.join(KINDS)}.")
+        if absent := sorted(names - given):
+            raise InvalidRequest(f"soft: the query has no parameter for {absent[0]}.")
+        return names
+
+    def _recent(self) -> RecentFrames | None:
+        if not self.exclude_frames and not self.exclude_seconds:
+            return None
+        if self.sequence is None:
+            raise InvalidRequest("exclude_frames and exclude_seconds need the frame's own sequence.")
+        if self.exclude_seconds and self.timestamp is None:
+            raise InvalidRequest("exclude_seconds: it needs the frame's own timestamp.")
+        moment = None if self.timestamp is None else microseconds(self.timestamp)
+        return RecentFrames(self.sequence, self.exclude_frames or 0, moment, self.exclude_seconds or 0.0)
+
+
+def _conditions(
+    names: set[str],
+    geometry: Mapping[Kind, Constraint],
+    sequences: tuple[str, ...] | None,
+    metadata: Mapping[str, Scalar],
+) -> Conditions:
+    return Conditions(
+        tuple(constraint for name, constraint in geometry.items() if name in names),
+        sequences if "sequences" in names else None,
+        metadata if "where" in names else {},
+    )
+
+
+def parse_box(text: str) -> Box:
+    """The box of a text ``west,south,east,north`` in degrees.
+
+    Raises:
+        InvalidRequest: the text is no such box.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if len(parts) != 4 or not all(_DEGREES.fullmatch(part) for part in parts):
+        raise InvalidRequest("bbox: the value is not four numbers, west,south,east,north.")
+    west, south, east, north = map(float, parts)
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
+        raise InvalidRequest("bbox: west and east must be -180 to 180, and -90 <= south <= north <= 90.")
+    return Box(west, south, east, north)
+
+
+def parsed_json(text: str, what: str) -> Any:
+    """The value of JSON text in a parameter.
+
+    Raises:
+        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair).
+    """
+
+    def refuse(constant: str) -> Any:
+        raise ValueError(constant)
+
+    try:
+        found = json.loads(text, parse_constant=refuse)
+        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
+        return found
+    except (ValueError, RecursionError):
+        raise InvalidRequest(f"{what}: the value is not JSON.") from None
+
 
 MOST_MAPS = 100
 """The most maps that one query may name."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.reference_pipeline import reference_vlad
-from benchmarks.thesis_pipeline import THESIS, literal, ours
+from benchmarks.thesis.reference_pipeline import reference_vlad
+from benchmarks.thesis.thesis_pipeline import THESIS, literal, ours
 from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.method.catalogue import EncoderCatalogue

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.reference_regions import reference_regions
+from benchmarks.thesis.reference_regions import reference_regions
 from core.method.regions import extract_regions
 
 

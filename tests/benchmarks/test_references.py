@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.references import NEIGHBOURS, Material, _kind, _roles
+from benchmarks.maps.references import NEIGHBOURS, Material, _kind, _roles
 
 WORDS, VALUES = 8, 16
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import report
-from benchmarks.regions import main
+from benchmarks.thesis.regions import main
 from core.method.catalogue import EncoderCatalogue
 
 

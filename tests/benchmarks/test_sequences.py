@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.sequences import FILTERS, HALVED, RECALL, SHARE, costs, recalls
+from benchmarks.maps.sequences import FILTERS, HALVED, RECALL, SHARE, costs, recalls
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from tests.service.server import ROOT
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-import core.recognition
 from tests.service.server import ROOT, Server
 
 BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -41,7 +40,6 @@ def name_of(page: Path) -> str:
     return page.relative_to(ROOT).with_suffix("").as_posix()
 
 
-@pytest.mark.skipif(not hasattr(core.recognition, "recognize"), reason="core.recognition has no recognize yet")
 def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
     run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
     (program,) = PYTHON.findall((ROOT / "README.md").read_text())

@@ -31,7 +31,7 @@ from service.errors.faults import Fault
 from service.http.multipart import FormReader
 from service.http.schemas import validated
 from service.places.parameters import EnrolParameters
-from service.queries.filters import FilterParameters, parse_box, parsed_json
+from service.queries.parameters import FilterParameters, parse_box, parsed_json
 from service.telemetry.requests import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 

@@ -51,8 +51,8 @@ def test_a_circle_is_found() -> None:
     assert circles(graph) == [["a", "b", "c"], ["d", "e"]]
 
 
-KNOWN_CROWDS = {"benchmarks", "tests/core/evaluation/report", "tests/core/storage"}
-"""Folders with more modules; a flat list of commands or tests, to be divided when one of them grows."""
+KNOWN_CROWDS = {"tests/core/evaluation/report", "tests/core/storage"}
+"""Folders of tests with more modules, to be divided when one of them grows."""
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:

@@ -7,7 +7,7 @@ compressed  descriptors in six bits per value with a scale per block of 128 valu
 
 Intra-normalised VLADs and unit vectors have values within [-1, 1], most of them near 1 / 128 (D = 16 384), which half
 precision represents with 11 bits.  Searches and comparisons use what is stored, converted back to float32 and int8.
-``python -m benchmarks.precision`` measures the cost of each format.
+``python -m benchmarks.maps.precision`` measures the cost of each format.
 """
 
 from __future__ import annotations

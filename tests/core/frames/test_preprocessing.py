@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from core.frames.masks import Mask
-from core.frames.preprocessing import InputDefinition, contrast, prepare
+from core.frames.preprocessing import InputDefinition, contrast, prepare, second_look
 
 MEAN, SCALE = (104.0, 117.0, 123.0), (0.5, 0.25, 0.017)
 
@@ -55,3 +55,12 @@ def test_what_a_mask_covers_has_no_contrast() -> None:
     frame[:, :32] = pixels(64, 32)
     left = Mask(polygons=(((0.0, 0.0), (0.55, 0.0), (0.55, 1.0), (0.0, 1.0)),))
     assert contrast(frame) > 20 and contrast(frame, left) == 0
+
+
+@pytest.mark.parametrize("shape", [(16, 16, 3), (120, 160, 3)])
+def test_a_second_look_is_another_picture_of_the_same_size(shape: tuple[int, int, int]) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    again = second_look(pixels)
+    assert again.shape == shape
+    assert again.dtype == np.uint8
+    assert again.mean() < pixels.mean()

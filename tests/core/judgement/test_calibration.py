@@ -16,7 +16,6 @@ from core.judgement.calibration import (
     curve_points,
     fit_encoder_calibration,
     fit_map_calibration,
-    second_look,
 )
 from core.judgement.probability import Curve
 from core.judgement.trials import Trials, joined
@@ -225,15 +224,6 @@ def test_frames_that_are_all_alike() -> None:
 def test_too_few_frames() -> None:
     with pytest.raises(ValueError, match="too few"):
         fit_encoder_calibration(np.ones((3, 3), np.float32), np.ones((3, 3), np.float32), 2, "encoder-default")
-
-
-@pytest.mark.parametrize("shape", [(16, 16, 3), (120, 160, 3)])
-def test_a_second_look_is_another_picture_of_the_same_size(shape: tuple[int, int, int]) -> None:
-    pixels = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    again = second_look(pixels)
-    assert again.shape == shape
-    assert again.dtype == np.uint8
-    assert again.mean() < pixels.mean()
 
 
 def test_the_curve_is_sure_of_second_looks_and_not_of_strangers() -> None:

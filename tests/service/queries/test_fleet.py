@@ -51,10 +51,10 @@ def test_a_place_that_is_lost_or_comes_back_is_reported(server: Server, map_id: 
 
 def test_operators_enrol_and_delete_and_the_counts_agree(server: Server, map_id: str) -> None:
     scenes = [Scene(jpeg(number), jpeg(number)) for number in range(40)]
-    fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 4, [], {}, 1, 1, rate=2, enrol_rate=8))
+    fleet = Fleet(Plan(str(server.client.base_url), map_id, scenes * 8, [], {}, 1, 1, rate=2, enrol_rate=8))
     asyncio.run(fleet.fill())
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"] == 160
-    asyncio.run(fleet.work(2.0, exports=False))
+    asyncio.run(fleet.work(3.0, exports=False))
     assert fleet.alive() == server.client.get(f"/v1/maps/{map_id}").json()["places"]
     assert fleet.seen.statuses["enrol one 201"] and fleet.seen.statuses["delete place 204"]
 

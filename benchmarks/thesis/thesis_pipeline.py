@@ -1,6 +1,6 @@
 """Encoding a JPEG against the thesis's pipeline written literally, on this machine: at least 40 times faster.
 
-python -m benchmarks.thesis_pipeline
+python -m benchmarks.thesis.thesis_pipeline
 
 Both give M-Region-VLAD as the thesis has it (N = 300 of conv3 and conv4 each, V = 128), on the packaged network, from
 the bytes of one frame to the vector.  The literal pipeline's time grows with the number of regions, so it is measured
@@ -18,8 +18,8 @@ import torch
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.reference_pipeline import reference_encode
 from benchmarks.report import report, verdict
+from benchmarks.thesis.reference_pipeline import reference_encode
 from core.evaluation.samples import jpeg, sample_frame
 from core.evaluation.timing import medians
 from core.frames.images import decode

@@ -1,6 +1,6 @@
 """The region pass over two layers against the frozen reference: at least 500 times faster.
 
-python -m benchmarks.regions
+python -m benchmarks.thesis.regions
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from benchmarks.reference_regions import reference_regions
 from benchmarks.report import report, verdict
+from benchmarks.thesis.reference_regions import reference_regions
 from core.evaluation.samples import sample_frame
 from core.evaluation.timing import medians
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue

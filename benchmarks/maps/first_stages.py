@@ -1,6 +1,6 @@
 """What a first stage could be: FAISS's compact indexes beside the codes of ``core.index``, on the same descriptors.
 
-    python -m benchmarks.first_stages [--places 20000] [--rounds 20]
+    python -m benchmarks.maps.first_stages [--places 20000] [--rounds 20]
 
 Each answers with its 100 best; how often the exact best is among them, and the median time, taken in turns.  FAISS's
 indexes are given descriptors rotated as ours are, so that the comparison is one of codes and loops alone; PQ
@@ -21,7 +21,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.references import Material, material
+from benchmarks.maps.references import Material, material
 from benchmarks.report import report
 from core.index import CodedQuery, Coder, CodeTable
 from core.index.rotation import rotated

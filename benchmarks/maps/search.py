@@ -1,16 +1,16 @@
 """How long one query takes against a map, and what it finds, by the number of places and the tier.
 
-    python -m benchmarks.search [--places 1000 --places 10000] [--rounds 30] [--queries 1040] [--keep FOLDER]
-    python -m benchmarks.search --million --keep FOLDER    # up to 1M places: a long run, 20 GB of disk
+    python -m benchmarks.maps.search [--places 1000 --places 10000] [--rounds 30] [--queries 1040] [--keep FOLDER]
+    python -m benchmarks.maps.search --million --keep FOLDER    # up to 1M places: a long run, 20 GB of disk
 
 Maps are written through the storage (``core.storage``), of real places and distractors synthesized from real
-descriptors (:mod:`benchmarks.references`), and searched as the service searches them: the first stage, and the exact
-comparison of the shortlist with what the disk holds; the encoder's second stage is not in it.  Flat is FAISS's
+descriptors (:mod:`benchmarks.maps.references`), and searched as the service searches them: the first stage, and the
+exact comparison of the shortlist with what the disk holds; the encoder's second stage is not in it.  Flat is FAISS's
 IndexFlatIP over float32; over more than 20 000 places its time is that of 20 000, scaled linearly.  All are measured
 in turns, so that whatever else the machine does falls on all of them alike; what is shown are medians.
 
 The truth is the best of all references by float32 inner products, computed while they are written; recall@1 is how
-often just that row comes first.  ``python -m benchmarks.search_plots`` draws the figures.
+often just that row comes first.  ``python -m benchmarks.maps.search_plots`` draws the figures.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from benchmarks.references import Material, material
+from benchmarks.maps.references import Material, material
 from benchmarks.report import report, verdict
 from core.errors import UnknownMap
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue

@@ -1,6 +1,6 @@
 """What following a run is worth: recall@1 of single frames, of the filter and of the path search; and what it costs.
 
-    python -m benchmarks.sequences --data ../shared/datasets/eval
+    python -m benchmarks.maps.sequences --data ../shared/datasets/eval
 
 Three pairs of traverses: lip6_outdoor (by its stated truth, and by the truth put right with local features,
 training/ground_truth.py; the bar is half the single frames' errors by the latter), nordland_tiny (within 15 frames; the

@@ -1,6 +1,6 @@
 """What keeping descriptors in fewer bits costs: AUC-PR of both stages, by how a map keeps what it searches.
 
-    python -m benchmarks.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz]
+    python -m benchmarks.maps.precision QUERIES REFERENCES TRUTH.csv [--encoder NAME] [--cache FILE.npz]
 
 Queries are never kept and stay float32; references go through the storage's own packing and back.  ``first`` is
 the first stage alone, ``both`` adds the second to every reference, ``changed`` says for how many queries another

@@ -1,6 +1,6 @@
 """How well the estimated pose says where a frame was taken, against the pose of the best match alone.
 
-    python -m benchmarks.poses ../shared/datasets/eval/corridor
+    python -m benchmarks.maps.poses ../shared/datasets/eval/corridor
 
 The folder has ``query``, ``ref`` and ``ground_truth.csv`` (``query,reference``).  Nobody measured where the frames were
 taken, so reference i stands at i metres, and a query in the middle of its true references.  Counted are the queries

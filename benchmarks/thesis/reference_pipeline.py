@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.reference_regions import reference_regions
+from benchmarks.thesis.reference_regions import reference_regions
 
 
 def reference_vlad(features: NDArray[np.float32], centers: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,9 +1,9 @@
 """Figures for the documents: cost against map size, and how like real places the distractors are.
 
-    python -m benchmarks.search_plots [--output docs/figures]
+    python -m benchmarks.maps.search_plots [--output docs/figures]
 
-``search-cost.png`` shows what ``benchmarks.search`` measured last, with and without ``--million``; the times of the
-second are scaled by the flat search that both runs timed.  ``distractors.png`` is computed: of every
+``search-cost.png`` shows what ``benchmarks.maps.search`` measured last, with and without ``--million``; the times of
+the second are scaled by the flat search that both runs timed.  ``distractors.png`` is computed: of every
 query, the best score among as many distractors as there are photographs of other real places, and among those.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from benchmarks.references import Material, material
+from benchmarks.maps.references import Material, material
 from benchmarks.report import RESULTS
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 

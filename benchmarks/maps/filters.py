@@ -1,6 +1,6 @@
 """What filters cost: queries of a large map that may find 1 % of it, against the same queries unfiltered.
 
-    python -m benchmarks.filters [--places 100000] [--rounds 15] [--keep FOLDER]
+    python -m benchmarks.maps.filters [--places 100000] [--rounds 15] [--keep FOLDER]
 
 The map is written through the storage, of descriptors mixed from those of sample frames, and
 every place has a pose, a heading, a time, a sequence and metadata.  Measured is all that a query takes after its
@@ -21,7 +21,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from benchmarks.opening import built
+from benchmarks.maps.opening import built
 from benchmarks.process import median
 from benchmarks.report import report, verdict
 from core.evaluation.samples import fill_map, sample_descriptors, sample_frame
@@ -31,7 +31,7 @@ from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
 from core.recognition.selection import WHOLE_MAP, Selection
 from core.storage import Atlas, Map
-from service.queries.filters import FilterParameters
+from service.queries.parameters import FilterParameters
 
 MAP = "filtered"
 START = datetime(2026, 1, 1, tzinfo=UTC)

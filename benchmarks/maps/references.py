@@ -4,7 +4,7 @@ Photographs of the data sets are encoded once by the default encoder and kept.  
 like places, A and one of the ten that score highest against A among those of A's kind (its folder): each word's part
 is A's with probability 1/2, else B's; 0.8 of it with 0.6 of the other one's, scaled back to unit length; empty where
 the first one's is.  These two numbers were chosen so that the best score of a real query among n distractors is
-distributed as among n photographs of other real places (``python -m benchmarks.search_plots`` draws both).
+distributed as among n photographs of other real places (``python -m benchmarks.maps.search_plots`` draws both).
 
 *Queries* are second looks that nothing here was made from: the second walks of corridor and lip6, every other frame of
 five webcams and of floors of the tower, fixed cameras by night.  Their places, the first looks, come first among the

@@ -1,6 +1,6 @@
 """A large map: time to its first query after a start, time of a search, memory and disk a place.
 
-    python -m benchmarks.opening [--places 100000] [--precision half] [--keep FOLDER]
+    python -m benchmarks.maps.opening [--places 100000] [--precision half] [--keep FOLDER]
 
 The map is written through the storage, of descriptors mixed from those of sample frames, and
 what it is searched by is built as the service would.  Then a service is started on it and asked once, from a cold
@@ -117,7 +117,7 @@ def main(
         figures = made(folder, places, "compressed" if precision == "compressed" else "half")
         forget_cached(folder)
         figures["first"] = first_query(folder)
-        command = [sys.executable, "-m", "benchmarks.opening", "--search-only", "--keep", str(folder)]
+        command = [sys.executable, "-m", "benchmarks.maps.opening", "--search-only", "--keep", str(folder)]
         child = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
         figures["search"] = search = json.loads(child.stdout)
     recall, disk = figures["index"]["recall"], figures["storage"]["bytes_per_place"]

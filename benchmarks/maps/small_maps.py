@@ -1,6 +1,6 @@
 """What the search of a small map costs, every place compared: FAISS's indexes beside ``core.index.exact``.
 
-    python -m benchmarks.small_maps [--places 1622] [--rounds 25]
+    python -m benchmarks.maps.small_maps [--places 1622] [--rounds 25]
 
 One thread, of which wall time and processor time are the same; taken in turns, medians.  Descriptors are random, for
 what is in them costs no time.  *Search* is all that a map does with queries that come together, products and rankings,

@@ -1,0 +1,1 @@
+"""Searches of maps: by size, precision, filters, and along sequences."""

@@ -1,0 +1,1 @@
+"""The thesis's pipeline written literally, to compare with."""
