@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from benchmarks.maps.references import Material, material
 from benchmarks.report import report
 from core.index import CodedQuery, Coder, CodeTable
+from core.index.best_estimates import best_first
 from core.index.rotation import rotated
-from core.index.selection import best_first
 from core.kernels.codes import GROUP_BITS, estimates_of
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import cores, share_cores

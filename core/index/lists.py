@@ -18,8 +18,8 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
+from core.index.best_estimates import best_positions, together
 from core.index.codes import Bits, CodedQuery
-from core.index.selection import best_positions, together
 from core.index.table import CodeTable
 from core.kernels.codes import GROUP_BITS, estimates_of
 

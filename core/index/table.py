@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from core.index.best_estimates import best_first, best_positions, together
 from core.index.codes import CodedQuery, Coder, Codes, PlaneQuery
-from core.index.selection import best_first, best_positions, together
 from core.kernels.codes import estimates_at, estimates_of
 
 Array = NDArray[np.float32]

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from core.evaluation.report.drawing import Plot
-from core.evaluation.report.fates import plot_fates
 from core.evaluation.report.gallery import gallery
 from core.evaluation.report.matrix import Layers, describe_matrix, heat_file, layers, matrix_file, png, true_cells
 from core.evaluation.report.table import swatch
 from core.evaluation.report.text import counted, escape, number
 from core.evaluation.report.theme import Mark
+from core.evaluation.report.threshold_effects import plot_fates
 from core.evaluation.report.thumbnails import Thumbnails, data_uri
 
 if TYPE_CHECKING:

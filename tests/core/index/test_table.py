@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from core.index import CodedQuery, Coder, CodeTable, table
-from core.index.selection import best_first, best_positions, together
+from core.index.best_estimates import best_first, best_positions, together
 from core.kernels.codes import estimates_of
 from tests.core.index.made_up import Array, descriptors, second_looks, table_of
 

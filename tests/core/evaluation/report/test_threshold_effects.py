@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from core.evaluation.protocol.thresholds import Counts, thresholdings
-from core.evaluation.report.fates import fate, fate_before, plot_fates, scores_by_fate
+from core.evaluation.report.threshold_effects import fate, fate_before, plot_fates, scores_by_fate
 from tests.core.evaluation.report.comparisons import outcome
 
 OUTCOMES = [
