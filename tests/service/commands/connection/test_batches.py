@@ -126,7 +126,7 @@ def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, t
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("moment", [13, 30])
+@pytest.mark.parametrize("moment", [9, 20])
 def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
     monkeypatch.setattr(batches, "PATIENCE", 0.0)
     server = Server(tmp_path / "service").wait()
@@ -135,7 +135,7 @@ def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     def send() -> None:
         try:
-            enrol(server, "walk", tmp_path, 160, way)
+            enrol(server, "walk", tmp_path, 96, way)
         except Failure as error:
             ended.append(error)
 
@@ -147,7 +147,7 @@ def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(ended) == 1
     server = Server(tmp_path / "service").wait()
     kept = list(server.places("walk"))
-    assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 160
-    enrol(server, "walk", tmp_path, 160, Mischief({}))
-    assert list(server.places("walk")) == [f"p{index}" for index in range(160)]
+    assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 96
+    enrol(server, "walk", tmp_path, 96, Mischief({}))
+    assert list(server.places("walk")) == [f"p{index}" for index in range(96)]
     assert server.stop() == 0
