@@ -190,6 +190,13 @@ class Whereabouts:
     def __len__(self) -> int:
         return len(self.kind)
 
+    @classmethod
+    def along_sequence(cls, ordinals: ArrayLike) -> Whereabouts:
+        """Places of one sequence without poses, by their order in it, int64 [n]."""
+        order = np.asarray(ordinals, np.int64)
+        count = len(order)
+        return cls(np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), np.zeros(count, np.int32), order)
+
     def take(self, rows: ArrayLike) -> Whereabouts:
         """The places ``rows`` (integers or a mask) in that order."""
         chosen = np.asarray(rows)

@@ -53,8 +53,7 @@ def half_trials(encoder: Encoder, queries: Encodings, references: Encodings, tru
     for number, local in enumerate(queries.local):
         for half in (slice(0, middle), slice(middle, end)):
             order = half.start + np.argsort(-scores[number, half], kind="stable")
-            none = np.zeros(len(order), np.int64)
-            places = Whereabouts(none.astype(np.int8), np.zeros((len(order), 3)), none.astype(np.int32), order)
+            places = Whereabouts.along_sequence(order)
             gains = partial(_gains, encoder, local, references.local[order])
             seen = examine(scores[number, order], places, NEIGHBORHOOD, encoder.candidates, gains)
             judgement = judge(seen.scores, places.take(seen.order), encoder.calibration, NEIGHBORHOOD, seen.examined)

@@ -58,10 +58,7 @@ def judged_trials(scores: Array, truth: NDArray[np.bool_], calibration: Calibrat
         examined: candidates of the encoder's second stage; 0 without one.
     """
     made = []
-    places = scores.shape[1]
-    frames = Whereabouts(
-        np.zeros(places, np.int8), np.zeros((places, 3)), np.zeros(places, np.int32), np.arange(places, dtype=np.int64)
-    )
+    frames = Whereabouts.along_sequence(np.arange(scores.shape[1]))
     for number, (query, true) in enumerate(zip(scores, truth, strict=True)):
         order = np.argsort(-query, kind="stable")
         judgement = judge(query[order], frames.take(order), calibration, NEIGHBORHOOD, examined)

@@ -26,7 +26,7 @@ from core.evaluation.timing import medians
 from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from core.places import METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import METRIC, Neighborhood, Whereabouts
 from core.recognition.stages import examine
 from core.storage import MapSettings
 from training.ground_truth import corrected_truth
@@ -47,13 +47,6 @@ TRAVERSES = {
 }
 FILTERS = {"bayes": RunOptions(), "path": RunOptions(filter="path")}
 HALVED, RECALL, SHARE = 0.5, 0.9, 0.2
-
-
-def walked(count: int) -> Whereabouts:
-    """One sequence without poses."""
-    return Whereabouts(
-        np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), np.zeros(count, np.int32), np.arange(count)
-    )
 
 
 def evidences(
@@ -103,7 +96,7 @@ def recalls(encoder: Encoder, name: str, data: Path, frames: int | None = None) 
     """
     folder = data / name
     asked, known = ([read(path) for path in find_photographs(folder / part)][:frames] for part in TRAVERSES[name])
-    where = walked(len(known))
+    where = Whereabouts.along_sequence(np.arange(len(known)))
     graph = place_graph(where, np.arange(len(known)), len(known), SAME_PLACE)
     told = list(evidences(encoder, describe(encoder, asked), describe(encoder, known), where))
     answers = {"single": [best for best, _ in told]}

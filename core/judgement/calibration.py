@@ -107,9 +107,7 @@ def _judged(
 ) -> Judgement:
     """The judgement of one query against a map of the frames ``places``."""
     order = places[np.argsort(-scores[places], kind="stable")]
-    zeros = np.zeros(len(order), np.int64)
-    frames = Whereabouts(zeros.astype(np.int8), np.zeros((len(order), 3)), zeros.astype(np.int32), order)
-    return judge(scores[order], frames, calibration, neighborhood)
+    return judge(scores[order], Whereabouts.along_sequence(order), calibration, neighborhood)
 
 
 def _just_above(decision: float) -> float:

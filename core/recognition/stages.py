@@ -252,9 +252,7 @@ def score_matrix(encoder: Encoder, inner_products: Array, queries: Cells, refere
     scores = encoder.scores_from_inner_products(inner_products)
     if not encoder.candidates:
         return scores
-    count = len(references)
-    zeros = np.zeros(count, np.int64)
-    places = Whereabouts(zeros.astype(np.int8), np.zeros((count, 3)), zeros.astype(np.int32), np.arange(count))
+    places = Whereabouts.along_sequence(np.arange(len(references)))
     settings = MapSettings()
     neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
     for row, query in zip(scores, queries, strict=True):
