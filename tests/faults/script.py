@@ -112,7 +112,7 @@ def _create(map_id: str, unlisted: bool = False) -> Callable[[World], object]:
 
 def _wait_for_codes(world: World) -> None:
     lab = world.map("lab")
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while lab.index_status().state != "ready" and time.monotonic() < until:
         time.sleep(0.002)
 

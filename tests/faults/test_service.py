@@ -112,7 +112,7 @@ def check_recovered(server: Server) -> None:
 
 def wait_for_readiness(server: Server, status: int) -> httpx.Response:
     """The answer of the probe, which looks at the disk once a second."""
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while (response := server.client.get("/readyz")).status_code != status and time.monotonic() < until:
         time.sleep(0.1)
     assert response.status_code == status, response.text

@@ -61,7 +61,7 @@ def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
 
 
 def end_of(runtime: Runtime, job: Job) -> Job:
-    until = time.monotonic() + 30
+    until = time.monotonic() + 60
     while not (found := runtime.jobs.get(job.id)).ended:
         assert time.monotonic() < until, found
         time.sleep(0.01)

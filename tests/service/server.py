@@ -10,14 +10,15 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 
 ROOT = Path(__file__).parents[2]
 START_SECONDS = 120.0
+T = TypeVar("T")
 
 
 def free_port() -> int:
@@ -96,7 +97,7 @@ class Server:
 
     def logged_request(self, request_id: str) -> dict[str, Any]:
         """The line of a request, which is written when its answer is on its way."""
-        until = time.monotonic() + 10
+        until = time.monotonic() + 60
         while not (lines := self.lines(message="request", request_id=request_id)) and time.monotonic() < until:
             time.sleep(0.02)
         (line,) = lines
@@ -146,6 +147,14 @@ def typed(data: bytes) -> dict[str, str]:
     if data.startswith(b"\x89PNG"):
         return {"Content-Type": "image/png"}
     return {"Content-Type": "image/webp" if data[8:12] == b"WEBP" else "image/jpeg"}
+
+
+def settled(condition: Callable[[], T]) -> T:
+    """What ``condition`` gives once that is true, or after a minute; the machine may be busy with something else."""
+    until = time.monotonic() + 60
+    while not (found := condition()) and time.monotonic() < until:
+        time.sleep(0.05)
+    return found
 
 
 def assert_problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def test_version(client: httpx.Client) -> None:
 
 def test_a_process_lives_before_it_is_ready_and_says_what_is_missing(tmp_path: Path) -> None:
     server = Server(tmp_path, {"encoder": "absent"}).wait("/livez")
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while "loading" in (response := server.client.get("/readyz")).text and time.monotonic() < until:
         time.sleep(0.1)
     problem = assert_problem(response, 503, "not-ready")

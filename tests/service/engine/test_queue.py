@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from statistics import median
 
 import pytest
 
@@ -51,7 +52,7 @@ def busy(queue: EncoderQueue) -> Iterator[threading.Event]:
         done.wait(30)
 
     queue._batches.call(work)
-    assert begun.wait(5)
+    assert begun.wait(30)
     yield done
     done.set()
 
@@ -173,20 +174,35 @@ def test_an_overloaded_server_says_when_to_come_back(tight_server: Server) -> No
 
 
 def test_a_busy_server_is_alive_and_keeps_deadlines(server: Server) -> None:
-    slow = encoded(scene(1, 3000, 3000))
-    with ThreadPoolExecutor(4) as pool:
-        heavy = [pool.submit(server.client.post, "/v1/encode", content=slow, headers=HEADERS) for _ in range(4)]
-        slowest, late = 0.0, []
-        while not all(job.done() for job in heavy):
+    large, enough = encoded(scene(1, 3000, 3000)), threading.Event()
+    durations: list[float] = []
+
+    def encode_large_frames() -> None:
+        while not enough.is_set():
             start = time.monotonic()
-            assert server.client.get("/livez").status_code == 200
-            slowest = max(slowest, time.monotonic() - start)
-            hurried = {**HEADERS, "X-Request-Timeout": "0.02"}
-            late.append(server.client.post("/v1/encode", content=jpeg(1), headers=hurried))
-        assert all(job.result().status_code == 200 for job in heavy)
-    assert slowest < 1
-    refused = [answer for answer in late if answer.status_code == 503]
-    assert refused, "a frame that would have waited for a large one was dropped"
+            assert server.client.post("/v1/encode", content=large, headers=HEADERS).status_code == 200
+            durations.append(time.monotonic() - start)
+
+    alive, refused = [], []
+    with ThreadPoolExecutor(4) as pool:
+        callers = [pool.submit(encode_large_frames) for _ in range(4)]
+        try:
+            # Until both were seen often enough: a processor that is fast or busy takes more turns to the same result.
+            began = time.monotonic()
+            while (len(refused) < 3 or len(durations) < 8) and time.monotonic() - began < 60:
+                start = time.monotonic()
+                assert server.client.get("/livez").status_code == 200
+                alive.append(time.monotonic() - start)
+                hurried = {**HEADERS, "X-Request-Timeout": "0.001"}
+                answer = server.client.post("/v1/encode", content=jpeg(1), headers=hurried)
+                if answer.status_code == 503:
+                    refused.append(answer)
+        finally:
+            enough.set()
+        for caller in callers:
+            caller.result()
+    assert len(refused) >= 3, "a frame that would have waited for a large one was dropped"
+    assert median(alive) < median(durations), "being asked for a sign of life does not wait for the encoder"
     for answer in refused:
         assert_problem(answer, 503, "deadline-exceeded")
         assert 1 <= int(answer.headers["retry-after"]) <= 3

@@ -14,7 +14,7 @@ import pytest
 from service.errors.faults import InvalidRequest, MalformedBody
 from service.http.bodies import json_size, parse_json
 from tests.service.scenes import encoded, jpeg, scene
-from tests.service.server import Server, assert_problem
+from tests.service.server import Server, assert_problem, settled
 
 JPEG = {"Content-Type": "image/jpeg"}
 
@@ -76,10 +76,9 @@ def test_a_body_without_a_length_is_cut_at_the_limit(tight_server: Server) -> No
         while True:
             yield b"1000\r\n" + b"x" * 4096 + b"\r\n"
 
-    start = time.monotonic()
     answer, sent = exchange(tight_server, head("/v1/encode", "Transfer-Encoding: chunked"), chunks())
     assert answer.startswith(b"HTTP/1.1 413") and b"problem:body-too-large" in answer
-    assert sent < 20_000_000 and time.monotonic() - start < 5
+    assert sent < 20_000_000
 
 
 def test_limits_hold_to_the_byte(tight_server: Server, tight_map: str) -> None:
@@ -107,7 +106,7 @@ def test_a_body_that_trickles_is_not_waited_for(tight_server: Server) -> None:
     start = time.monotonic()
     answer, _ = exchange(tight_server, head("/v1/encode", "Content-Length: 500", "X-Request-Timeout: 0.5"))
     assert answer.startswith(b"HTTP/1.1 503") and b"deadline-exceeded" in answer
-    assert 0.4 < time.monotonic() - start < 4
+    assert 0.4 < time.monotonic() - start < 20, "half a second was asked for; without that it would be thirty"
 
 
 def test_uploads_share_a_bounded_memory(tight_server: Server, tight_map: str) -> None:
@@ -117,16 +116,20 @@ def test_uploads_share_a_bounded_memory(tight_server: Server, tight_map: str) ->
             connection = socket.create_connection(("127.0.0.1", tight_server.port))
             connection.sendall(head("/v1/encode", "Content-Length: 55001") + b"x" * 55_000)
             connections.append(connection)
-        time.sleep(0.3)
         picture = encoded(scene(1), quality=60)
-        response = tight_server.client.post("/v1/encode", content=picture, headers=JPEG)
+
+        def answered(status: int) -> httpx.Response | None:
+            response = tight_server.client.post("/v1/encode", content=picture, headers=JPEG)
+            return response if response.status_code == status else None
+
+        response = settled(lambda: answered(503))  # once the service has read what the others sent
+        assert response is not None
         assert_problem(response, 503, "memory-full")
         assert 1 <= int(response.headers["retry-after"]) <= 3
     finally:
         for connection in connections:
             connection.close()
-    time.sleep(0.3)
-    assert tight_server.client.post("/v1/encode", content=picture, headers=JPEG).status_code == 200, "given back"
+    assert settled(lambda: answered(200)), "given back"
 
 
 def test_a_caller_that_hangs_up_harms_nobody(server: Server) -> None:

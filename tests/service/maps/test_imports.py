@@ -47,7 +47,7 @@ class Gate:
 
     def __call__(self, *arguments: Any) -> Any:
         self.reached.set()
-        assert self.opened.wait(10)
+        assert self.opened.wait(60)
         return self._function(*arguments)
 
     async def cancelled_there(self, task: asyncio.Task[Any]) -> None:

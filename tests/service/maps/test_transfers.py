@@ -247,7 +247,7 @@ def test_an_import_is_refused_before_the_rest_is_sent(
 
 def _settled(server: Server) -> list[str]:
     """What is left after a while."""
-    until = time.monotonic() + 10
+    until = time.monotonic() + 60
     while (left := staged(server)) and time.monotonic() < until:
         time.sleep(0.02)
     return left

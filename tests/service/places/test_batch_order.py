@@ -44,11 +44,11 @@ async def test_a_batch_waits_for_the_stage_of_the_batch_before() -> None:
             elsewhere.report(Stage.ENCODED)
             await begun(encoding)
             first.report(Stage.ENCODED)
-            await asyncio.wait_for(encoding, 5)
+            await asyncio.wait_for(encoding, 30)
             await begun(storing)
-        await asyncio.wait_for(storing, 5)
+        await asyncio.wait_for(storing, 30)
     with line.enter("lab", None, "b", deadline()) as third:
-        await asyncio.wait_for(third.wait_for(Stage.STORED), 5)
+        await asyncio.wait_for(third.wait_for(Stage.STORED), 30)
 
 
 @pytest.mark.anyio
@@ -61,11 +61,11 @@ async def test_a_failed_batch_is_not_stored_and_may_be_sent_again() -> None:
     await begun(storing)
     with line.enter("lab", "a", None, deadline()):
         await begun(storing)
-    await asyncio.wait_for(storing, 5)
+    await asyncio.wait_for(storing, 30)
     # What was stored stays so, whatever becomes of a request that says the same again.
     with pytest.raises(ValueError), line.enter("lab", "a", None, deadline()):
         raise ValueError
-    await asyncio.wait_for(second.wait_for(Stage.STORED), 5)
+    await asyncio.wait_for(second.wait_for(Stage.STORED), 30)
 
 
 @pytest.mark.anyio
@@ -79,10 +79,10 @@ async def test_no_batch_waits_forever(monkeypatch: pytest.MonkeyPatch) -> None:
         await begun(storing)
         gone.set()
         with pytest.raises(ClientGone):
-            await asyncio.wait_for(storing, 5)
+            await asyncio.wait_for(storing, 30)
     monkeypatch.setattr(batch_order, "GRACE", 0.05)
     with pytest.raises(BatchOutOfOrder):
-        await asyncio.wait_for(BatchTurn(line, "lab", None, "never", deadline()).wait_for(Stage.ENCODED), 5)
+        await asyncio.wait_for(BatchTurn(line, "lab", None, "never", deadline()).wait_for(Stage.ENCODED), 30)
 
 
 @pytest.mark.anyio

@@ -117,7 +117,7 @@ async def test_a_cancelled_task_writes_into_no_other_file(tmp_path: Path, monkey
 
     def late(*arguments: Any) -> None:
         reached.set()
-        assert opened.wait(10)
+        assert opened.wait(60)
         write_at(*arguments)
 
     monkeypatch.setattr(module, "write_at", late)

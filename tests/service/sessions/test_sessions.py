@@ -278,9 +278,9 @@ def test_a_session_ends_with_its_map(server: Server, map_id: str) -> None:
 
 @pytest.fixture
 def small(tmp_path: Path) -> Iterator[Server]:
-    """A service that keeps two sessions, for two seconds."""
+    """A service that keeps two sessions, for four seconds."""
     install_coarse_encoder(tmp_path / "models")
-    settings = {"max_sessions": 2, "session_expiry": 2, "max_session_memory": 1 << 20, "encoder": COARSE}
+    settings = {"max_sessions": 2, "session_expiry": 4, "max_session_memory": 1 << 20, "encoder": COARSE}
     running = Server(tmp_path, settings=settings).wait()
     running.create_map("lab")
     yield running
@@ -307,7 +307,7 @@ def test_sessions_expire_and_are_bounded(small: Server) -> None:
     refused = small.client.post("/v1/maps/lab/sessions", json={})
     assert_problem(refused, 429, "too-many-sessions")
     assert float(refused.headers["retry-after"]) > 0
-    until = time.monotonic() + 2.5
+    until = time.monotonic() + 4.5
     while time.monotonic() < until:
         send(small, "lab", first, jpeg(1))
         time.sleep(0.2)

@@ -185,7 +185,7 @@ def test_the_old_map_is_deleted_meanwhile(server: Server) -> None:
 
 
 def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(folder: Path) -> None:
-    server = Server(folder).wait()
+    server = Server(folder, {"shutdown_timeout": 120}).wait()
     enrol_many(server, "lab", 64)
     job = start(server, "lab", "lab-2")
     reaching(server, job, 1)
@@ -196,7 +196,7 @@ def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(fol
             began = time.monotonic()
             assert server.stop() == 0
             list(stream)
-        assert time.monotonic() - began < 9
+        assert time.monotonic() - began < 90, "requests under way would have had two minutes"
     server = Server(folder).wait()
     assert finished(server, job)["state"] == "succeeded"
     assert server.stop() == 0

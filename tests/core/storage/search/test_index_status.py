@@ -13,7 +13,7 @@ from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 
 def wait_for(is_so: Callable[[], bool]) -> None:
-    until = time.monotonic() + 30
+    until = time.monotonic() + 60
     while not is_so():
         assert time.monotonic() < until
         time.sleep(0.005)
