@@ -149,11 +149,11 @@ def typed(data: bytes) -> dict[str, str]:
     return {"Content-Type": "image/webp" if data[8:12] == b"WEBP" else "image/jpeg"}
 
 
-def settled(condition: Callable[[], T]) -> T:
+def settled(condition: Callable[[], T], every: float = 0.05) -> T:
     """What ``condition`` gives once that is true, or after a minute; the machine may be busy with something else."""
     until = time.monotonic() + 60
     while not (found := condition()) and time.monotonic() < until:
-        time.sleep(0.05)
+        time.sleep(every)
     return found
 
 
