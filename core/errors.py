@@ -147,6 +147,10 @@ class DataDirectoryTooNew(PlacerecError):
     """The data was written by a later version of placerec."""
 
 
+class DataDirectoryTooOld(PlacerecError):
+    """The data was written before the first release of placerec, in a form that is not read."""
+
+
 # Maps as files
 
 

@@ -27,7 +27,7 @@ from benchmarks.process import ROOT, median, memory, service
 from benchmarks.report import report, verdict
 from core.evaluation.samples import fill_map, jpeg, sample_frame
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
-from core.storage import Atlas, Map, NewPrecision
+from core.storage import Atlas, Map, Precision
 
 MAP = "large"
 FIRST_SECONDS = 10.0
@@ -45,7 +45,7 @@ def built(map_: Map) -> float:
     return time.monotonic() - began
 
 
-def made(folder: Path, places: int, precision: NewPrecision) -> dict[str, Any]:
+def made(folder: Path, places: int, precision: Precision) -> dict[str, Any]:
     """Make the map, unless it is there; how long that took, and what the API shows of it."""
     began = time.monotonic()
     if not (folder / "maps" / MAP).is_dir():

@@ -10,7 +10,7 @@ reference is the best, and ``deviation`` by how much a first-stage score differs
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import typer
@@ -46,9 +46,11 @@ def sides(encoder: Encoder, queries: Path, references: Path, cache: Path | None)
     return asked, known
 
 
-def at_rest(side: Side, precision: Precision) -> tuple[Side, int]:
-    """What comes back of a side that was kept, and bytes a place."""
+def at_rest(side: Side, precision: Precision | Literal["float32"]) -> tuple[Side, int]:
+    """What comes back of a side that was kept, or the side itself for float32, and bytes a place."""
     descriptors, local = side
+    if precision == "float32":
+        return side, descriptors[0].nbytes + local[0].nbytes
     kept, kept_local = pack_descriptors(descriptors, precision), pack_local(local, precision)
     back = (
         unpack_descriptors(kept, precision, descriptors.shape[1]),
@@ -70,7 +72,7 @@ def main(
     truth = read_ground_truth(truth_file, len(asked[0]), len(known[0]))
     figures: dict[str, dict[str, float]] = {}
     exact_first = exact_best = None
-    for precision in get_args(Precision):
+    for precision in ("float32", *get_args(Precision)):
         back, size = at_rest(known, precision)
         products = asked[0] @ back[0].T
         first = chosen.scores_from_inner_products(products)

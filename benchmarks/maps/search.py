@@ -38,7 +38,7 @@ from core.errors import UnknownMap
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, Map, MapSettings, NewPrecision
+from core.storage import Atlas, Enrolment, Map, MapSettings, Precision
 from core.storage.files.segment_files import Layout
 from core.storage.search.snapshot import Snapshot
 from core.threads import cores, share_cores
@@ -84,7 +84,7 @@ class Best:
         return Best(np.where(better, products, self.products), np.where(better, offsets + first, self.rows))
 
 
-def write_map(folder: Path, encoder: Encoder, of: Material, places: int, precision: NewPrecision) -> None:
+def write_map(folder: Path, encoder: Encoder, of: Material, places: int, precision: Precision) -> None:
     """A map of the first references, and the truth beside it, unless both are there; goes on where it broke off."""
     done = folder / f"truth-{places}.npz"
     best, first = Best(np.full(len(of.queries), -np.inf, np.float32), np.zeros(len(of.queries), np.int64)), 0
@@ -167,7 +167,7 @@ def recall(snapshot: Snapshot, queries: Array, truth: NDArray[np.int64]) -> floa
     return float(np.mean(np.array(found) == truth))
 
 
-def disk_bytes(map_: Map, encoder: Encoder, precision: NewPrecision, rows_per_segment: int) -> int:
+def disk_bytes(map_: Map, encoder: Encoder, precision: Precision, rows_per_segment: int) -> int:
     """Of a place, with the second stage's cells, which the map measured is spared."""
     layouts = [
         Layout(encoder.dimension, encoder.identity, rows_per_segment, shape, precision).record.itemsize
@@ -177,7 +177,7 @@ def disk_bytes(map_: Map, encoder: Encoder, precision: NewPrecision, rows_per_se
 
 
 def run(
-    folder: Path, encoder: Encoder, of: Material, sizes: Sequence[int], precision: NewPrecision, rounds: int
+    folder: Path, encoder: Encoder, of: Material, sizes: Sequence[int], precision: Precision, rounds: int
 ) -> list[dict[str, Any]]:
     """The figures of every size and tier."""
     contenders: list[Contender] = []
@@ -271,7 +271,7 @@ def main(
     asked = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
     of = replace(of, queries=of.queries[asked], walks=of.walks[asked])
     sizes = [100_000, MILLION] if million else places or [1000, 10_000, 100_000]
-    precision: NewPrecision = "compressed" if million else "half"
+    precision: Precision = "compressed" if million else "half"
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         folder.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import FEWEST_PLACES, TOP_PLACES, Calibration, filled_up
+from core.judgement.verdict import TOP_PLACES, Calibration, filled_up
 from core.places import Neighborhood, Whereabouts
 
 LISTED = 100
@@ -84,29 +84,25 @@ def evidence(
     listed = np.flatnonzero(examined) if examined is not None and second_stage else np.arange(min(len(rows), LISTED))
     values = scores[listed].astype(np.float64)
     rest = values[~whereabouts.take(listed).near(0, neighborhood)]
-    ordinary, believable = believable_score(rest, calibration, second_stage)
+    ordinary, believable = believable_score(rest, calibration)
     shares = (values - ordinary) / (believable - ordinary)
     gains = np.minimum(STRENGTH * shares + CLEARNESS * np.maximum(shares - 1, 0), STRONGEST).astype(np.float32)
     gaining = gains > 0
     return Evidence(rows[listed][gaining], gains[gaining], STRENGTH * UNKNOWN)
 
 
-def believable_score(rest: NDArray[np.float64], calibration: Calibration, second_stage: bool) -> tuple[float, float]:
+def believable_score(rest: NDArray[np.float64], calibration: Calibration) -> tuple[float, float]:
     """The mean score of the rest, and the least score at which a best match would be accepted beside that rest.
 
     The second solves the verdict's rule threshold² = s · (s - top) for s, where top is the mean of the best few of the
-    rest; in older calibrations without a second stage the rule is threshold = (s - top) / spread.
+    rest.
 
     Args:
         rest: float64 [n], best first: scores of listed places other than the best match's.
     """
-    leads = second_stage or calibration.decision == "leading"
-    scores = filled_up(rest.astype(np.float32), TOP_PLACES if leads else FEWEST_PLACES, calibration)
+    scores = filled_up(rest.astype(np.float32), calibration)
     ordinary, top = float(scores.mean()), float(scores[:TOP_PLACES].mean())
     spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
-    if leads:
-        positive = max(top, 0.0)
-        believable = (positive + np.sqrt(positive**2 + 4 * max(calibration.threshold, 0.0) ** 2)) / 2
-    else:
-        believable = top + calibration.threshold * spread
+    positive = max(top, 0.0)
+    believable = (positive + np.sqrt(positive**2 + 4 * max(calibration.threshold, 0.0) ** 2)) / 2
     return ordinary, float(max(believable, ordinary + 0.5 * spread))

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from core.kernels.belief import same_place
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
@@ -198,6 +197,8 @@ def _edges(
     where: Whereabouts, first: NDArray[np.int32], last: NDArray[np.int32], reach: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """The edges: each place is joined to itself, then to those beside it in its sequence and to the nearest."""
+    from scipy.spatial import cKDTree  # here, because it takes long to import
+
     n = len(where)
     none = np.empty(0, np.int64)
     pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []

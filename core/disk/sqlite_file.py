@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal
 
 from core.disk.files import Damage
+from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 
 log = logging.getLogger(__name__)
 
@@ -31,12 +32,18 @@ class NotOurs(Damage):
     """The file is a database, but of another program or of another kind."""
 
 
-class TooNew(Exception):
-    """A later version of placerec wrote the file."""
+class UnreadVersion(Exception):
+    """The tables of the file have a version that is not read: a later one, or one from before the first release."""
 
-    def __init__(self, version: int) -> None:
-        super().__init__(f"the file is of schema {version}")
-        self.version = version
+    def __init__(self, version: int, newest: int) -> None:
+        writer = "by a later version of placerec" if version > newest else "before the first release of placerec"
+        super().__init__(f"was written {writer} (schema {version}, this one knows {newest})")
+        self.version, self.newest = version, newest
+
+    def refusal(self, file: str) -> DataDirectoryTooNew | DataDirectoryTooOld:
+        """The error that users see, about the ``file`` of this name."""
+        kind = DataDirectoryTooNew if self.version > self.newest else DataDirectoryTooOld
+        return kind(f"{file} {self}.")
 
 
 def connect(
@@ -83,7 +90,7 @@ class Schema:
     application_id: names the kind of file; 0 for kinds that have none.
     version: of the newest tables.
     create: statements that make the newest tables in an empty file.
-    migrations: by a version, the statements that lead from it to the next one.
+    migrations: by a version, the statements that lead from it to the next one, from the oldest that is read on.
     """
 
     application_id: int
@@ -102,7 +109,7 @@ class Schema:
 
         Raises:
             NotOurs: the file is of another kind, or empty without ``create``.
-            TooNew: a later version of placerec wrote it.
+            UnreadVersion: its tables are of a later version, or of one that is too old.
             sqlite3.Error: a statement failed; the file is as it was.
         """
         (version,) = connection.execute("PRAGMA user_version").fetchone()
@@ -112,8 +119,8 @@ class Schema:
             statements = list(self.create)
         elif version < 1 or owner != self.application_id:
             raise NotOurs("it is a database, but not one of placerec's")
-        elif version > self.version:
-            raise TooNew(version)
+        elif not min(self.migrations, default=self.version) <= version <= self.version:
+            raise UnreadVersion(version, self.version)
         else:
             statements = [one for older in range(version, self.version) for one in self.migrations[older]]
         if version < self.version:
@@ -149,7 +156,7 @@ class SqliteFile:
 
         Raises:
             Damage: the file is damaged, or NotOurs.
-            TooNew: a later version of placerec wrote it.
+            UnreadVersion: its tables are of a later version, or of one that is too old.
             OSError, sqlite3.OperationalError: the disk refuses.
         """
         try:
@@ -190,14 +197,14 @@ class SqliteFile:
         return aside
 
     def open_or_replace(self) -> sqlite3.Connection:
-        """A connection to the file; a damaged, foreign or too new one is put aside first and made anew.
+        """A connection to the file; a damaged one, or one that is not read, is put aside first and made anew.
 
         Raises:
             OSError, sqlite3.OperationalError: the disk refuses.
         """
         try:
             return self.open()
-        except (Damage, TooNew) as error:
+        except (Damage, UnreadVersion) as error:
             self.put_aside(error)
             return self.open()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from core.frames.preprocessing import Pixels
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, MapSettings, NewPrecision
+from core.storage import Atlas, Enrolment, MapSettings, Precision
 
 BATCH = 64
 """Places that are written together."""
@@ -71,7 +71,7 @@ def fill_map(
     map_id: str,
     encoder: Encoder,
     places: int,
-    precision: NewPrecision = "half",
+    precision: Precision = "half",
     fields: Callable[[int], PlaceFields] = one_sequence,
 ) -> None:
     """Write a map of sample descriptors; ``fields`` gives the fields of each place.
@@ -89,7 +89,7 @@ def write_map(
     map_id: str,
     encoder: Encoder,
     described: Iterable[tuple[NDArray[np.float32], NDArray[np.int8]]],
-    precision: NewPrecision = "half",
+    precision: Precision = "half",
     fields: Callable[[int], PlaceFields] = one_sequence,
 ) -> None:
     """Write a map through the storage, its places called p00000, p00001, … in their order.

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.priors import decision_slope, log_odds, log_odds_per_score
+from core.judgement.priors import decision_slope, log_odds
 from core.judgement.probability import FARTHEST
-from core.judgement.verdict import Calibration, Judgement, Verdict, leading, standing_out
+from core.judgement.verdict import Calibration, Judgement, Verdict, leading
 from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
@@ -81,12 +81,11 @@ class Fused:
     weights: Values
 
 
-def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighborhood, second_stage: bool) -> Fused:
+def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighborhood) -> Fused:
     """Judge the frames of several cameras of a rig together, against one map.
 
     Args:
         views: of the cameras whose frames have a region; at least one, each with at least one place.
-        second_stage: whether the encoder has one.
     """
     listed = [view.listed() for view in views]
     rows, first = np.unique(
@@ -97,7 +96,7 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
     for camera, (view, part) in enumerate(zip(views, listed, strict=True)):
         scores[camera, np.searchsorted(rows, view.rows[part])] = view.scores[part]
     near = np.stack([places.near(i, neighborhood) for i in range(len(rows))])
-    of_place = _added(np.stack([_camera_log_odds(row, near, calibration, second_stage) for row in scores]))
+    of_place = _added(np.stack([_camera_log_odds(row, near, calibration) for row in scores]))
     prior = np.concatenate(
         [
             np.zeros(len(part)) if view.weights is None else view.weights[part]
@@ -105,7 +104,7 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
         ]
     )[first]
     of_place += np.where(near, prior, -np.inf).max(axis=1)
-    steepness = log_odds_per_score(calibration, second_stage)
+    steepness = decision_slope(calibration)
     # The frames of one place share its evidence; among them, those with the best scores of their own come first.
     lowest = np.where(np.isfinite(scores), scores, np.inf).min(axis=1, keepdims=True)
     own = np.where(np.isfinite(scores), scores, lowest)
@@ -128,7 +127,7 @@ def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
     )
 
 
-def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calibration, second_stage: bool) -> Values:
+def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calibration) -> Values:
     """The log odds of each place by one camera, float64 [n].
 
     Args:
@@ -141,11 +140,7 @@ def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calib
         rest = np.sort(scores[~same & np.isfinite(scores)])[::-1].astype(np.float32)
         if not np.isfinite(best):
             best = min(calibration.background_mean, float(rest[0]) if len(rest) else np.inf)
-        if second_stage or calibration.decision == "leading":
-            decision = leading(best, rest, calibration)
-        else:
-            decision = standing_out(best, rest, calibration, is_part=True)
-        found[place] = log_odds(decision, calibration)
+        found[place] = log_odds(leading(best, rest, calibration), calibration)
     return found
 
 

@@ -216,20 +216,12 @@ def log_weights(fits: Sequence[Values], trust: float) -> Values:
     return np.log((1 - trusted) + trusted * product)
 
 
-def log_odds_per_score(calibration: Calibration, second_stage: bool) -> float:
-    """By how much the log odds of a match grow with its score.
-
-    This is the derivative of the calibrated curve at a match that leads, as √(s · (s - top)) grows by about one with s.
-    The older decision value without a second stage is a score in units of the standard deviation of the rest, for which
-    that of the background is taken.  Without a curve, the threshold is taken for even odds.
-    """
-    slope = decision_slope(calibration)
-    leads = second_stage or calibration.decision == "leading"
-    return slope if leads else slope / calibration.background_deviation
-
-
 def decision_slope(calibration: Calibration) -> float:
-    """By how much the log odds of a match grow with its decision value."""
+    """By how much the log odds of a match grow with its decision value.
+
+    They grow with its score by about as much, as √(s · (s - top)) grows by about one with s.  Without a curve, the
+    threshold is taken for even odds.
+    """
     if calibration.curve is not None:
         return calibration.curve.slope
     return UNCALIBRATED_STEEPNESS / max(abs(calibration.threshold), 1e-6)
@@ -242,9 +234,7 @@ def log_odds(decision: float, calibration: Calibration) -> float:
     return slope * decision + intercept
 
 
-def weighed(
-    scores: NDArray[np.float32], weights: Values, calibration: Calibration, second_stage: bool
-) -> NDArray[np.float32]:
+def weighed(scores: NDArray[np.float32], weights: Values, calibration: Calibration) -> NDArray[np.float32]:
     """Lower scores by a prior: the log weights are converted to units of the score and added.
 
     A score does not fall below the mean of unrelated frames unless it was lower before: a place that the prior rules
@@ -257,5 +247,5 @@ def weighed(
     Returns:
         float32 [n].
     """
-    lowered = scores + (weights / log_odds_per_score(calibration, second_stage)).astype(np.float32)
+    lowered = scores + (weights / decision_slope(calibration)).astype(np.float32)
     return np.asarray(np.maximum(lowered, np.minimum(scores, np.float32(calibration.background_mean))), np.float32)

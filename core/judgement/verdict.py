@@ -35,11 +35,8 @@ from core.places import Neighborhood, Whereabouts
 
 Verdict = Literal["recognized", "ambiguous", "unknown"]
 
-FEWEST_PLACES = 16
-"""Imagined places are added to maps with fewer other places than this."""
-
 TOP_PLACES = 5
-"""The best score is compared with the mean of this many of the best other places."""
+"""The best score is compared with the mean of this many of the best other places; imagined ones are added to fewer."""
 
 
 class Calibration(BaseModel):
@@ -47,9 +44,8 @@ class Calibration(BaseModel):
 
     ``threshold`` is on the decision value, ``margin`` on the difference of
     two scores.  ``background_mean`` and ``background_deviation`` describe the score of unrelated
-    frames, in units of the score.  ``curve`` tells how probable a decision value is right; calibrations
-    made before there was one have none.  They are ``by-stage``, too: their decision value is
-    ``leading`` only after a second stage, and ``standing_out`` where there is none.
+    frames, in units of the score.  ``curve`` tells how probable a decision value is right; a calibration on
+    frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -60,26 +56,8 @@ class Calibration(BaseModel):
     background_mean: float = Field(allow_inf_nan=False)
     background_deviation: float = Field(gt=0, allow_inf_nan=False)
     curve: Curve | None = None
-    decision: Literal["leading", "by-stage"] = "by-stage"
+    decision: Literal["leading"] = "leading"
     frames: int | None = Field(default=None, ge=1, description="Held-out or labelled frames it rests on, if known.")
-
-
-def completed(own: Calibration | None, default: Calibration, second_stage: bool) -> Calibration:
-    """The calibration to judge a map's queries by: its own, or else the default of its encoder.
-
-    A map's calibration from before there were curves borrows the encoder's curve.
-
-    Args:
-        own: the map's; None: it has none.
-        default: the encoder's.
-        second_stage: whether the encoder has one.  Without it, the decision values of such an old calibration are not
-            those of the encoder's curve, so that none is borrowed.
-    """
-    if own is None:
-        return default
-    if own.curve is not None or not second_stage or own.decision == default.decision:
-        return own
-    return own.model_copy(update={"curve": default.curve, "decision": default.decision})
 
 
 @dataclass(frozen=True)
@@ -101,43 +79,21 @@ class Judgement:
     probability: float | None = None
 
 
-def filled_up(scores: NDArray[np.float32], fewest: int, calibration: Calibration) -> NDArray[np.float64]:
-    """Add the scores of imagined places to those of other places until there are ``fewest``.
+def filled_up(scores: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float64]:
+    """Add the scores of imagined places to those of other places until there are ``TOP_PLACES``.
 
     Args:
         scores: float32 [n], n >= 0, best first.
 
     Returns:
-        float64 [max(n, fewest)], best first.
+        float64 [max(n, TOP_PLACES)], best first.
     """
-    missing = fewest - len(scores)
+    missing = TOP_PLACES - len(scores)
     if missing <= 0:
         return scores.astype(np.float64)
     quantiles = np.array([NormalDist().inv_cdf((i + 0.5) / missing) for i in range(missing)])
     imagined = calibration.background_mean + calibration.background_deviation * quantiles
     return np.sort(np.concatenate([scores, imagined]))[::-1]
-
-
-def standing_out(best: float, rest: NDArray[np.float32], calibration: Calibration, is_part: bool = False) -> float:
-    """The decision value of older calibrations without a second stage, in standard deviations of the rest.
-
-    It is (best - mean of the top of the rest) / standard deviation of the rest.  The top of the rest grows with the
-    number of places just as the best score of an unknown place does, so that the value means the same on small and
-    large maps.
-
-    Args:
-        best: the best score.
-        rest: float32 [n], n >= 0, best first: the scores of places other than the best match's.
-        calibration: has the scores of imagined places.
-        is_part: ``rest`` holds only the best of them, whose standard deviation is not that of all; the calibration's
-            background is used instead.
-    """
-    scores = filled_up(rest, FEWEST_PLACES, calibration)
-    if is_part:
-        return float((best - scores[:TOP_PLACES].mean()) / calibration.background_deviation)
-    # If all scores are equal, any difference would be infinite; the background's deviation bounds it.
-    spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
-    return float((best - scores[:TOP_PLACES].mean()) / spread)
 
 
 def leading(best: float, rest: NDArray[np.float32], calibration: Calibration) -> float:
@@ -149,7 +105,7 @@ def leading(best: float, rest: NDArray[np.float32], calibration: Calibration) ->
             has examined, too, if there is one.
         calibration: has the scores of imagined places.
     """
-    scores = filled_up(rest, TOP_PLACES, calibration)
+    scores = filled_up(rest, calibration)
     return float(np.sqrt(max(0.0, best) * max(0.0, best - scores[:TOP_PLACES].mean())))
 
 
@@ -177,7 +133,6 @@ def judge(
     calibration: Calibration,
     neighborhood: Neighborhood,
     examined: int | NDArray[np.bool_] = 0,
-    is_part: bool = False,
 ) -> Judgement:
     """Judge one query.
 
@@ -188,7 +143,6 @@ def judge(
         neighborhood: which places are the same place and so no rivals of each other.
         examined: which of the places the encoder's second stage has examined, bool [n], or how many of the first;
             0: it has no second stage.
-        is_part: the scores are those of the best places alone.
 
     Returns:
         ``unknown`` for an empty map and for a decision value under the threshold, ``ambiguous`` for a lead over the
@@ -199,11 +153,7 @@ def judge(
     best = float(scores[0])
     others = np.flatnonzero(~whereabouts.near(0, neighborhood))
     closely = others[others < examined] if isinstance(examined, int) else others[examined[others]]
-    second_stage = bool(np.any(examined))
-    if second_stage or calibration.decision == "leading":
-        decision = leading(best, scores[closely if second_stage else others], calibration)
-    else:
-        decision = standing_out(best, scores[others], calibration, is_part)
+    decision = leading(best, scores[closely if np.any(examined) else others], calibration)
     rival = int(others[0]) if len(others) else None
     margin = None if rival is None else best - float(scores[rival])
     verdict: Verdict = "recognized"

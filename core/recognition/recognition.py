@@ -21,7 +21,7 @@ from core.frames.images import decode, encode_thumbnail
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.position import PoseEstimate, estimate_pose
-from core.judgement.priors import log_odds_per_score
+from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder, Encoding
 from core.places import Place, PlaceFields
@@ -239,12 +239,11 @@ def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidat
         calibration,
         neighborhood,
         candidates.examined,
-        candidates.is_part,
     )
     matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
     if matches:
         judgement = replace(judgement, score=matches[0][0])
-    log_odds = log_odds_per_score(calibration, encoder.candidates > 0) * candidates.ordered.astype(np.float64)
+    log_odds = decision_slope(calibration) * candidates.ordered.astype(np.float64)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates)

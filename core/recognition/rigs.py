@@ -10,7 +10,7 @@ import numpy as np
 
 from core.judgement.fusion import Fused, View, fuse
 from core.judgement.position import estimate_pose
-from core.judgement.priors import log_odds_per_score
+from core.judgement.priors import decision_slope
 from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import ATTEMPTS, Answer, locate
 from core.recognition.selection import Selection
@@ -41,7 +41,7 @@ def locate_rig(
         if not len(ranked[0].rows):
             return locate(map_, encoder, encodings[:1], k, selection)[0]  # no place is allowed, or there is none
         views = [View(one.rows, one.scores, one.whereabouts, one.examined, one.weights) for one in ranked]
-        fused = fuse(views, calibration, neighborhood, encoder.candidates > 0)
+        fused = fuse(views, calibration, neighborhood)
         places = map_.places_at(fused.rows[:k].tolist())
         if None not in places:
             break
@@ -49,7 +49,7 @@ def locate_rig(
     kept = [position for position, place in enumerate(places) if place is not None]
     judgement = fused.judgement if kept[:1] == [0] else replace(fused.judgement, verdict="unknown", probability=None)
     matches = [(float(fused.scores[position]), place) for position in kept if (place := places[position]) is not None]
-    candidates = _candidates_of_rig(fused, ranked[0], log_odds_per_score(calibration, encoder.candidates > 0))
+    candidates = _candidates_of_rig(fused, ranked[0], decision_slope(calibration))
     weights = None if ranked[0].weights is None else np.exp(fused.weights[kept]).tolist()
     pose = estimate_pose(fused.whereabouts, fused.log_odds, neighborhood.radius)
     milliseconds = 1e3 * (time.perf_counter() - began)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.priors import Values, weighed
-from core.judgement.verdict import TOP_PLACES, Calibration, completed
+from core.judgement.verdict import TOP_PLACES, Calibration
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import Neighborhood, Whereabouts
@@ -45,7 +45,6 @@ class Candidates:
     examined: bool [n], which of them the second stage has compared with the query.
     weights: float64 [n], the log prior of each place; None if the query had no prior.
     ordered: float32 [n], the values by which the places are ordered: the scores, changed by the prior.
-    is_part: whether the map has further places whose scores are not known.
     places: the number of places in the map, including those that the query may not find.
     """
 
@@ -55,7 +54,6 @@ class Candidates:
     examined: NDArray[np.bool_]
     weights: Values | None
     ordered: Array
-    is_part: bool
     places: int
 
     def take(self, kept: Positions) -> Candidates:
@@ -73,7 +71,7 @@ class Candidates:
 
 def calibration_of(map_: Map, encoder: Encoder) -> Calibration:
     """The map's own calibration or, if it has none, its encoder's."""
-    return completed(map_.record.calibration, encoder.calibration, encoder.candidates > 0)
+    return map_.record.calibration or encoder.calibration
 
 
 def neighborhood_of(map_: Map) -> Neighborhood:
@@ -148,19 +146,18 @@ def agree(
         StorageFailure: local descriptors cannot be read from disk.
     """
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
-    by_all = not encoder.candidates and calibration.decision != "leading" and not snapshot.coded
     scores = encoder.scores_from_inner_products(ranking[1])
     rows, ordered, weights = ranking[0], scores, None
     if scope.weights is not None:
         weights = scope.weights[rows]
-        ordered = weighed(scores, weights, calibration, encoder.candidates > 0)
+        ordered = weighed(scores, weights, calibration)
         order = np.argsort(-ordered, kind="stable")
         rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]
 
     def gains(positions: Positions) -> Array:
         return encoder.agreement(local, snapshot.locals_in_place(rows[positions]))
 
-    for length in (len(rows) if by_all else HEAD, len(rows)):
+    for length in (HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])
         found = examine(ordered[:length], places, neighborhood, encoder.candidates, gains)
         order = found.order
@@ -171,7 +168,6 @@ def agree(
             found.examined,
             None if weights is None else weights[order],
             found.scores,
-            snapshot.coded > 0,
             len(snapshot),
         )
         if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):

@@ -1,7 +1,7 @@
 """Durable maps: a write that has returned is on disk, whatever is read from disk is checked, searches run in memory."""
 
 from core.storage.atlas import Atlas
-from core.storage.files.row_formats import NewPrecision
+from core.storage.files.row_formats import Precision
 from core.storage.map import Map
 from core.storage.records import (
     Change,
@@ -27,7 +27,7 @@ __all__ = [
     "Map",
     "MapRecord",
     "MapSettings",
-    "NewPrecision",
+    "Precision",
     "Ranking",
     "Recall",
     "SameFrame",

@@ -51,6 +51,7 @@ class Atlas:
         Raises:
             DataDirectoryLocked: another process uses it.
             DataDirectoryTooNew: a later version of placerec wrote it, or one of its maps.
+            DataDirectoryTooOld: one of its maps was written before the first release.
             StorageFull, StorageFailure: the disk refuses.
         """
         self._directory = directory

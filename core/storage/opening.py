@@ -124,7 +124,7 @@ def read_record(folder: Path) -> tuple[MapRecord, int]:
     """The record of a map and how many places it has, without its places; an older database is migrated.
 
     Raises:
-        DataDirectoryTooNew: a later version wrote it.
+        DataDirectoryTooNew, DataDirectoryTooOld: its database is of a version that is not read.
         Damage: it is not a map, or another one than its folder says.
         sqlite3.Error: it cannot be read.
     """
@@ -270,7 +270,7 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
     The snapshot is returned apart from the rest, so that its memory can be freed when a later one takes its place.
 
     Raises:
-        DataDirectoryTooNew: a later version wrote it.
+        DataDirectoryTooNew, DataDirectoryTooOld: its database is of a version that is not read.
         Damage: what is on disk is not what was written.
         OSError, sqlite3.Error: the disk refuses.
     """
@@ -284,8 +284,7 @@ def open_map(folder: Path) -> tuple[OpenMap, Snapshot]:
             clear_folder(folder, segment_entries(connection, layout))
         descriptors.rewind(folder, layout, snapshot.rows)
         sync_folder(folder)  # the name of SQLite's log
-        # Earlier versions stored the descriptors of full segments twice, for FAISS.
-        for superfluous in (*folder.glob(f"*{TEMPORARY}"), *folder.glob("index-*.faiss")):
+        for superfluous in folder.glob(f"*{TEMPORARY}"):
             superfluous.unlink()
     except sqlite3.OperationalError as error:
         database.close()

@@ -57,7 +57,7 @@ class MapRecord(MapSettings):
     dimension: int = Field(gt=0, description="Values of one descriptor.")
     local_cells: int = Field(default=0, ge=0, description="Local descriptors of one frame; 0: there are none.")
     local_values: int = Field(default=0, ge=0, description="Values of one local descriptor.")
-    precision: Precision = Field(default="full", description="How its descriptors are kept; chosen when it is made.")
+    precision: Precision = Field(description="How its descriptors are kept; chosen when it is made.")
     calibration: Calibration | None = Field(default=None, description="The map's own; none: that of its encoder.")
     revision: int = Field(ge=1, description="Grows by one with every edit of this record.")
     created_at: Timestamp

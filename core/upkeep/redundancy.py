@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from core.places import NO_POSE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
@@ -18,6 +17,8 @@ MOST_NEIGHBOURS = 32
 
 def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
     """Pairs of frames of the same place (``Whereabouts.near``), each once, the lower first: int64 [m, 2]."""
+    from scipy.spatial import cKDTree  # here, because it takes long to import
+
     pairs: list[NDArray[np.int64]] = [np.empty((0, 2), np.int64)]
     for kind in np.unique(where.kind[where.kind != NO_POSE]):
         members = np.flatnonzero(where.kind == kind)

@@ -23,7 +23,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from core.disk.files import Damage, sync_folder
-from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, TooNew, connect, transaction
+from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
 from core.places import check_map_id
 from service.access.roles import LEVELS, Role
 from service.errors.faults import InvalidRequest, KeysUnreadable
@@ -191,9 +191,8 @@ class KeyStore:
                 raise KeysUnreadable(f"Others may write to {self.path}: chmod 600 it, then look whose keys it holds.")
             try:
                 return SqliteFile(self.path, _SCHEMA, {}, timeout=BUSY_SECONDS).open(create=False)
-            except TooNew as error:
-                written = f"{self.path} was written by a later version of placerec (schema {error.version})."
-                raise KeysUnreadable(written) from error
+            except UnreadVersion as error:
+                raise KeysUnreadable(str(error.refusal(str(self.path)))) from error
             except NotOurs as error:
                 raise KeysUnreadable(
                     f"{self.path} is not a file of keys, or it is damaged; nobody is let in. Restore it."

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from core.disk.files import Damage, disk_errors
-from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, TooNew
-from core.errors import DataDirectoryTooNew
+from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, UnreadVersion
 
 FILE = "jobs.sqlite"
 
@@ -50,15 +49,7 @@ _TABLE = """CREATE TABLE jobs (
     asker TEXT NOT NULL DEFAULT '{}'
 ) STRICT"""
 
-_SCHEMA = Schema(
-    application_id=0,
-    version=3,
-    create=[_TABLE],
-    migrations={
-        1: ["ALTER TABLE jobs ADD COLUMN maps TEXT NOT NULL DEFAULT '{}'"],
-        2: ["ALTER TABLE jobs ADD COLUMN asker TEXT NOT NULL DEFAULT '{}'"],
-    },
-)
+_SCHEMA = Schema(application_id=0, version=3, create=[_TABLE])
 
 
 @dataclass(frozen=True)
@@ -126,7 +117,7 @@ class JobRecords:
         that cannot be resumed.
 
         Raises:
-            DataDirectoryTooNew: a later version of placerec wrote the file.
+            DataDirectoryTooNew, DataDirectoryTooOld: the file is of a version that is not read.
             StorageFull, StorageFailure: the file cannot be opened.
         """
         self._lock = threading.Lock()
@@ -137,10 +128,8 @@ class JobRecords:
         with disk_errors(f"open {file.path}", FILE):
             try:
                 self._connection = file.open()
-            except TooNew as error:
-                raise DataDirectoryTooNew(
-                    f"{file.path} was written by a later version of placerec (schema {error.version})."
-                ) from error
+            except UnreadVersion as error:
+                raise error.refusal(str(file.path)) from error
             except Damage as damage:
                 salvaged = _salvaged(file.path)
                 self.put_aside = file.put_aside(damage).name
@@ -254,7 +243,7 @@ def _salvaged(path: Path) -> list[Job]:
         for values in rows:
             columns = dict(zip(names, values, strict=True))
             with suppress(KeyError, TypeError, ValueError):
-                job = _readable({"maps": "{}", "asker": "{}"} | columns)
+                job = _readable(columns)
                 found[int(job.number)] = replace(job, resumable=False, message=DAMAGED)
     return [found[number] for number in sorted(found)]
 

@@ -10,7 +10,7 @@ from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
 from core.places import Timestamp
-from core.storage import IndexStatus, Keep, MapSettings, NewPrecision, StorageStatus, TierSetting
+from core.storage import IndexStatus, Keep, MapSettings, Precision, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 
@@ -112,7 +112,7 @@ class NewMap(MapSettings):
         max_length=256,
         description="Name or full identity of the encoder; the default encoder if left out.",
     )
-    precision: NewPrecision = Field(
+    precision: Precision = Field(
         default="half", description="How the descriptors are stored; it cannot be changed later."
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 from core import errors
 from core.frames.masks import Mask
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
-from core.judgement.priors import log_odds_per_score
+from core.judgement.priors import decision_slope
 from core.judgement.verdict import Verdict
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
@@ -208,5 +208,5 @@ def match_log_odds(report: MapReport) -> list[float]:
     answer = report.answer
     assert answer is not None
     ordered = answer.candidates.ordered[: len(answer.matches)].astype(np.float64)
-    steepness = log_odds_per_score(answer.calibration, bool(answer.candidates.examined.any()))
+    steepness = decision_slope(answer.calibration)
     return (report.log_odds - steepness * (ordered[0] - ordered)).tolist() if len(ordered) else []

@@ -101,7 +101,7 @@ class _Reencoding:
             record.settings(),
             encoder.local_shape,
             unlisted=True,
-            precision="half" if record.precision == "full" else record.precision,
+            precision=record.precision,
         )
 
     def run(self) -> Mapping[str, Any]:

@@ -54,10 +54,11 @@ def test_image_runs_as_a_user_of_its_own() -> None:
     assert re.search(r"install .*--owner placerec .*/data", stage["RUN"])
 
 
-def test_package_index_is_empty_unless_given() -> None:
+def test_nothing_but_the_cpu_build_of_torch_is_chosen_unless_given() -> None:
     arguments = [argument for name, argument in instructions() if name == "ARG"]
-    assert {"PIP_INDEX_URL=", "PIP_EXTRA_INDEX_URL="} <= set(arguments)
-    assert all(value in (f"${{{name}:-}}",) for name, value in service()["build"]["args"].items())
+    assert {"PIP_INDEX_URL=", "PIP_EXTRA_INDEX_URL=", "TORCH_BACKEND=cpu"} <= set(arguments)
+    passed = {name: f"${{{name}:-{'cpu' if name == 'TORCH_BACKEND' else ''}}}" for name in service()["build"]["args"]}
+    assert service()["build"]["args"] == passed
 
 
 def test_variables_are_settings_of_the_service() -> None:

@@ -5,6 +5,7 @@ Which room may import which is kept by the contracts of import-linter in ``pypro
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import tomllib
 from collections import Counter
@@ -12,13 +13,13 @@ from collections.abc import Iterable, Mapping
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tests.project.sources import FILES, FOLDERS, ROOT, forbidden_imports, imports_of
+from tests.project.test_lock import locked
 
 MOST_MODULES = 16
 
@@ -72,21 +73,68 @@ def test_examples_know_nothing_of_the_project() -> None:
     assert forbidden_imports("examples", {"benchmarks", "core", "service", "tests", "training"}) == []
 
 
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_what_is_imported_is_declared(folder: str) -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    developing = folder in ("tests", "benchmarks")
-    texts = project["dependencies"] + (project["optional-dependencies"]["dev"] if developing else [])
-    declared = {canonicalize_name(Requirement(text).name) for text in texts}
-    examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
-    known = set(sys.stdlib_module_names) | set(FOLDERS) | examples
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = {"core/evaluation/report": {"report"}, "training": {"report"}}
+"""Folders that may import what an extra brings; tests and benchmarks may import all."""
+
+
+def allowed(path: Path) -> set[str]:
+    """The distributions that a file may import from."""
+    extras = PROJECT["optional-dependencies"]
+    folders = {str(parent.relative_to(ROOT)) for parent in path.parents if parent.is_relative_to(ROOT)}
+    chosen = (
+        set(extras) if folders & {"benchmarks", "tests"} else set().union(*(EXTRAS.get(one, ()) for one in folders))
+    )
+    texts = PROJECT["dependencies"] + [text for extra in chosen for text in extras[extra]]
+    return {canonicalize_name(Requirement(text).name) for text in texts}
+
+
+def test_what_is_imported_is_declared() -> None:
+    known = set(sys.stdlib_module_names) | set(FOLDERS) | {path.stem for path in (ROOT / "examples").glob("*.py")}
     distributions = packages_distributions()
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"
         for path in FILES
-        if path.is_relative_to(ROOT / folder)
         for name, _ in imports_of(path)
         if (top := name.split(".")[0]) not in known
-        if not declared & {canonicalize_name(distribution) for distribution in distributions.get(top, [])}
+        if not allowed(path) & {canonicalize_name(distribution) for distribution in distributions.get(top, [])}
     }
     assert undeclared == set()
+
+
+BLOCKED = """
+import importlib.abc, pkgutil, sys
+
+class Blocker(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in blocked:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+blocked, without = set(sys.argv[1].split()), tuple(sys.argv[2].split())
+sys.meta_path.insert(0, Blocker())
+import core, service
+count = 0
+for package in (core, service):
+    for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not (found.name + ".").startswith(without) and not found.name.endswith("__main__"):
+            __import__(found.name)
+            count += 1
+print(count, *(sorted(blocked & {name.split(".")[0] for name in sys.modules})))
+"""
+
+
+def test_the_service_and_the_core_need_only_what_the_service_lock_has() -> None:
+    """Every module is imported, those of an extra apart, while nothing can be imported that the lock leaves out."""
+    extra = set(locked("development")) - set(locked("service"))
+    blocked = {
+        top
+        for top, distributions in packages_distributions().items()
+        if {canonicalize_name(name) for name in distributions} <= extra
+    }
+    assert {"matplotlib", "PIL", "sklearn", "pytest"} <= blocked
+    without = " ".join(f"{folder.replace('/', '.')}." for folder in EXTRAS)
+    command = [sys.executable, "-c", BLOCKED, " ".join(blocked), without]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100)
+    assert run.returncode == 0, run.stderr
+    count, *there = run.stdout.split()
+    assert int(count) > 200 and there == []

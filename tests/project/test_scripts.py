@@ -16,11 +16,13 @@ RUNNABLE = [
     *(f"scripts/{name}" for name in ("fuzz", "lint", "lock", "openapi", "reference", "serve", "soak", "test")),
 ]
 
-# Replaces Python: a venv is a copy of this script, an installation a line in a log; everything else is real.
+# Replaces Python: a venv is a copy of this script, what pip installs a line in a log; the rest is real.
 STUB = """#!/bin/bash
 case "$1 $2" in
     "-m venv") mkdir -p "${@: -1}/bin" && cp "$0" "${@: -1}/bin/python" && echo venv >>"$LOG" ;;
     "-m pip") sleep 0.1 && echo "${*: -1}" >>"$LOG" && [ ! -e "$LOG.full" ] ;;
+    "scripts/packages.py "*) echo "$2 ${TORCH_BACKEND:-}" >>"$LOG" && [ ! -e "$LOG.full" ] ;;
+    "-c import service.app.application") ;;
     *) exec REAL "$@" ;;
 esac
 """
@@ -50,20 +52,20 @@ class Checkout:
         self.python.write_text(STUB.replace("REAL", sys.executable))
         self.python.chmod(0o755)
 
-    def start(self, profile: str, python: str | None = None) -> subprocess.Popen[str]:
+    def start(self, profile: str, python: str | None = None, backend: str = "") -> subprocess.Popen[str]:
         return subprocess.Popen(
             ["bash", "-c", f"set -eu; . '{self.folder}/scripts/environment'; environment {profile}; echo ready"],
-            env={**os.environ, "PYTHON": python or str(self.python), "LOG": str(self.log)},
+            env={**os.environ, "PYTHON": python or str(self.python), "LOG": str(self.log), "TORCH_BACKEND": backend},
             cwd="/",
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
 
-    def prepare(self, profile: str) -> list[str]:
+    def prepare(self, profile: str, backend: str = "") -> list[str]:
         """Run ``environment PROFILE``; what it installed, in order."""
         self.log.write_text("")
-        out, error = self.start(profile).communicate(timeout=30)
+        out, error = self.start(profile, backend=backend).communicate(timeout=30)
         assert out == "ready\n", error
         return self.log.read_text().split()
 
@@ -73,26 +75,39 @@ def checkout(tmp_path: Path) -> Checkout:
     return Checkout(tmp_path)
 
 
-def test_torch_comes_first_and_nothing_twice(checkout: Checkout) -> None:
-    assert checkout.prepare("service") == ["venv", "requirements/torch.lock", "requirements/service.lock", "."]
+def test_nothing_is_installed_twice(checkout: Checkout) -> None:
+    assert checkout.prepare("service") == ["venv", "service", "."]
     assert checkout.prepare("service") == []
 
 
 def test_development_serves_too(checkout: Checkout) -> None:
-    assert checkout.prepare("development")[2] == "requirements/development.lock"
+    assert checkout.prepare("development") == ["venv", "development", "."]
     assert checkout.prepare("service") == []
 
 
 def test_a_changed_lock_installs_again_into_the_same_venv(checkout: Checkout) -> None:
     checkout.prepare("service")
     (checkout.folder / "requirements/service.lock").write_text("newer\n")
-    assert checkout.prepare("service") == ["requirements/torch.lock", "requirements/service.lock", "."]
+    assert checkout.prepare("service") == ["service", "."]
+
+
+def test_another_build_of_torch_gets_a_new_venv(checkout: Checkout) -> None:
+    checkout.prepare("service")
+    assert checkout.prepare("service", backend="auto") == ["venv", "service", "auto", "."]
+    assert checkout.prepare("service", backend="auto") == []
+
+
+def test_a_venv_of_an_earlier_version_is_made_anew(checkout: Checkout) -> None:
+    checkout.prepare("service")
+    (checkout.folder / ".venv/torch-backend").unlink()
+    (checkout.folder / ".venv/installed-service").write_text("earlier\n")
+    assert checkout.prepare("service") == ["venv", "service", "."]
 
 
 def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
     runs = [checkout.start("development") for _ in range(3)]
     assert [run.communicate(timeout=30)[0] for run in runs] == ["ready\n"] * 3
-    assert checkout.log.read_text().split().count("requirements/torch.lock") == 1
+    assert checkout.log.read_text().split() == ["venv", "development", "."]
 
 
 def test_an_interrupted_installation_is_repeated(checkout: Checkout) -> None:

@@ -63,7 +63,7 @@ class Database:
         """Open the file, and migrate it if it is older.
 
         Raises:
-            DataDirectoryTooNew: a later version wrote it.
+            DataDirectoryTooNew, DataDirectoryTooOld: it is of a version that is not read.
             Damage: it is not the database of a map.
             sqlite3.Error: it cannot be read.
         """

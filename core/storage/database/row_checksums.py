@@ -60,15 +60,3 @@ def mismatched(connection: sqlite3.Connection, table: str) -> list[str]:
     """The names of the rows of a table that do not match their checksum."""
     query = f"SELECT {_NAMES[table]} FROM {table} WHERE seal IS NOT NULL AND seal <> {expression(table)}"
     return [str(name) for (name,) in connection.execute(query).fetchall()]
-
-
-def statements() -> list[str]:
-    """SQL that adds the column to each table and writes the checksums of all rows."""
-    return [
-        statement
-        for table in CHECKED
-        for statement in (
-            f"ALTER TABLE {table} ADD COLUMN seal INTEGER",
-            f"UPDATE {table} SET seal = {expression(table)}",
-        )
-    ]

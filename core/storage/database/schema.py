@@ -1,7 +1,7 @@
 """The tables of ``map.sqlite``, and the migrations that bring older files to the newest tables.
 
-A file's ``user_version`` is the number of migrations that it has had.  A migration is a list of statements; all that a
-file lacks are applied in one transaction.
+Version 7 of the tables is that of placerec 0.1.0, the first release, and the oldest that is read.  A migration is a
+list of statements that leads from one version to the next; all that a file lacks are applied in one transaction.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from core.disk.files import Damage
-from core.disk.sqlite_file import NotOurs, Schema, TooNew, transaction
-from core.errors import DataDirectoryTooNew
+from core.disk.sqlite_file import NotOurs, Schema, UnreadVersion, transaction
 from core.storage.database import row_checksums
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
@@ -24,75 +23,8 @@ T = TypeVar("T")
 NO_SEQUENCE = -1
 """Code of the places that belong to no sequence."""
 
-_FIRST: Migration = (
-    """CREATE TABLE map (
-        only INTEGER PRIMARY KEY CHECK (only = 1),
-        id TEXT NOT NULL,
-        encoder TEXT NOT NULL,
-        dimension INTEGER NOT NULL CHECK (dimension > 0),
-        rows_per_segment INTEGER NOT NULL CHECK (rows_per_segment > 0),
-        description TEXT NOT NULL,
-        keep TEXT NOT NULL,
-        same_place_radius REAL NOT NULL,
-        same_place_frames INTEGER NOT NULL,
-        calibration TEXT,
-        revision INTEGER NOT NULL,
-        created_at TEXT NOT NULL,
-        updated_at TEXT NOT NULL
-    ) STRICT""",
-    # A code is never used twice, so that an old snapshot cannot confuse two sequences.
-    """CREATE TABLE sequences (
-        code INTEGER PRIMARY KEY AUTOINCREMENT,
-        name TEXT UNIQUE,
-        next_ordinal INTEGER NOT NULL
-    ) STRICT""",
-    f"INSERT INTO sequences VALUES ({NO_SEQUENCE}, NULL, 0)",
-    # Of each segment file: how many rows it has, and the checksum of their checksums.
-    """CREATE TABLE segments (
-        number INTEGER PRIMARY KEY,
-        rows INTEGER NOT NULL CHECK (rows > 0),
-        checksum INTEGER NOT NULL
-    ) STRICT""",
-    """CREATE TABLE places (
-        number INTEGER PRIMARY KEY AUTOINCREMENT,
-        id TEXT NOT NULL UNIQUE,
-        row INTEGER NOT NULL UNIQUE CHECK (row >= 0),
-        checksum INTEGER NOT NULL,
-        digest BLOB NOT NULL CHECK (length(digest) = 32),
-        regions INTEGER NOT NULL CHECK (regions >= 0),
-        picture TEXT NOT NULL CHECK (picture IN ('none', 'thumbnail', 'image')),
-        x REAL, y REAL, z REAL, latitude REAL, longitude REAL, heading REAL,
-        timestamp TEXT,
-        sequence INTEGER NOT NULL REFERENCES sequences (code),
-        ordinal INTEGER NOT NULL,
-        metadata TEXT NOT NULL,
-        created_at TEXT NOT NULL,
-        updated_at TEXT NOT NULL
-    ) STRICT""",
-    "CREATE INDEX places_of_sequence ON places (sequence, number)",
-    # Apart from the places, so that a listing need not read the pictures.
-    """CREATE TABLE pictures (
-        place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
-        digest BLOB NOT NULL CHECK (length(digest) = 32),
-        bytes BLOB NOT NULL
-    ) STRICT""",
-)
-
-# Shape of the local descriptors; maps that were made before have none.
-_LOCAL: Migration = (
-    "ALTER TABLE map ADD COLUMN local_cells INTEGER NOT NULL DEFAULT 0 CHECK (local_cells >= 0)",
-    "ALTER TABLE map ADD COLUMN local_values INTEGER NOT NULL DEFAULT 0 CHECK (local_values >= 0)",
-)
-
-# Which camera took a frame, and what is ignored in its frames.
-_CAMERAS: Migration = (
-    """CREATE TABLE cameras (
-        name TEXT PRIMARY KEY,
-        mask TEXT,
-        updated_at TEXT NOT NULL
-    ) STRICT""",
-    "ALTER TABLE places ADD COLUMN camera TEXT",
-)
+FIRST_VERSION = 7
+"""The version of the tables of placerec 0.1.0."""
 
 LONGEST_INDEXED = 512
 """Most characters of a text in a place's metadata by which the place can be found; longer texts are only stored."""
@@ -114,9 +46,79 @@ _FILL_VALUES = (
 _INSERT_VALUES = f"INSERT OR IGNORE INTO place_values {_values_of('new').format(source='')}"
 _DELETE_VALUES = f"DELETE FROM place_values WHERE (key, kind, value, row) IN ({_values_of('old').format(source='')})"
 
-# The index by which places are found by their metadata.  Triggers update it with every change of a place.
-_VALUES: Migration = (
-    # The kind distinguishes true from 1; with the type ANY, 1 and 1.0 are equal.
+# The column "seal" is the checksum of a row (:mod:`core.storage.database.row_checksums`).
+_TABLES: Migration = (
+    # local_cells and local_values are the shape of the local descriptors; 0 without a second stage.
+    """CREATE TABLE map (
+        only INTEGER PRIMARY KEY CHECK (only = 1),
+        id TEXT NOT NULL,
+        encoder TEXT NOT NULL,
+        dimension INTEGER NOT NULL CHECK (dimension > 0),
+        local_cells INTEGER NOT NULL CHECK (local_cells >= 0),
+        local_values INTEGER NOT NULL CHECK (local_values >= 0),
+        precision TEXT NOT NULL,
+        rows_per_segment INTEGER NOT NULL CHECK (rows_per_segment > 0),
+        "index" TEXT NOT NULL,
+        description TEXT NOT NULL,
+        keep TEXT NOT NULL,
+        same_place_radius REAL NOT NULL,
+        same_place_frames INTEGER NOT NULL,
+        calibration TEXT,
+        revision INTEGER NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL,
+        seal INTEGER
+    ) STRICT""",
+    # A code is never used twice, so that an old snapshot cannot confuse two sequences.
+    """CREATE TABLE sequences (
+        code INTEGER PRIMARY KEY AUTOINCREMENT,
+        name TEXT UNIQUE,
+        next_ordinal INTEGER NOT NULL
+    ) STRICT""",
+    f"INSERT INTO sequences VALUES ({NO_SEQUENCE}, NULL, 0)",
+    # Of each segment file: how many rows it has, and the checksum of their checksums.  The files of removed segments,
+    # which are without a place, are deleted (:mod:`core.storage.removed_segments`).
+    """CREATE TABLE segments (
+        number INTEGER PRIMARY KEY,
+        rows INTEGER NOT NULL CHECK (rows > 0),
+        checksum INTEGER NOT NULL,
+        removed INTEGER NOT NULL DEFAULT 0
+    ) STRICT""",
+    """CREATE TABLE places (
+        number INTEGER PRIMARY KEY AUTOINCREMENT,
+        id TEXT NOT NULL UNIQUE,
+        row INTEGER NOT NULL UNIQUE CHECK (row >= 0),
+        checksum INTEGER NOT NULL,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        regions INTEGER NOT NULL CHECK (regions >= 0),
+        picture TEXT NOT NULL CHECK (picture IN ('none', 'thumbnail', 'image')),
+        x REAL, y REAL, z REAL, latitude REAL, longitude REAL, heading REAL,
+        timestamp TEXT,
+        sequence INTEGER NOT NULL REFERENCES sequences (code),
+        ordinal INTEGER NOT NULL,
+        camera TEXT,
+        metadata TEXT NOT NULL,
+        created_at TEXT NOT NULL,
+        updated_at TEXT NOT NULL,
+        seal INTEGER
+    ) STRICT""",
+    "CREATE INDEX places_of_sequence ON places (sequence, number)",
+    "CREATE INDEX places_in_order ON places (sequence, ordinal)",
+    # Apart from the places, so that a listing need not read the pictures.
+    """CREATE TABLE pictures (
+        place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
+        digest BLOB NOT NULL CHECK (length(digest) = 32),
+        bytes BLOB NOT NULL
+    ) STRICT""",
+    # Which camera took a frame, and what is ignored in its frames.
+    """CREATE TABLE cameras (
+        name TEXT PRIMARY KEY,
+        mask TEXT,
+        updated_at TEXT NOT NULL,
+        seal INTEGER
+    ) STRICT""",
+    # The index by which places are found by their metadata.  Triggers update it with every change of a place.  The
+    # kind distinguishes true from 1; with the type ANY, 1 and 1.0 are equal.
     """CREATE TABLE place_values (
         key TEXT NOT NULL,
         kind TEXT NOT NULL,
@@ -124,28 +126,15 @@ _VALUES: Migration = (
         row INTEGER NOT NULL,
         PRIMARY KEY (key, kind, value, row)
     ) STRICT, WITHOUT ROWID""",
-    _FILL_VALUES,
     f"CREATE TRIGGER place_values_made AFTER INSERT ON places BEGIN {_INSERT_VALUES}; END",
     "CREATE TRIGGER place_values_changed AFTER UPDATE OF row, metadata ON places"
     " WHEN old.row <> new.row OR old.metadata <> new.metadata"
     f" BEGIN {_DELETE_VALUES}; {_INSERT_VALUES}; END",
     f"CREATE TRIGGER place_values_gone AFTER DELETE ON places BEGIN {_DELETE_VALUES}; END",
-    "CREATE INDEX places_in_order ON places (sequence, ordinal)",
 )
 
-# How the map is searched, and how its descriptors are stored; "full" in maps that were made before.
-_TIERS: Migration = (
-    "ALTER TABLE map ADD COLUMN \"index\" TEXT NOT NULL DEFAULT 'auto'",
-    "ALTER TABLE map ADD COLUMN precision TEXT NOT NULL DEFAULT 'full'",
-)
-
-# A checksum in each row of the record, the places and the cameras.
-_SEALS: Migration = row_checksums.statements()
-
-# Segments without a place, whose files are deleted (:mod:`core.storage.removed_segments`).
-_REMOVED: Migration = ("ALTER TABLE segments ADD COLUMN removed INTEGER NOT NULL DEFAULT 0",)
-
-MIGRATIONS: Sequence[Migration] = (_FIRST, _LOCAL, _CAMERAS, _VALUES, _TIERS, _SEALS, _REMOVED)
+MIGRATIONS: Sequence[Migration] = ()
+"""The steps from ``FIRST_VERSION`` to the newest version; new files get them, too."""
 
 
 def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
@@ -158,44 +147,46 @@ def _columns(connection: sqlite3.Connection) -> dict[str, set[str]]:
 
 
 def migrate(connection: sqlite3.Connection, migrations: Sequence[Migration] = MIGRATIONS, create: bool = False) -> int:
-    """Apply the ``migrations`` that a file lacks, all of them or none; to an empty file only with ``create``.
+    """Apply the ``migrations`` that a file lacks, all of them or none.
+
+    With ``create`` the tables are made if the file is empty.
 
     Returns:
-        How many were applied.
+        By how many versions the file advanced.
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the file.
+        DataDirectoryTooOld: it was written before the first release.
         Damage: it is not the database of a map, or it has the newest tables and yet a later version.
         sqlite3.Error: a statement failed; the file is as it was.
     """
     row_checksums.register(connection)
+    schema = _schema(migrations)
     try:
-        return _schema(migrations).migrate(connection, create)
+        return schema.migrate(connection, create)
     except NotOurs as error:
         raise Damage("map.sqlite is not one of placerec's databases") from error
-    except TooNew as error:
-        if _statements(connection) == _expected(migrations, _statements):
+    except UnreadVersion as error:
+        if _parts(connection) == _expected(migrations, _parts):
             claimed = f"map.sqlite says that it is of schema {error.version}"
-            raise Damage(f"{claimed}, but its tables are of {len(migrations)}") from error
-        raise DataDirectoryTooNew(
-            f"A map was written by a later version of placerec (schema {error.version}, this one knows"
-            f" {len(migrations)})."
-        ) from error
+            raise Damage(f"{claimed}, but its tables are of {schema.version}") from error
+        raise error.refusal("A map") from error
 
 
 def _schema(migrations: Sequence[Migration]) -> Schema:
-    """The schema whose versions are the migrations; a new file gets all of them, too."""
-    every = [statement for migration in migrations for statement in migration]
-    return Schema(APPLICATION_ID, len(migrations), every, dict(enumerate(migrations)))
+    steps = dict(enumerate(migrations, start=FIRST_VERSION))
+    create = [*_TABLES, *(statement for step in steps.values() for statement in step)]
+    return Schema(APPLICATION_ID, FIRST_VERSION + len(steps), create, steps)
 
 
-def _statements(connection: sqlite3.Connection) -> set[tuple[str, ...]]:
-    """The tables, indexes and triggers of a file, each with its SQL statement."""
-    return set(connection.execute("SELECT type, name, sql FROM sqlite_schema WHERE name NOT LIKE 'sqlite_%'"))
+def _parts(connection: sqlite3.Connection) -> tuple[set[tuple[str, str]], dict[str, set[str]]]:
+    """The tables, indexes and triggers of a file by type and name, and the columns of its tables."""
+    query = "SELECT type, name FROM sqlite_schema WHERE name NOT LIKE 'sqlite_%'"
+    return set(connection.execute(query)), _columns(connection)
 
 
 def _expected(migrations: Sequence[Migration], read: Callable[[sqlite3.Connection], T]) -> T:
-    """What ``read`` returns for a file that ``migrations`` have made."""
+    """What ``read`` returns for a file that has the newest tables."""
     wanted = sqlite3.connect(":memory:", isolation_level=None)
     try:
         migrate(wanted, migrations, create=True)

@@ -1,6 +1,5 @@
 """The formats in which descriptors are stored on disk.
 
-full        float32 and int8 without change: maps of the first two versions of segment files
 half        descriptors in half precision, local descriptors without change
 compressed  descriptors in six bits per value with a scale per block of 128 values, local descriptors in four bits per
             value with a step per cell: 29 KB instead of 98 KB with the default encoder
@@ -24,11 +23,8 @@ Descriptor = NDArray[np.float32]
 Local = NDArray[np.int8]
 """Local descriptors of one frame, [C, L]; [0, 0] where the encoder has no second stage."""
 
-Precision = Literal["full", "half", "compressed"]
-NewPrecision = Literal["half", "compressed"]
-"""The formats that a new map can have."""
+Precision = Literal["half", "compressed"]
 
-FULL: Precision = "full"
 HALF: Precision = "half"
 COMPRESSED: Precision = "compressed"
 
@@ -62,13 +58,11 @@ def resting_types(precision: Precision, dimension: int, local_shape: tuple[int, 
         cells, values = local_shape
         blocks = -(-dimension // BLOCK)
         return ("u1", (blocks * (2 + BLOCK // 2 + BLOCK // 4),)), ("u1", (cells * (1 + -(-values // 2)),))
-    return ("<f4" if precision == FULL else "<f2", (dimension,)), ("i1", local_shape)
+    return ("<f2", (dimension,)), ("i1", local_shape)
 
 
 def pack_descriptors(descriptors: NDArray[np.float32], precision: Precision) -> NDArray[Any]:
     """Convert descriptors, float32 [n, D], to their stored form, [n, …]; halves are rounded to nearest, ties even."""
-    if precision == FULL:
-        return descriptors
     if precision == HALF:
         return descriptors.astype("<f2")
     n, dimension = descriptors.shape

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage, missing
-from core.storage.files.row_formats import FULL, Local, inner_products
+from core.storage.files.row_formats import Local, inner_products
 from core.storage.files.segment_files import HEADER_BYTES, NO_LOCAL, Layout, check_header, segment_name
 
 Rows = NDArray[np.int64]
@@ -39,10 +39,9 @@ class RowReader:
         record = layout.record
         assert record.fields is not None
         offsets = {name: described[1] for name, described in record.fields.items()}
-        # A record of version 3 holds descriptor, checksums, local descriptors: either end is read with the checksums.
-        is_split = layout.precision != FULL
-        self._first = self._part(0, offsets["local"]) if is_split else self._part(0, record.itemsize)
-        self._last = self._part(offsets["row"] if is_split else 0, record.itemsize)
+        # A record holds descriptor, checksums, local descriptors: either end is read with the checksums.
+        self._first = self._part(0, offsets["local"])
+        self._last = self._part(offsets["row"], record.itemsize)
 
     def _part(self, start: int, stop: int) -> tuple[int, np.dtype[np.void]]:
         """The offset ``start`` in a record, and the type of its fields from byte ``start`` to ``stop``."""
@@ -101,8 +100,6 @@ class RowReader:
 
     def _sound(self, found: NDArray[np.void], rows: Rows, name: str) -> list[bool]:
         """Whether each record is of its row and matches the checksums that cover the field ``name``."""
-        if self._layout.precision == FULL:
-            return [self._layout.is_sound(part, row) for part, row in zip(found, rows.tolist(), strict=True)]
         fields = found.dtype.fields
         assert fields is not None
         part, row, sums = (fields[field][1] for field in (name, "row", "of_descriptor"))

@@ -3,16 +3,14 @@
 A file is little-endian: a header of 4 096 bytes followed by records (see `Layout.record`):
 
     header   magic, version, format of the descriptors, dimension, rows of a full segment, first row, length of the
-             encoder identity; from version 2 on the cells and the values per cell of the local descriptors; the
-             identity, zeros, CRC-32 of all before it
-    record   versions 1, 2: descriptor (float32 [D]), in version 2 local descriptors (int8 [C, L]), row (uint64),
-             CRC-32 of descriptors and row (uint32), zeros (uint32)
-             version 3: stored descriptor, row (uint64), checksum of the record (uint32), CRC-32 of descriptor and
-             row (uint32), CRC-32 of local descriptors and row (uint32), zeros (uint32), stored local descriptors
+             encoder identity, the cells and the values per cell of the local descriptors, the encoder identity,
+             zeros, CRC-32 of all before it
+    record   stored descriptor, row (uint64), checksum of the record (uint32), CRC-32 of descriptor and row (uint32),
+             CRC-32 of local descriptors and row (uint32), zeros (uint32), stored local descriptors
 
-Maps made before version 3 keep their version: 2, or 1 if their encoder has no second stage.  In version 3 the checksum
-of a record is the CRC-32 of its two other checksums, so that the descriptor and the local descriptors can each be read
-and checked without the other; both are stored in the map's precision (:data:`Precision`).
+The checksum of a record is the CRC-32 of its two other checksums, so that the descriptor and the local descriptors can
+each be read and checked without the other; both are stored in the map's precision (:data:`Precision`).  The version is
+3, which all releases have written.
 
 Row r of a map is record ``r % rows_per_segment`` of segment ``r // rows_per_segment``.  SQLite says how many records
 count; any that follow were never acknowledged and are overwritten.
@@ -35,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from core.disk.files import Damage, missing, sync_folder, write_at
 from core.storage.files.row_formats import (
-    FULL,
+    HALF,
     Descriptor,
     Local,
     Precision,
@@ -56,8 +54,8 @@ HEADER_BYTES = 4096
 _HEADER = struct.Struct("<8sI8sIIQH")
 _LOCAL_SHAPE = struct.Struct("<II")
 _MAGIC = b"PLRCSEG\x00"
-_FIRST_VERSION, _LOCAL_VERSION, _LATEST_VERSION = 1, 2, 3
-_KEPT: dict[Precision, bytes] = {"full": b"<f4", "half": b"<f2", "compressed": b"6 bits"}
+_VERSION = 3
+_KEPT: dict[Precision, bytes] = {"half": b"<f2", "compressed": b"6 bits"}
 _IDENTITY_BYTES = 1024
 _CHUNK_BYTES = 8 << 20
 
@@ -70,7 +68,7 @@ class Layout:
     identity: str
     rows_per_segment: int
     local_shape: tuple[int, int] = NO_LOCAL
-    precision: Precision = FULL
+    precision: Precision = HALF
 
     def __post_init__(self) -> None:
         if len(self.identity.encode()) > _IDENTITY_BYTES:
@@ -78,32 +76,21 @@ class Layout:
         if self.local_shape != NO_LOCAL and min(self.local_shape) < 1:
             raise ValueError(f"local descriptors cannot have {self.local_shape} cells and values")
 
-    @property
-    def version(self) -> int:
-        """The version of the segment files."""
-        if self.precision != FULL:
-            return _LATEST_VERSION
-        return _FIRST_VERSION if self.local_shape == NO_LOCAL else _LOCAL_VERSION
-
     @cached_property
     def record(self) -> np.dtype[np.void]:
         """The structured type of one record."""
         descriptor, local = resting_types(self.precision, self.dimension, self.local_shape)
-        row, last = ("row", "<u8"), ("reserved", "<u4")
-        if self.version < _LATEST_VERSION:
-            return np.dtype([("descriptor", *descriptor), ("local", *local), row, ("checksum", "<u4"), last])
-        sums = [("checksum", "<u4"), ("of_descriptor", "<u4"), ("of_local", "<u4")]
-        return np.dtype([("descriptor", *descriptor), row, *sums, last, ("local", *local)])
+        sums = [("checksum", "<u4"), ("of_descriptor", "<u4"), ("of_local", "<u4"), ("reserved", "<u4")]
+        return np.dtype([("descriptor", *descriptor), ("row", "<u8"), *sums, ("local", *local)])
 
     def header(self, number: int) -> bytes:
         """The first 4 096 bytes of segment ``number``."""
         identity = self.identity.encode()
         first_row = number * self.rows_per_segment
         fixed = _HEADER.pack(
-            _MAGIC, self.version, _KEPT[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
+            _MAGIC, _VERSION, _KEPT[self.precision], self.dimension, self.rows_per_segment, first_row, len(identity)
         )
-        shape = b"" if self.version == _FIRST_VERSION else _LOCAL_SHAPE.pack(*self.local_shape)
-        content = (fixed + shape + identity).ljust(HEADER_BYTES - 4, b"\x00")
+        content = (fixed + _LOCAL_SHAPE.pack(*self.local_shape) + identity).ljust(HEADER_BYTES - 4, b"\x00")
         return content + struct.pack("<I", zlib.crc32(content))
 
     def pack(self, record: np.void, descriptor: Descriptor, local: Local, row: int) -> None:
@@ -129,8 +116,7 @@ class Layout:
 
     def _complete(self, record: np.void, row: int) -> None:
         record["row"] = row
-        if self.version == _LATEST_VERSION:
-            record["of_descriptor"], record["of_local"] = self.part_checksums(record, row)
+        record["of_descriptor"], record["of_local"] = self.part_checksums(record, row)
         record["checksum"] = self.row_checksum(record, row)
 
     def part_checksums(self, record: np.void, row: int) -> tuple[int, int]:
@@ -141,17 +127,12 @@ class Layout:
 
     def row_checksum(self, record: np.void, row: int) -> int:
         """The checksum that ``record`` has as that of ``row``; a record in the wrong place does not match it."""
-        if self.version == _LATEST_VERSION:
-            return zlib.crc32(struct.pack("<II", *self.part_checksums(record, row)))
-        running = zlib.crc32(record["descriptor"].tobytes())
-        return zlib.crc32(struct.pack("<Q", row), zlib.crc32(record["local"].tobytes(), running))
+        return zlib.crc32(struct.pack("<II", *self.part_checksums(record, row)))
 
     def is_sound(self, record: np.void, row: int) -> bool:
         """Whether a record is of ``row`` and matches its checksums."""
         if record["row"] != row or record["checksum"] != self.row_checksum(record, row):
             return False
-        if self.version < _LATEST_VERSION:
-            return True
         return (int(record["of_descriptor"]), int(record["of_local"])) == self.part_checksums(record, row)
 
     def descriptors_of(self, records: NDArray[np.void]) -> NDArray[np.float32]:

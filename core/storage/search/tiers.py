@@ -95,7 +95,7 @@ class StorageStatus(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    precision: str = Field(description="How descriptors are kept: half precision; full in maps made before there was.")
+    precision: str = Field(description="How descriptors are kept.")
     bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
     descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
     index: int = Field(ge=0, description="Bytes of codes and lists, which can be made again.")

@@ -16,10 +16,10 @@ CALIBRATION = Calibration(
 APART = Neighborhood(5, 0)
 
 
-def told(scores: list[float], examined: int, calibration: Calibration = CALIBRATION) -> dict[int, float]:
+def told(scores: list[float], examined: int) -> dict[int, float]:
     values = np.sort(np.array(scores, np.float32))[::-1].copy()
     marks = np.arange(len(values)) < examined
-    seen = evidence(np.arange(len(values)), values, walk(len(values)), calibration, APART, marks)
+    seen = evidence(np.arange(len(values)), values, walk(len(values)), CALIBRATION, APART, marks)
     assert seen.unknown == pytest.approx(STRENGTH * UNKNOWN)
     return dict(zip(seen.rows.tolist(), seen.gains.tolist(), strict=True))
 
@@ -28,16 +28,15 @@ def told(scores: list[float], examined: int, calibration: Calibration = CALIBRAT
 def test_a_place_that_would_just_be_believed_gains_the_strength(examined: int) -> None:
     random = np.random.default_rng(0)
     rest = random.normal(0.07, 0.01, 60).tolist()
-    calibration = CALIBRATION if examined else CALIBRATION.model_copy(update={"threshold": 2.0})
     below, above = 0.05, 1.0
     for _ in range(60):  # the least score that the single-frame verdict takes
         middle = (below + above) / 2
         scores = np.sort(np.array([middle, *rest], np.float32))[::-1].copy()
-        verdict = judge(scores, walk(61), calibration, APART, examined).verdict
+        verdict = judge(scores, walk(61), CALIBRATION, APART, examined).verdict
         below, above = (below, middle) if verdict != "unknown" else (middle, above)
-    gains = told([above, *rest], examined, calibration)
+    gains = told([above, *rest], examined)
     assert gains[0] == pytest.approx(STRENGTH, abs=0.02)
-    assert told([2 * above, *rest], examined, calibration)[0] > 2 * STRENGTH
+    assert told([2 * above, *rest], examined)[0] > 2 * STRENGTH
 
 
 def test_only_listed_places_speak_and_none_too_loudly() -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from core.disk.files import Damage
-from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, TooNew, connect, expect_writable, transaction
+from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, expect_writable, transaction
+from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
 
 FIRST = Schema(0x74657374, 1, ["CREATE TABLE t (a INTEGER) STRICT"])
 SECOND = Schema(
@@ -38,9 +39,20 @@ def test_an_older_file_gets_the_newest_tables(tmp_path: Path) -> None:
         connection.execute("INSERT INTO t VALUES (1)")
     with closing(file_of(tmp_path).open(create=False)) as connection:
         assert connection.execute("SELECT * FROM t").fetchall() == [(1, None)]
-    with pytest.raises(TooNew) as error:
+    with pytest.raises(UnreadVersion, match="later version") as error:
         file_of(tmp_path, FIRST).open()
     assert error.value.version == 2
+    assert isinstance(error.value.refusal("t"), DataDirectoryTooNew)
+
+
+def test_a_file_older_than_the_oldest_step_is_refused(tmp_path: Path) -> None:
+    file_of(tmp_path, FIRST).open().close()
+    third = Schema(0x74657374, 3, [], {2: ["ALTER TABLE t ADD COLUMN c INTEGER"]})
+    with pytest.raises(UnreadVersion, match="before the first release") as error:
+        file_of(tmp_path, third).open()
+    assert isinstance(error.value.refusal("t"), DataDirectoryTooOld)
+    with closing(connect(tmp_path / "t.sqlite")) as connection:
+        assert pragma(connection, "user_version") == 1
 
 
 def test_a_failed_migration_changes_nothing(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def view(scores: dict[int, float], weights: dict[int, float] | None = None) -> V
 
 
 def fused(*views: View) -> Fused:
-    return fuse(views, CALIBRATION, NEIGHBORHOOD, second_stage=True)
+    return fuse(views, CALIBRATION, NEIGHBORHOOD)
 
 
 BACKGROUND = {row: 0.1 + 0.001 * row for row in range(10, 18)}

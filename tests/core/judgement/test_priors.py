@@ -18,9 +18,9 @@ from core.judgement.priors import (
     InSequences,
     NotLately,
     Period,
+    decision_slope,
     holding,
     log_odds,
-    log_odds_per_score,
     log_weights,
     weighed,
 )
@@ -161,13 +161,13 @@ def test_what_is_soft_adds_its_log_weight_to_the_log_odds() -> None:
     weights = log_weights([np.array([1.0, 0.5, 0.0]), np.array([1.0, 0.5, 1.0])], 0.9)
     np.testing.assert_allclose(np.exp(weights), [1.0, 0.1 + 0.9 * 0.25, 0.1])
     scores = np.array([0.6, 0.5, 0.4], np.float32)
-    after = weighed(scores, weights, CALIBRATION, second_stage=True)
-    np.testing.assert_allclose(log_odds_per_score(CALIBRATION, True) * (after - scores), weights, rtol=1e-4)
+    after = weighed(scores, weights, CALIBRATION)
+    np.testing.assert_allclose(decision_slope(CALIBRATION) * (after - scores), weights, rtol=1e-4)
 
 
 def test_a_place_ruled_out_scores_no_less_than_what_is_unrelated() -> None:
     weights = np.full(3, math.log(0.001))
-    after = weighed(np.array([0.3, 0.12, 0.02], np.float32), weights, CALIBRATION, second_stage=True)
+    after = weighed(np.array([0.3, 0.12, 0.02], np.float32), weights, CALIBRATION)
     np.testing.assert_allclose(after, [0.1, 0.1, 0.02], rtol=1e-6)
 
 
@@ -175,5 +175,3 @@ def test_log_odds_with_and_without_a_curve() -> None:
     assert log_odds(0.3, CALIBRATION) == pytest.approx(2)
     bare = CALIBRATION.model_copy(update={"curve": None})
     assert log_odds(0.2, bare) == pytest.approx(0) and log_odds(0, bare) == pytest.approx(-4)
-    older = bare.model_copy(update={"decision": "by-stage"})
-    assert log_odds_per_score(older, False) == pytest.approx(log_odds_per_score(older, True) / 0.05)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,8 @@ from hypothesis import strategies as st
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map
 from core.storage.attributes import Scalar
-from core.storage.database.connections import FILE, connect
-from core.storage.database.schema import _VALUES, LONGEST_INDEXED, MIGRATIONS, check_schema, migrate
+from core.storage.database.connections import FILE
+from core.storage.database.schema import LONGEST_INDEXED
 
 DIMENSION = 4
 
@@ -118,23 +117,6 @@ def test_a_forgotten_sequence_is_not_found(atlas: Atlas) -> None:
     lab.forget_sequence("monday")
     assert by_index(lab, {"n": 1}) == ["p0", "p2", "p4"]
     assert set(lab.attributes.sequence_codes(["monday", "tuesday"])) == {"tuesday"}
-
-
-def test_older_maps_are_filled_by_the_migration(tmp_path: Path) -> None:
-    before = MIGRATIONS[: list(MIGRATIONS).index(_VALUES)]
-    connection = connect(tmp_path / FILE, create=True)
-    migrate(connection, before, create=True)
-    for row, metadata in enumerate(({"floor": 2}, {"floor": 3}, {"floor": 2.0, "list": [2]}, {})):
-        connection.execute(
-            "INSERT INTO places (id, row, checksum, digest, regions, picture, sequence, ordinal, metadata, created_at,"
-            " updated_at) VALUES (?, ?, 0, zeroblob(32), 1, 'none', -1, ?, ?, '', '')",
-            (f"p{row}", row, row, json.dumps(metadata)),
-        )
-    migrate(connection)
-    check_schema(connection)
-    found = connection.execute("SELECT key, kind, value, row FROM place_values ORDER BY row").fetchall()
-    assert found == [("floor", "number", 2, 0), ("floor", "number", 3, 1), ("floor", "number", 2.0, 2)]
-    connection.close()
 
 
 def test_a_look_up_reads_the_index_alone(atlas: Atlas, tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_what_a_place_cannot_have_is_refused(changes: Any) -> None:
 
 
 NOW = datetime(2026, 11, 20, tzinfo=UTC)
-RECORD = MapRecord(id="lab", encoder="e@1", dimension=4, revision=3, created_at=NOW, updated_at=NOW)
+RECORD = MapRecord(id="lab", encoder="e@1", dimension=4, precision="half", revision=3, created_at=NOW, updated_at=NOW)
 CALIBRATION = Calibration(source="measured", threshold=3.5, margin=0.02, background_mean=0.1, background_deviation=0.02)
 
 

@@ -43,7 +43,7 @@ def thumbnail_of(picture: str) -> bytes:
 def shown(picture: str) -> Shown:
     """What must be found of a place with this picture."""
     real = descriptor_of(picture)[np.newaxis]
-    kept: tuple[Precision, ...] = ("full", "half", "compressed")
+    kept: tuple[Precision, ...] = ("half", "compressed")
     stored = {name: unpack_descriptors(pack_descriptors(real, name), name, DIMENSION) for name in kept}
     cells = local_of(picture)[np.newaxis]
     local = {name: unpack_local(pack_local(cells, name), name, LOCAL_SHAPE) for name in kept}
@@ -198,7 +198,7 @@ def _new_map(random: Random, name: str, unlisted: bool) -> Operation:
         "keep": random.choice(["none", "thumbnail", "image"]),
         "index": random.choice(["auto", "exact", "compact", "inverted"]),
     }
-    precision = random.choice(["half", "half", "full", "compressed"])
+    precision = random.choice(["half", "half", "compressed"])
     return {"do": "create", "map": name, "settings": settings, "precision": precision, "unlisted": unlisted}
 
 

@@ -6,13 +6,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from core.errors import DataDirectoryTooNew, UnknownMap
+from core.errors import DataDirectoryTooNew, DataDirectoryTooOld, UnknownMap
 from service.errors.faults import JobEnded, JobQueueFull, TooManyWatchers, UnknownJob
 from service.jobs.context import JobContext
 from service.jobs.jobs import Jobs
@@ -241,15 +240,16 @@ def test_a_damaged_file_is_put_aside(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
 
 
-def test_a_file_of_a_later_version_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("version", "refusal"), [(99, DataDirectoryTooNew), (2, DataDirectoryTooOld)])
+def test_a_file_of_another_version_is_refused(tmp_path: Path, version: int, refusal: type[Exception]) -> None:
     import sqlite3
 
     with running(tmp_path):
         pass
     connection = sqlite3.connect(tmp_path / FILE)
-    connection.execute("PRAGMA user_version = 99")
+    connection.execute(f"PRAGMA user_version = {version}")
     connection.close()
-    with pytest.raises(DataDirectoryTooNew):
+    with pytest.raises(refusal):
         Jobs(tmp_path)
 
 
@@ -313,22 +313,6 @@ def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) ->
                 jobs.get("forgotten")
         gate.open.set()
         assert end_of(jobs, jobs.submit("gate", "lab", arguments={})).state == "succeeded"
-
-
-def test_a_file_of_the_first_version_is_migrated(tmp_path: Path) -> None:
-    import sqlite3
-
-    with running(tmp_path) as jobs:
-        done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
-    connection = sqlite3.connect(tmp_path / FILE)
-    for later in ("maps", "asker"):
-        connection.execute(f"ALTER TABLE jobs DROP COLUMN {later}")
-    connection.execute("PRAGMA user_version = 1")
-    connection.commit()
-    connection.close()
-    with running(tmp_path) as jobs:
-        assert jobs.get(done.id) == replace(done, asker={})
-        assert end_of(jobs, jobs.submit("note", None, lambda _: {}, maps={"lab": "then"})).maps == {"lab": "then"}
 
 
 def test_the_files_of_a_job_are_discarded_however_it_ends(tmp_path: Path) -> None:

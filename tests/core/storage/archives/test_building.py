@@ -206,7 +206,7 @@ def test_large_pictures_are_not_even_read(content: bytes, library: Atlas, tmp_pa
         {"local_cells": 1, "local_values": 0},
     ],
 )
-@pytest.mark.parametrize("precision", ["full", "half", "compressed"])
+@pytest.mark.parametrize("precision", ["half", "compressed"])
 def test_places_that_nothing_could_hold(content: bytes, values: dict[str, Any], precision: str) -> None:
     manifest = parts_of(content)[0]
     manifest["map"] |= {**values, "precision": precision}

@@ -16,6 +16,7 @@ from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
 from core.storage import Atlas, Map, MapSettings
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
+from core.storage.files.row_formats import COMPRESSED, HALF
 from tests.core.storage.archives.files import exported, imported, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, stored_of
 from tests.core.storage.test_opening import flip
@@ -25,15 +26,15 @@ def listed(map_: Map) -> list[object]:
     return [map_.places(None, 100), map_.sequences(None, 100), map_.cameras.all(), map_.transfer.sequence_ends()]
 
 
-@pytest.mark.parametrize("precision", ["half", "compressed", "full"])
+@pytest.mark.parametrize("kind", ["of everything", "compressed", "without local descriptors"])
 def test_what_comes_back_is_what_was_there(
-    atlas: Atlas, tmp_path: Path, precision: str, request: pytest.FixtureRequest
+    atlas: Atlas, tmp_path: Path, kind: str, request: pytest.FixtureRequest
 ) -> None:
-    if precision == "half":
+    if kind == "of everything":
         source = request.getfixturevalue("full")
     else:
-        shape = (0, 0) if precision == "full" else LOCAL_SHAPE
-        source = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), shape, precision=precision)  # type: ignore[arg-type]
+        shape, precision = (LOCAL_SHAPE, COMPRESSED) if kind == "compressed" else ((0, 0), HALF)
+        source = atlas.create("lab", ENCODER, DIMENSION, MapSettings(), shape, precision=precision)
         source.enrol([frame(f"p{i}", local_shape=shape) for i in range(6)])
         source.forget("p2")
     path = tmp_path / "lab.tar"

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 import pytest
 
 from core.disk.files import Damage
-from core.errors import DataDirectoryTooNew
-from core.storage.database.schema import MIGRATIONS, check_schema, migrate
+from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
+from core.storage.database.schema import FIRST_VERSION, MIGRATIONS, check_schema, migrate
 
+NEWEST = FIRST_VERSION + len(MIGRATIONS)
 LATER = (
     *MIGRATIONS,
     ("ALTER TABLE places ADD COLUMN floor INTEGER NOT NULL DEFAULT 0", "CREATE TABLE floors (number INTEGER) STRICT"),
@@ -34,8 +35,8 @@ PLACE = (
 
 
 def test_an_empty_file_gets_the_newest_schema(connection: sqlite3.Connection) -> None:
-    assert migrate(connection, create=True) == len(MIGRATIONS)
-    assert version(connection) == len(MIGRATIONS)
+    migrate(connection, create=True)
+    assert version(connection) == NEWEST
     check_schema(connection)
     assert migrate(connection) == 0
 
@@ -44,21 +45,9 @@ def test_an_older_file_becomes_newer_and_keeps_what_it_holds(connection: sqlite3
     migrate(connection, create=True)
     connection.execute(PLACE)
     assert migrate(connection, LATER) == len(LATER) - len(MIGRATIONS)
-    assert version(connection) == len(LATER)
+    assert version(connection) == FIRST_VERSION + len(LATER)
     assert connection.execute("SELECT id, regions, floor FROM places").fetchall() == [("p", 3, 1)]
     check_schema(connection, LATER)
-
-
-def test_maps_of_the_first_schema_have_no_local_descriptors(connection: sqlite3.Connection) -> None:
-    migrate(connection, MIGRATIONS[:1], create=True)
-    columns = "only, id, encoder, dimension, rows_per_segment, description, keep, same_place_radius, same_place_frames"
-    values = "1, 'lab', 'e@1', 16, 4, '', 'none', 5.0, 3, 1, 'then', 'then'"
-    connection.execute(f"INSERT INTO map ({columns}, revision, created_at, updated_at) VALUES ({values})")
-    assert migrate(connection) == len(MIGRATIONS) - 1
-    assert connection.execute("SELECT dimension, local_cells, local_values FROM map").fetchall() == [(16, 0, 0)]
-    check_schema(connection)
-    with pytest.raises(sqlite3.IntegrityError):
-        connection.execute("UPDATE map SET local_cells = -1")
 
 
 def test_a_migration_that_fails_leaves_the_file_as_it_was(connection: sqlite3.Connection) -> None:
@@ -66,7 +55,7 @@ def test_a_migration_that_fails_leaves_the_file_as_it_was(connection: sqlite3.Co
     before = connection.execute("SELECT sql FROM sqlite_schema").fetchall()
     with pytest.raises(sqlite3.OperationalError):
         migrate(connection, (*LATER, ("SELECT nonsense",)))
-    assert version(connection) == len(MIGRATIONS)
+    assert version(connection) == NEWEST
     assert connection.execute("SELECT sql FROM sqlite_schema").fetchall() == before
     assert not connection.in_transaction
 
@@ -75,7 +64,16 @@ def test_a_later_file_is_refused_and_not_touched(connection: sqlite3.Connection)
     migrate(connection, LATER, create=True)
     with pytest.raises(DataDirectoryTooNew):
         migrate(connection)
-    assert version(connection) == len(LATER)
+    assert version(connection) == FIRST_VERSION + len(LATER)
+
+
+def test_a_file_from_before_the_first_release_is_refused_and_not_touched(connection: sqlite3.Connection) -> None:
+    migrate(connection, create=True)
+    connection.execute("ALTER TABLE segments DROP COLUMN removed")
+    connection.execute("PRAGMA user_version = 6")
+    with pytest.raises(DataDirectoryTooOld, match="before the first release of placerec \\(schema 6"):
+        migrate(connection)
+    assert version(connection) == 6
 
 
 def test_what_is_not_ours_is_refused(connection: sqlite3.Connection) -> None:
@@ -112,9 +110,9 @@ def test_a_later_file_with_the_same_columns_is_refused_as_such(connection: sqlit
         migrate(connection)
 
 
-def test_a_version_that_is_not_that_of_the_tables_is_damage(connection: sqlite3.Connection) -> None:
-    migrate(connection, MIGRATIONS[:1], create=True)
-    migrate(connection)  # by way of an older file
-    connection.execute(f"PRAGMA user_version = {len(MIGRATIONS) | 64}")
+@pytest.mark.parametrize("flipped", [4, 64])
+def test_a_version_that_is_not_that_of_the_tables_is_damage(connection: sqlite3.Connection, flipped: int) -> None:
+    migrate(connection, create=True)
+    connection.execute(f"PRAGMA user_version = {NEWEST ^ flipped}")
     with pytest.raises(Damage, match="schema"):
         migrate(connection)

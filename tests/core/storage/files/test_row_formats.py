@@ -16,7 +16,7 @@ from core.storage.files.row_formats import (
 )
 from tests.core.storage.frames import descriptor_of, local_of
 
-PRECISIONS: tuple[Precision, ...] = ("full", "half", "compressed")
+PRECISIONS: tuple[Precision, ...] = ("half", "compressed")
 
 
 def descriptors(count: int, dimension: int) -> NDArray[np.float32]:
@@ -33,7 +33,7 @@ def test_what_is_kept_has_the_type_that_a_record_gives_it(precision: Precision, 
     assert (str(back.dtype), back.shape) == ("float32", (3, dimension))
 
 
-@pytest.mark.parametrize(("precision", "bound"), [("full", 0), ("half", 2.0**-11), ("compressed", 1 / 61.9)])
+@pytest.mark.parametrize(("precision", "bound"), [("half", 2.0**-11), ("compressed", 1 / 61.9)])
 def test_no_value_is_off_by_more_than_half_a_step(precision: Precision, bound: float) -> None:
     """Of halves a step is 2^-10 of the value, of compressed values a thirty-first of the largest of their block."""
     given = descriptors(5, 1024)

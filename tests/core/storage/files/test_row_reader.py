@@ -31,7 +31,7 @@ def filled(folder: Path, precision: Precision) -> tuple[RowReader, NDArray[np.vo
     return RowReader(folder, layout), records
 
 
-EVERY: list[Precision] = ["full", "half", "compressed"]
+EVERY: list[Precision] = ["half", "compressed"]
 
 
 @pytest.mark.parametrize("precision", EVERY)

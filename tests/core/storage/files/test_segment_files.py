@@ -21,16 +21,16 @@ from core.storage.files.segment_files import (
     segment_checksum,
     segment_name,
 )
-from tests.core.storage.frames import descriptor_of, local_of, packed
+from tests.core.storage.frames import descriptor_of, local_of, packed, stored_of
 
 LAYOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4, local_shape=(3, 5))
 WITHOUT = Layout(dimension=8, identity="encoder@1", rows_per_segment=4)
-RECORD_BYTES = 8 * 4 + 15 + 16
-HALF = replace(LAYOUT, precision="half")
+SPARE = 8 * 2 + 20  # the offset of the four bytes that nothing uses
+RECORD_BYTES = 8 * 2 + 24 + 15
 
 
 def rows(count: int, start: int = 0) -> list[NDArray[np.float32]]:
-    return [descriptor_of(f"row {start + i}", LAYOUT.dimension) for i in range(count)]
+    return [stored_of(f"row {start + i}", LAYOUT.dimension) for i in range(count)]
 
 
 def local(count: int, start: int = 0) -> list[NDArray[np.int8]]:
@@ -79,12 +79,9 @@ def test_the_checksum_of_a_segment_can_be_continued() -> None:
 def test_the_checksum_of_a_row_is_of_all_that_it_holds() -> None:
     (descriptor,), (cells,) = rows(1), local(1)
     others = [(rows(1, 1)[0], cells, 0), (descriptor, local(1, 1)[0], 0), (descriptor, cells, 1)]
-    for layout in (LAYOUT, HALF):
-        assert checksum_of(layout, descriptor, cells, 0) not in [checksum_of(layout, *other) for other in others]
-    place = struct.pack("<Q", 7)
-    assert checksum_of(LAYOUT, descriptor, cells, 7) == zlib.crc32(descriptor.tobytes() + cells.tobytes() + place)
-    parts = [zlib.crc32(part.tobytes() + place) for part in (descriptor.astype("<f2"), cells)]
-    assert checksum_of(HALF, descriptor, cells, 7) == zlib.crc32(struct.pack("<II", *parts))
+    assert checksum_of(LAYOUT, descriptor, cells, 0) not in [checksum_of(LAYOUT, *other) for other in others]
+    parts = [zlib.crc32(part.tobytes() + struct.pack("<Q", 7)) for part in (descriptor.astype("<f2"), cells)]
+    assert checksum_of(LAYOUT, descriptor, cells, 7) == zlib.crc32(struct.pack("<II", *parts))
 
 
 def test_only_the_rows_asked_for_count(tmp_path: Path) -> None:
@@ -98,7 +95,7 @@ def test_rows_behind_are_overwritten(tmp_path: Path) -> None:
     first = write(tmp_path, 0, 3)
     second = write(tmp_path, 2, 1, 77)
     found = stored(tmp_path, 0, 3, segment_checksum([*first[:2], *second]))
-    np.testing.assert_array_equal(found[2], descriptor_of("row 77", LAYOUT.dimension))
+    np.testing.assert_array_equal(found[2], rows(1, 77)[0])
 
 
 @pytest.mark.parametrize(("kept", "files", "size"), [(0, 0, 0), (2, 1, 2), (4, 1, 4), (5, 2, 1), (9, 3, 1), (10, 3, 2)])
@@ -121,7 +118,7 @@ def test_a_damaged_header_is_found(tmp_path: Path, offset: int) -> None:
         stored(tmp_path, 0, 2, segment_checksum(checksums))
 
 
-@pytest.mark.parametrize("offset", range(RECORD_BYTES - 4))
+@pytest.mark.parametrize("offset", [*range(SPARE), *range(SPARE + 4, RECORD_BYTES)])
 def test_every_flipped_bit_of_a_record_is_found(tmp_path: Path, offset: int) -> None:
     checksums = write(tmp_path, 0, 3)
     flip(tmp_path / segment_name(0), HEADER_BYTES + RECORD_BYTES + offset)
@@ -166,7 +163,7 @@ def test_a_file_that_is_missing_or_short(tmp_path: Path) -> None:
         replace(LAYOUT, identity="encoder@2"),
         replace(LAYOUT, rows_per_segment=5),
         replace(LAYOUT, local_shape=(5, 3)),
-        HALF,
+        replace(LAYOUT, precision="compressed"),
         WITHOUT,
     ],
 )
@@ -185,51 +182,39 @@ def test_local_descriptors_of_no_shape(shape: tuple[int, int]) -> None:
         replace(LAYOUT, local_shape=shape)
 
 
-def test_without_local_descriptors_a_file_is_as_it_always_was(tmp_path: Path) -> None:
-    """Version 1, written out by its rules."""
-    append(tmp_path, WITHOUT, 4, packed(WITHOUT, rows(2, 4), [local_of("", (0, 0))] * 2, 4))
-    head = struct.pack("<8sI8sIIQH", b"PLRCSEG\x00", 1, b"<f4", 8, 4, 4, 9) + b"encoder@1"
+@pytest.mark.parametrize("layout", [LAYOUT, WITHOUT], ids=["with local descriptors", "without"])
+def test_a_file_written_out_by_its_rules(tmp_path: Path, layout: Layout) -> None:
+    cells = [local_of(f"row {row}", layout.local_shape) for row in (4, 5)]
+    append(tmp_path, layout, 4, packed(layout, rows(2, 4), cells, 4))
+    head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 3, b"<f2", 8, 4, 4, 9, *layout.local_shape) + b"encoder@1"
     expected = head.ljust(4092, b"\x00") + struct.pack("<I", zlib.crc32(head.ljust(4092, b"\x00")))
-    for row in (4, 5):
-        values = rows(1, row)[0].tobytes()
-        checksum = zlib.crc32(values + struct.pack("<Q", row))
-        expected += values + struct.pack("<QII", row, checksum, 0)
+    for row, (halves, local_bytes) in enumerate(
+        [(rows(1, row)[0].astype("<f2").tobytes(), cells[row - 4].tobytes()) for row in (4, 5)], start=4
+    ):
+        sums = [zlib.crc32(part + struct.pack("<Q", row)) for part in (halves, local_bytes)]
+        expected += halves + struct.pack("<QIIII", row, zlib.crc32(struct.pack("<II", *sums)), *sums, 0) + local_bytes
     assert (tmp_path / segment_name(1)).read_bytes() == expected
 
 
-def test_the_header_says_what_is_in_a_record(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("version", "kept"), [(1, b"<f4"), (2, b"<f4"), (4, b"<f2")])
+def test_a_file_of_a_version_that_no_release_wrote_is_refused(tmp_path: Path, version: int, kept: bytes) -> None:
     write(tmp_path, 0, 1)
-    header = (tmp_path / segment_name(0)).read_bytes()[:HEADER_BYTES]
-    head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 2, b"<f4", 8, 4, 0, 9, 3, 5) + b"encoder@1"
-    assert header[:-4] == head.ljust(HEADER_BYTES - 4, b"\x00")
-
-
-def test_version_3_written_out_by_its_rules(tmp_path: Path) -> None:
-    append(tmp_path, HALF, 4, packed(HALF, rows(2, 4), local(2, 4), 4))
-    head = struct.pack("<8sI8sIIQHII", b"PLRCSEG\x00", 3, b"<f2", 8, 4, 4, 9, 3, 5) + b"encoder@1"
-    expected = head.ljust(4092, b"\x00") + struct.pack("<I", zlib.crc32(head.ljust(4092, b"\x00")))
-    for row in (4, 5):
-        halves, cells = rows(1, row)[0].astype("<f2").tobytes(), local(1, row)[0].tobytes()
-        sums = [zlib.crc32(part + struct.pack("<Q", row)) for part in (halves, cells)]
-        expected += halves + struct.pack("<QIIII", row, zlib.crc32(struct.pack("<II", *sums)), *sums, 0) + cells
-    assert (tmp_path / segment_name(1)).read_bytes() == expected
-
-
-@pytest.mark.parametrize("offset", [*range(8 * 2 + 20), *range(8 * 2 + 24, 8 * 2 + 24 + 15)])
-def test_every_flipped_bit_of_a_record_of_version_3_is_found(tmp_path: Path, offset: int) -> None:
-    records = packed(HALF, rows(3), local(3), 0)
-    append(tmp_path, HALF, 0, records)
-    flip(tmp_path / segment_name(0), HEADER_BYTES + records.dtype.itemsize + offset)
-    with pytest.raises(Damage, match="row 1 does not match"):
-        list(read_checked(tmp_path, HALF, 0, 3, segment_checksum(records["checksum"])))
+    path = tmp_path / segment_name(0)
+    content = bytearray(path.read_bytes())
+    content[8:20] = struct.pack("<I8s", version, kept)
+    content[HEADER_BYTES - 4 : HEADER_BYTES] = struct.pack("<I", zlib.crc32(content[: HEADER_BYTES - 4]))
+    path.write_bytes(content)
+    with pytest.raises(Damage, match="another map, encoder, segment or version"):
+        list(read_records(tmp_path, LAYOUT, 0, 1))
 
 
 def test_what_comes_back_is_the_descriptor_to_half_precision() -> None:
-    records = packed(HALF, rows(5), local(5), 0)
-    np.testing.assert_array_equal(HALF.descriptors_of(records), np.array(rows(5)).astype(np.float16))
-    np.testing.assert_allclose(HALF.descriptors_of(records), rows(5), rtol=2**-11)
-    np.testing.assert_array_equal(HALF.locals_of(records), local(5))
-    types = [str(part.dtype) for part in (HALF.descriptors_of(records), HALF.locals_of(records))]
+    given = [descriptor_of(f"row {i}", LAYOUT.dimension) for i in range(5)]
+    records = packed(LAYOUT, given, local(5), 0)
+    np.testing.assert_array_equal(LAYOUT.descriptors_of(records), np.array(given).astype(np.float16))
+    np.testing.assert_allclose(LAYOUT.descriptors_of(records), given, rtol=2**-11)
+    np.testing.assert_array_equal(LAYOUT.locals_of(records), local(5))
+    types = [str(part.dtype) for part in (LAYOUT.descriptors_of(records), LAYOUT.locals_of(records))]
     assert types == ["float32", "int8"]
 
 

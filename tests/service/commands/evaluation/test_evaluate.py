@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -234,3 +235,13 @@ def test_the_default_encoder_on_the_corridor(placerec: Placerec, tmp_path: Path)
     assert figures["auc_pr"] >= 0.75
     assert figures["recall_at"]["1"] >= 0.55
     assert figures["recall_at"]["1"] == pytest.approx(np.mean([matched for _, _, _, matched in rows]))
+
+
+def test_a_report_without_what_draws_it_is_refused_before_the_work(
+    placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    both = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--report", tmp_path / "report")
+    said = placerec("evaluate", *both, status=1).stderr
+    assert "This needs matplotlib" in said and "pip install 'placerec[report]'" in said
+    assert not (tmp_path / "report").exists() and not (tmp_path / "cache").exists()

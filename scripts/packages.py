@@ -1,0 +1,120 @@
+"""Install the packages of a lock file into the environment of the Python that runs this.
+
+    .venv/bin/python scripts/packages.py service|development
+    .venv/bin/python scripts/packages.py --settings     # prints uv's variables for pip's configuration
+
+uv does it in seconds; requirements/installer.lock pins it.  Where uv cannot be had, or fails, pip does it.  Both look
+where pip is configured to look.  TORCH_BACKEND names the build of torch: ``cpu`` (the default), ``auto`` (CUDA if this
+machine has a driver for it), or any other that ``uv pip install --torch-backend`` knows.  uv looks for it in PyTorch's
+own indexes; where these cannot be reached, torch is the build that pip's indexes have.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+REQUIREMENTS = Path(__file__).parents[1] / "requirements"
+PIP = (sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+SECTIONS = ("global", "install", ":env:")
+"""The sections of pip's configuration that matter here; the last one that has a value counts."""
+
+SETTINGS = {
+    "index-url": ("UV_DEFAULT_INDEX", " "),
+    "extra-index-url": ("UV_INDEX", " "),
+    "find-links": ("UV_FIND_LINKS", ","),
+    "no-index": ("UV_NO_INDEX", " "),
+    "trusted-host": ("UV_INSECURE_HOST", " "),
+    "cert": ("SSL_CERT_FILE", " "),
+    "proxy": ("ALL_PROXY", " "),
+    "timeout": ("UV_HTTP_TIMEOUT", " "),
+    "default-timeout": ("UV_HTTP_TIMEOUT", " "),
+}
+"""uv's variable for each of pip's settings, and what separates several values in it."""
+
+
+def pip_settings() -> str:
+    """What ``pip config list`` prints."""
+    return subprocess.run([*PIP[:3], "config", "list"], check=True, capture_output=True, text=True).stdout
+
+
+def uv_settings(listing: str) -> dict[str, str]:
+    """uv's environment variables for what ``pip config list`` has printed."""
+    found: dict[str, tuple[int, str]] = {}
+    for line in listing.splitlines():
+        name, _, value = line.partition("=")
+        section, _, key = name.partition(".")
+        if section in SECTIONS and key in SETTINGS and (values := str(ast.literal_eval(value)).split()):
+            variable, separator = SETTINGS[key]
+            rank = SECTIONS.index(section)
+            if rank >= found.get(variable, (0, ""))[0]:
+                found[variable] = rank, separator.join(values)
+    # Of all indexes the best version, as pip does, not that of the first index; hashes say which files are right.
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match"} | {name: value for name, (_, value) in found.items()}
+
+
+def install_by_uv(lock: Path, folder: Path) -> None:
+    """Install torch and the lock's packages by a uv that is put into ``folder``.
+
+    Raises:
+        subprocess.CalledProcessError, OSError: uv cannot be had, or fails.
+    """
+    tool = ("--requirement", REQUIREMENTS / "installer.lock")
+    subprocess.run([*PIP, "--target", folder, "--no-deps", "--require-hashes", *tool], check=True)
+    environment = {**uv_settings(pip_settings()), **os.environ}
+    torch = ("--requirement", REQUIREMENTS / "torch.lock")
+    backend: tuple[str, ...] = ("--torch-backend", os.environ.get("TORCH_BACKEND", "cpu"))
+
+    def uv(*arguments: str | Path, quiet: bool = False) -> subprocess.CompletedProcess[bytes]:
+        command = [folder / "bin" / "uv", "pip", "install", "--quiet", "--python", sys.executable, *arguments]
+        return subprocess.run(command, env=environment, check=not quiet, capture_output=quiet)
+
+    if uv("--no-deps", *backend, *torch, quiet=True).returncode:
+        print(
+            f"The {backend[1]} build of torch cannot be had from PyTorch's own index. torch is the build that pip's"
+            " indexes have; if that is the CUDA build, it takes several GB.",
+            file=sys.stderr,
+        )
+        backend = ()
+        uv("--no-deps", *torch)
+    uv("--require-hashes", "--requirement", lock)
+    uv(*backend, *torch)  # the libraries that a CUDA build asks for; the CPU build's are in the lock
+
+
+def install_by_pip(lock: Path) -> None:
+    """Install torch and the lock's packages by pip, torch from wherever it finds it.
+
+    Raises:
+        subprocess.CalledProcessError: it fails.
+    """
+    torch = ("--requirement", REQUIREMENTS / "torch.lock")
+    # torch first and by its exact pin, so that nothing else can bring in another build.
+    for arguments in (("--no-deps", *torch), ("--require-hashes", "--requirement", lock), torch):
+        subprocess.run([*PIP, *arguments], check=True)
+
+
+def main(profile: str) -> int:
+    """Install a profile, or print uv's settings; the exit status."""
+    if profile == "--settings":
+        print("\n".join(f"{name}={value}" for name, value in uv_settings(pip_settings()).items()))
+        return 0
+    lock = REQUIREMENTS / f"{profile}.lock"
+    try:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                install_by_uv(lock, Path(folder))
+        except (subprocess.CalledProcessError, OSError):
+            print("uv could not install the packages; pip does it, which takes minutes.", file=sys.stderr)
+            install_by_pip(lock)
+    except subprocess.CalledProcessError as error:
+        print(f"The packages could not be installed: pip ended with status {error.returncode}.", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))
