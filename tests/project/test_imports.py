@@ -76,7 +76,8 @@ def test_examples_know_nothing_of_the_project() -> None:
 def test_what_is_imported_is_declared(folder: str) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     developing = folder in ("tests", "benchmarks")
-    texts = project["dependencies"] + (project["optional-dependencies"]["dev"] if developing else [])
+    extras = [texts for name, texts in project["optional-dependencies"].items() if developing or name != "dev"]
+    texts = sum(extras, project["dependencies"])
     declared = {canonicalize_name(Requirement(text).name) for text in texts}
     examples = {path.stem for path in (ROOT / "examples").glob("*.py")}
     known = set(sys.stdlib_module_names) | set(FOLDERS) | examples
