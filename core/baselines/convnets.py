@@ -48,8 +48,6 @@ VGG_SIDE = 224
 IMAGENET_MEAN = (104.00699, 116.66877, 122.67892)
 """The mean that Caffe publishes for ImageNet, BGR."""
 
-_MEAN_VALUE = 5  # of Caffe's TransformationParameter
-
 
 @dataclass(frozen=True)
 class Published:
@@ -80,7 +78,7 @@ def import_published(model: Path, published: Published, side: int) -> tuple[Netw
     stem = f"{model.stem}_mean"
     names = [f"{stem}.npy", f"{stem}.binaryproto", *published.means]
     mean: Path | tuple[float, float, float] | None = mean_file(model, names)
-    if mean is None and not any(_MEAN_VALUE in layer.part("transform") for layer in read_caffemodel(model).layers):
+    if mean is None and not any("mean" in layer.part("transform") for layer in read_caffemodel(model).layers):
         mean = published.mean
         if mean is None:
             raise MissingWeights(f"{model.name} needs its mean file too; put it beside it as {' or '.join(names)}.")

@@ -1,7 +1,8 @@
-"""JPEG, PNG and WebP files seen from outside: which format, how large, whole or cut, where the EXIF block is.
+"""JPEG, PNG and WebP files seen from outside: which format, how large, where the EXIF block is.
 
-Everything is read from the bytes alone and before any decoding, so that a picture of a billion pixels
-costs as little to refuse as a small one to accept.  The walks read a file as its decoder does.
+Everything is read from the bytes alone and before any decoding, so that a picture of a billion pixels costs as little
+to refuse as a small one to accept.  The walks read a file as its decoder does: PNG and WebP files to their end, JPEG
+files to their first scan, because only decoding shows whether the rest is there (``core.frames.jpeg``).
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ MAX_JPEG_SCANS = 64
 """Encoders write about ten; each may cost the decoder a pass over the whole picture, even an empty one."""
 
 MAX_SEGMENTS = 2048
-"""Parts of a JPEG file. A frame has about ten; metadata of 16 MiB needs 256."""
+"""Parts of a JPEG file before its first scan. A frame has about ten; metadata of 16 MiB needs 256."""
 
 MAX_GAP = 256
-"""Stray bytes tolerated before a JPEG marker outside the coded data, so that a header is found at once or not."""
+"""Stray bytes tolerated before a JPEG marker, so that a header is found at once or not."""
 
 MAX_CHUNKS = 16_384
 """Parts of a PNG or WebP file. A frame has a few; a PNG of 16 MiB in pieces of 8 KiB has 2 048."""
 
 # A marker of a JPEG file. FF00 is a data byte FF, FFFF is padding, D0 to D7 only restart the decoder.
 _MARKER = re.compile(rb"\xff([\x02-\xcf\xd8-\xfe])")
-_SOI, _EOI, _SOS, _DRI, _APP1, _JPEG_LS = 0xD8, 0xD9, 0xDA, 0xDD, 0xE1, 0xF7
-_RESTART, _RESTARTS = re.compile(rb"\xff([\xd0-\xd7])"), bytes(range(0xD0, 0xD8))
+_SOI, _EOI, _SOS, _APP1, _JPEG_LS = 0xD8, 0xD9, 0xDA, 0xE1, 0xF7
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOFn; DHT, JPG and DAC lie between them
-_DECODABLE_FRAMES = frozenset({0xC0, 0xC1, 0xC2, 0xC9, 0xCA})  # baseline, extended, progressive, both codings
+_PROGRESSIVE_FRAMES = frozenset({0xC2, 0xCA})
+_DECODABLE_FRAMES = _PROGRESSIVE_FRAMES | {0xC0, 0xC1, 0xC9}  # baseline, extended, progressive, both codings
 
 _OTHER_FORMATS: tuple[tuple[str, re.Pattern[bytes]], ...] = tuple(
     (name, re.compile(pattern, re.DOTALL))
@@ -75,16 +76,12 @@ class Structure:
     """What a walk through a whole file found.
 
     exif: the EXIF block (a TIFF file of its own), or None.
-    coded: of a JPEG file, ``data[start:end]`` of each stretch of coded data, one to a scan.
-    restarts: whether restart markers divide them.
-    plain: one scan of one or three colours, such as cameras write.
+    coded: of a JPEG file, where the data of its first scan begins.
     needed: of a PNG file, where chunks stand that a decoder needs; empty if it needs all of them.
     """
 
     exif: bytes | None
-    coded: tuple[tuple[int, int], ...] = ()
-    restarts: bool = False
-    plain: bool = True
+    coded: int = 0
     needed: tuple[tuple[int, int], ...] = ()
 
 
@@ -134,11 +131,10 @@ def read_header(data: bytes) -> Header:
 
 
 def read_structure(data: bytes, header: Header) -> Structure:
-    """Walk through the whole file.
+    """Walk through the file, of JPEG up to its first scan.
 
     Raises:
-        TruncatedImage: the file ends before the image does, or a stretch of it is missing. Bytes after its end are
-            tolerated.
+        TruncatedImage: the file ends before the image does. Bytes after its end are tolerated.
         NotAnImage: the parts of the file are damaged, or more than any real file has.
         UnsupportedFormat: an animation.
     """
@@ -152,7 +148,7 @@ def read_structure(data: bytes, header: Header) -> Structure:
 
 
 def check_structure(data: bytes, header: Header) -> bytes | None:
-    """The EXIF block of a whole file, or None without one; errors as for :func:`read_structure`."""
+    """The EXIF block of a file, or None without one; errors as for :func:`read_structure`."""
     return read_structure(data, header).exif
 
 
@@ -161,7 +157,7 @@ def _bare(exif: bytes | None) -> bytes | None:
 
 
 def find_exif(data: bytes) -> bytes | None:
-    """The EXIF block of an image file; None if it has none or is not a whole image."""
+    """The EXIF block of an image file; None if it has none or its parts are damaged."""
     try:
         return check_structure(data, read_header(data))
     except InvalidImage:
@@ -172,35 +168,33 @@ def find_exif(data: bytes) -> bytes | None:
 
 
 def _walk_jpeg(data: bytes) -> Iterator[_Segment]:
-    """The segments of a JPEG file up to its EOI; the coded data between them is passed over.
+    """The segments of a JPEG file up to the header of its first scan.
 
     Raises:
-        TruncatedImage: there is no EOI, or a segment is cut.
+        TruncatedImage: the file ends before, or a segment is cut.
         NotAnImage: a segment is shorter than its own length field, or bytes between segments are of none.
     """
-    position, coded = 2, False
+    position = 2
     for _ in range(MAX_SEGMENTS):
-        limit = len(data) if coded else min(len(data), position + MAX_GAP)
+        limit = min(len(data), position + MAX_GAP)
         found = _MARKER.search(data, position, limit)
         if found is None and limit < len(data):
             raise NotAnImage("The JPEG file is damaged: a segment does not begin where it should.")
         if found is None:
-            raise TruncatedImage("The JPEG file is cut: it has no end marker.")
-        marker, position = found[1][0], found.end()
+            raise TruncatedImage("The JPEG file is cut: it ends inside its header.")
+        marker, start = found[1][0], found.end() + 2
         if marker == _SOI:
             raise TruncatedImage("The JPEG file is cut: another one begins inside it.")
         if marker == _EOI:
-            yield _Segment(marker, position, position)
             return
-        if position + 2 > len(data):
+        position = start - 2 + int.from_bytes(data[start - 2 : start], "big")
+        if max(start, position) > len(data):
             raise TruncatedImage("The JPEG file is cut inside a segment.")
-        end = position + int.from_bytes(data[position : position + 2], "big")
-        if end < position + 2:
+        if position < start:
             raise NotAnImage("The JPEG file is damaged: a segment has no length.")
-        if end > len(data):
-            raise TruncatedImage("The JPEG file is cut inside a segment.")
-        yield _Segment(marker, position + 2, end)
-        position, coded = end, coded or marker == _SOS
+        yield _Segment(marker, start, position)
+        if marker == _SOS:
+            return
     raise NotAnImage(f"The JPEG file has more than {MAX_SEGMENTS} segments.")
 
 
@@ -208,8 +202,6 @@ def _read_jpeg_header(data: bytes) -> Header:
     for segment in _walk_jpeg(data):
         if segment.marker == _JPEG_LS:
             raise UnsupportedFormat("The image is of the format JPEG-LS; send JPEG, PNG or WebP.")
-        if segment.marker in (_SOS, _EOI):
-            break
         if segment.marker not in _FRAMES:
             continue
         if segment.end - segment.start < 6:
@@ -225,33 +217,17 @@ def _read_jpeg_header(data: bytes) -> Header:
 
 
 def _check_jpeg(data: bytes) -> Structure:
-    exif, restarts, colours, opened = None, False, 0, -1
-    coded: list[tuple[int, int]] = []
+    exif, scans, segment = None, 0, None
     for segment in _walk_jpeg(data):
-        if opened >= 0:
-            coded.append((opened, segment.start - (2 if segment.marker == _EOI else 4)))
-            opened = -1
-        if segment.marker == _SOS:
-            if len(coded) >= MAX_JPEG_SCANS:
-                raise NotAnImage(f"The JPEG file has more than {MAX_JPEG_SCANS} scans.")
-            opened = segment.end
-        elif segment.marker == _DRI:
-            restarts = restarts or any(data[segment.start : segment.end])
-        elif segment.marker in _FRAMES and segment.end - segment.start >= 6:
-            colours = data[segment.start + 5]
-        elif segment.marker == _APP1 and exif is None and data.startswith(EXIF_PREFIX, segment.start, segment.end):
+        if segment.marker == _APP1 and exif is None and data.startswith(EXIF_PREFIX, segment.start, segment.end):
             exif = data[segment.start : segment.end]
-    if not coded:
+        elif segment.marker in _PROGRESSIVE_FRAMES:
+            scans = data.count(bytes([0xFF, _SOS]), segment.end)
+    if scans > MAX_JPEG_SCANS:
+        raise NotAnImage(f"The JPEG file has more than {MAX_JPEG_SCANS} scans.")
+    if segment is None or segment.marker != _SOS:
         raise NotAnImage("The JPEG file is damaged: it has no image data.")
-    if restarts and not all(_restarts_in_order(data[start:end]) for start, end in coded):
-        raise TruncatedImage("The JPEG file is cut: a stretch of its data is missing.")
-    return Structure(_bare(exif), tuple(coded), restarts, len(coded) == 1 and colours in (1, 3))
-
-
-def _restarts_in_order(coded: bytes) -> bool:
-    """Whether the restart markers of a scan count from 0 to 7 and again: one that is lost leaves a gap."""
-    found = b"".join(_RESTART.findall(coded))
-    return found == (_RESTARTS * (len(found) // len(_RESTARTS) + 1))[: len(found)]
+    return Structure(_bare(exif), segment.end)
 
 
 # PNG (W3C, section 5)

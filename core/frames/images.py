@@ -15,12 +15,11 @@ from core.errors import (
     InvalidImage,
     NotAnImage,
     TooManyPixels,
-    TruncatedImage,
 )
 from core.frames.containers import Header, read_header, read_structure
 from core.frames.exif import read_orientation
+from core.frames.jpeg import decode_jpeg
 from core.frames.preprocessing import Pixels
-from core.frames.truncation import may_be_filled, same, with_other_endings
 
 __all__ = ["Header", "Limits", "Pixels", "decode", "encode_png", "encode_thumbnail", "read_header"]
 
@@ -71,14 +70,14 @@ def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
     structure = read_structure(data, header)
     if structure.needed:
         data = b"".join(data[start:end] for start, end in structure.needed)
-    pixels = _pixels(data)
+    if header.format == "jpeg":
+        pixels: Pixels | None = decode_jpeg(data, (header.height, header.width), structure.coded, _pixels)
+    else:
+        pixels = _pixels(data)
     if pixels is None:
         raise NotAnImage(f"The {header.format} data is damaged: it cannot be decoded.")
     if pixels.shape != (header.height, header.width, 3) or pixels.dtype != np.uint8:
         raise NotAnImage(f"The {header.format} header announces {size}, its data holds another picture.")
-    filled = header.format == "jpeg" and may_be_filled(structure, pixels)
-    if filled and not same(_pixels(with_other_endings(data, structure)), pixels):
-        raise TruncatedImage(f"The JPEG file is cut: its data ends before the {size} of its header do.")
     return _upright(pixels, read_orientation(structure.exif))
 
 

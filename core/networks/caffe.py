@@ -18,15 +18,17 @@ from torch import Tensor, nn
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
-from core.networks.caffemodel import CaffeLayer, CaffeNetwork, read_caffemodel, read_mean
+from core.networks.caffemodel import CaffeLayer, CaffeNetwork, Part, read_caffemodel, read_mean
 from core.networks.network import Convolution, Layer, NetworkDefinition, Normalization, Pooling, Relu
-from core.networks.protobuf import Message
 
 _TRUNK = {"Convolution", "ReLU", "Pooling", "LRN"}
 _PASSED = {"Dropout", "Split"}  # change nothing when a network is run
 _HEADS = {
     "Accuracy", "ArgMax", "Flatten", "HDF5Output", "InnerProduct", "Reshape", "Silence", "Softmax",
 }  # fmt: skip
+
+_DATA = ("transform", "data", "image_data")
+"""Groups of parameters that say how pictures are fed to the network."""
 
 _LAYER_NAME = re.compile(r"[A-Za-z0-9_/+-]{1,64}")
 MAX_SIDE = 4096
@@ -85,7 +87,7 @@ def import_caffe(
 
 def _is_head(layer: CaffeLayer) -> bool:
     """Whether a layer's output is not a map of activations any more, or serves training only."""
-    whole_map = layer.type == "Pooling" and layer.part("pooling").integer(12) != 0
+    whole_map = layer.type == "Pooling" and layer.part("pooling").get("global", False)
     return layer.type in _HEADS or layer.type.endswith("Loss") or whole_map
 
 
@@ -130,22 +132,21 @@ def _network_name(model: Path) -> str:
 def _input_size(network: CaffeNetwork) -> tuple[int, int]:
     """Height and width; the deployed network's own input comes before the crops it was trained on."""
     layers = network.layers
-    shapes = [message.integers(1) for layer in layers for message in layer.part("input").messages(1)]
+    shapes = [shape.get("dim", []) for layer in layers for shape in layer.part("input").get("shape", [])]
     for shape in (*shapes, network.input_shape):
         if shape:
             if len(shape) != 4 or shape[1] != 3:
                 raise InvalidModel(f"The network's input is {tuple(shape[:8])}, not of 3 channels, height and width.")
             return shape[2], shape[3]
-    crops = [layer.part("transform").integer(3) for layer in layers]
-    crops += [layer.part(key).integer(5) for layer in layers for key in ("data", "image_data")]
-    crop = next((crop for crop in crops if crop), None)
+    parts = [layer.part(key) for key in _DATA for layer in layers]
+    crop = next((part["crop"] for part in parts if part.get("crop")), None)
     if crop is None:
         raise InvalidModel("The model does not say its input size; give it.")
     return crop, crop
 
 
 def _named_mean(layers: Sequence[CaffeLayer]) -> tuple[float, float, float]:
-    found = next((values for layer in layers if len(values := layer.part("transform").floats(5))), None)
+    found = next((layer.part("transform")["mean"] for layer in layers if "mean" in layer.part("transform")), None)
     if found is None:
         raise InvalidModel("The model does not name the mean of its channels; give its mean file.")
     if len(found) not in (1, 3):
@@ -155,9 +156,8 @@ def _named_mean(layers: Sequence[CaffeLayer]) -> tuple[float, float, float]:
 
 
 def _named_scale(layers: Sequence[CaffeLayer]) -> float:
-    parts = [(layer.part("transform"), 1) for layer in layers]
-    parts += [(layer.part(key), 2) for layer in layers for key in ("data", "image_data")]
-    return next((part.float(number, 1.0) for part, number in parts if number in part), 1.0)
+    parts = [layer.part(key) for key in _DATA for layer in layers]
+    return next((part["scale"] for part in parts if "scale" in part), 1.0)
 
 
 # Each layer
@@ -171,7 +171,7 @@ def _translate(layer: CaffeLayer) -> Layer:
         case "Convolution":
             return _translate_convolution(layer)
         case "ReLU":
-            return Relu(name=layer.name, negative_slope=_finite(layer, layer.part("relu").float(1, 0.0)))
+            return Relu(name=layer.name, negative_slope=_finite(layer, layer.part("relu").get("negative_slope", 0.0)))
         case "Pooling":
             return _translate_pooling(layer)
         case _:
@@ -180,34 +180,34 @@ def _translate(layer: CaffeLayer) -> Layer:
 
 def _translate_convolution(layer: CaffeLayer) -> Convolution:
     part = layer.part("convolution")
-    if _side(layer, part, "dilation", (18,), 1) != 1:
+    if _side(layer, part, "dilation", 1) != 1:
         raise InvalidModel(f"The network's {layer} is dilated.")
-    if part.integer(16, 1) != 1:
+    if part.get("axis", 1) != 1:
         raise InvalidModel(f"The network's {layer} does not run over the channels.")
-    channels, groups = part.integer(1), part.integer(5, 1)
+    channels, groups = part.get("channels", 0), part.get("groups", 1)
     if channels > MAX_CHANNELS or not 0 < groups <= MAX_CHANNELS or channels % groups:
         raise InvalidModel(f"The network's {layer} has {channels} channels in {groups} groups.")
     return Convolution(
         name=layer.name,
         channels=channels,
-        kernel=_side(layer, part, "kernel", (4, 11, 12)),
-        stride=_side(layer, part, "stride", (6, 13, 14), 1),
-        pad=_side(layer, part, "pad", (3, 9, 10), 0),
+        kernel=_side(layer, part, "kernel"),
+        stride=_side(layer, part, "stride", 1),
+        pad=_side(layer, part, "pad", 0),
         groups=groups,
     )
 
 
 def _translate_pooling(layer: CaffeLayer) -> Pooling:
     part = layer.part("pooling")
-    method, rounding = part.integer(1), part.integer(13)
+    method, rounding = part.get("method", 0), part.get("rounding", 0)
     if method > 1 or rounding > 1:
         raise InvalidModel(f"The network's {layer} pools in a way that cannot be imported.")
     pooling = Pooling(
         name=layer.name,
         method="average" if method else "max",
-        kernel=_side(layer, part, "kernel", (2, 5, 6)),
-        stride=_side(layer, part, "stride", (3, 7, 8), 1),
-        pad=_side(layer, part, "pad", (4, 9, 10), 0),
+        kernel=_side(layer, part, "kernel"),
+        stride=_side(layer, part, "stride", 1),
+        pad=_side(layer, part, "pad", 0),
         ceil=not rounding,
     )
     if pooling.stride > pooling.kernel or 2 * pooling.pad > pooling.kernel:
@@ -217,12 +217,12 @@ def _translate_pooling(layer: CaffeLayer) -> Pooling:
 
 def _translate_normalization(layer: CaffeLayer) -> Normalization:
     part = layer.part("normalization")
-    if part.integer(4):
+    if part.get("within", 0):
         raise InvalidModel(f"The network's {layer} normalizes within a channel, not across channels.")
-    size = part.integer(1, 5)
+    size = part.get("size", 5)
     if size % 2 == 0 or size > MAX_CHANNELS:
         raise InvalidModel(f"The network's {layer} normalizes over {size} channels; an odd number is needed.")
-    alpha, beta, k = (_finite(layer, part.float(*default)) for default in ((2, 1.0), (3, 0.75), (5, 1.0)))
+    alpha, beta, k = (_finite(layer, part.get(*default)) for default in (("alpha", 1.0), ("beta", 0.75), ("k", 1.0)))
     return Normalization(name=layer.name, size=size, alpha=alpha, beta=beta, k=k)
 
 
@@ -232,17 +232,19 @@ def _finite(layer: CaffeLayer, value: float) -> float:
     return value
 
 
-def _side(layer: CaffeLayer, part: Message, what: str, numbers: Sequence[int], default: int | None = None) -> int:
+def _side(layer: CaffeLayer, part: Part, what: str, default: int | None = None) -> int:
     """A length in pixels, the same for height and width, given once, for each axis, or as ``_h`` and ``_w``."""
-    whole, *axes = numbers
-    found = part.integers(whole)
-    if any(number in part for number in axes):
-        found = [*found, *(part.integer(number) for number in axes)]
+    found = part.get(what, [])
+    found = [*found] if isinstance(found, list) else [found]
+    axes = (f"{what}_h", f"{what}_w")
+    if any(axis in part for axis in axes):
+        found += [part.get(axis, 0) for axis in axes]
     if not found and default is not None:
         return default
     if len(set(found)) != 1 or found[0] > MAX_SIDE:
         raise InvalidModel(f"The network's {layer} has the {what} {found}; one for both axes is needed.")
-    return found[0]
+    side: int = found[0]
+    return side
 
 
 def _check_sizes(definition: NetworkDefinition) -> None:
@@ -271,7 +273,7 @@ def _read_weights(definition: NetworkDefinition, trunk: Sequence[CaffeLayer]) ->
     for layer, source in zip(definition.layers, trunk, strict=True):
         if not isinstance(layer, Convolution):
             continue
-        biased = source.part("convolution").integer(2, 1) != 0
+        biased = source.part("convolution").get("bias", True)
         arrays = source.arrays()
         if len(arrays) != 1 + biased:
             raise InvalidModel(f"The network's {source} has {len(arrays)} arrays of weights, not {1 + biased}.")

@@ -13,7 +13,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
-from scipy.io import savemat
 
 from core.errors import InvalidArchive, InvalidCursor, InvalidImage, InvalidModel, PlacerecError
 from core.frames.containers import find_exif
@@ -21,7 +20,6 @@ from core.frames.exif import read_orientation, read_pose_and_time
 from core.frames.images import decode
 from core.method.catalogue import load_encoder
 from core.networks.checkpoints import read_checkpoint
-from core.networks.matfiles import read_mat
 from core.networks.network import load_network, read_definition
 from core.storage.archives.manifest import read_manifest
 from core.storage.archives.tar_layout import manifest_size
@@ -62,11 +60,6 @@ def damaged(draw: st.DrawFn, sound: bytes) -> bytes:
     return bytes(data)
 
 
-def _mat(path: Path, compressed: bool) -> None:
-    net = {"layers": np.array([1.0, 2.0]), "name": "x", "weights": np.arange(24, dtype=np.float32).reshape(2, 3, 4)}
-    savemat(path, {"net": net, "more": 3.0}, do_compression=compressed)
-
-
 def _everything(path: Path) -> object:
     return {name: tensor.shape for name, tensor in read_checkpoint(path).items()}
 
@@ -76,13 +69,6 @@ def _state() -> dict[str, torch.Tensor]:
 
 
 FILES: dict[str, tuple[Callable[[Path], object], Reader]] = {
-    "mat": (lambda path: _mat(path, False), read_mat),
-    "mat-compressed": (lambda path: _mat(path, True), read_mat),
-    "checkpoint-zip": (lambda path: torch.save(_state(), path), _everything),
-    "checkpoint-legacy": (
-        lambda path: torch.save(_state(), path, _use_new_zipfile_serialization=False),
-        _everything,
-    ),
     "checkpoint-safetensors": (lambda path: save_file(_state(), path), _everything),
     "arrays": (
         lambda path: write_arrays(path, "codes", "x", {"a": np.arange(6.0).reshape(2, 3), "b": np.zeros(3, np.uint8)}),

@@ -12,11 +12,11 @@ PICKLING = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "mar
 
 
 def test_nothing_reads_a_pickle() -> None:
-    assert [line for folder in FOLDERS for line in forbidden_imports(folder, PICKLING | {"torch.load"})] == []
+    assert [line for folder in FOLDERS for line in forbidden_imports(folder, PICKLING)] == []
     calls = []
     for path in FILES:
         for node in ast.walk(syntax_of(path)):
-            if isinstance(node, ast.Attribute) and ast.unparse(node) in ("torch.load", "np.lib.format.read_array"):
+            if isinstance(node, ast.Attribute) and ast.unparse(node) == "np.lib.format.read_array":
                 calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {ast.unparse(node)}")
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
                 calls.append(f"{path.relative_to(ROOT)}:{node.lineno} allow_pickle")
@@ -29,13 +29,19 @@ RUNNING = {
     "shutil.unpack_archive", "np.lib.format.read_array", "numpy.lib.format.read_array", "pandas.read_pickle",
     "scipy.io.loadmat", "loadmat", "importlib.import_module", "__import__",
 }  # fmt: skip
-"""Calls by which bytes that were read could run, or be laid out as files."""
+"""Calls by which bytes that were read could run, end the process, or be laid out as files."""
+
+ISOLATED = {
+    ("core/networks/checkpoints.py", "torch.load(path, map_location='cpu', weights_only=True)"),
+    ("core/networks/matfiles.py", "loadmat(path, struct_as_record=False)"),
+}
+"""Calls in readers that run in a child process with limits."""
 
 
 @pytest.mark.parametrize("folder", ["core", "service", "training"])
 def test_nothing_runs_what_it_reads(folder: str) -> None:
     """What is parsed is parsed by readers that make values and nothing else; weights come from safetensors."""
-    calls = []
+    calls, isolated = [], set()
     for path in FILES:
         if not path.is_relative_to(ROOT / folder):
             continue
@@ -43,6 +49,10 @@ def test_nothing_runs_what_it_reads(folder: str) -> None:
             if isinstance(node, ast.Call):
                 name = ast.unparse(node.func)
                 shell = any(word.arg == "shell" for word in node.keywords)
-                if name in RUNNING or shell or name.endswith((".extractall", ".extract")):
+                allowed = (path.relative_to(ROOT).as_posix(), ast.unparse(node))
+                if allowed in ISOLATED:
+                    isolated.add(allowed)
+                elif name in RUNNING or shell or name.endswith((".extractall", ".extract")):
                     calls.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}")
     assert calls == []
+    assert folder != "core" or isolated == ISOLATED

@@ -12,6 +12,7 @@ from PIL import Image
 
 from core.errors import EmptyImage, InvalidImage, NotAnImage, TruncatedImage, UnsupportedFormat
 from core.frames.containers import Header, check_structure, find_exif, read_header
+from core.frames.images import Limits, decode
 
 BLANK = np.zeros((64, 64, 3), np.uint8)
 
@@ -102,7 +103,7 @@ def test_a_header_can_be_read_before_the_file_is_whole(extension: str) -> None:
     header = read_header(data[:1000])
     assert (header.width, header.height) == (200, 200)
     with pytest.raises(TruncatedImage):
-        check_structure(data[:1000], header)
+        decode(data[:1000])
 
 
 @pytest.mark.parametrize("filling", [b"\xff", b"\xff\0", b"\0", b"\xff\xd0", b"\xff\xe0\0\2", b"\xff\xda\0\2"])
@@ -111,7 +112,7 @@ def test_hostile_bytes_are_refused_at_once(start: bytes, filling: bytes) -> None
     data = start + filling * (2**24 // len(filling))
     began = time.process_time()
     with pytest.raises(InvalidImage):
-        check_structure(data, read_header(data))
+        decode(data, Limits(max_pixels=10**12))
     assert time.process_time() - began < 1  # a loop over all bytes would take many seconds
 
 
@@ -137,6 +138,6 @@ def test_a_jpeg_without_image_data_is_damaged() -> None:
 
 def test_padding_before_a_marker_is_allowed() -> None:
     data = with_pillow("JPEG")
-    padded = data[:2] + b"\xff" * 20 + data[2:-2] + b"\xff" * 20 + data[-2:]
+    padded = data[:2] + b"\xff" * 20 + data[2:]
     assert read_header(padded) == Header("jpeg", 40, 24)
     assert check_structure(padded, read_header(padded)) is None

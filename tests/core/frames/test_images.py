@@ -257,6 +257,19 @@ def test_damaged_data_under_good_checksums() -> None:
         decode(data)
 
 
+def test_texts_and_profiles_of_a_png_do_not_reach_the_decoder(capfd: pytest.CaptureFixture[str]) -> None:
+    image = picture()
+    plain, told = io.BytesIO(), io.BytesIO()
+    image.save(plain, "PNG")
+    image.save(told, "PNG", icc_profile=bytes(range(256)) * 4)
+    data = told.getvalue().replace(b"ICC Profile", b'a\n{"forged"')
+    end = data.index(b"iCCP") + 4 + int.from_bytes(data[data.index(b"iCCP") - 4 :][:4], "big")
+    start = data.index(b"iCCP")
+    data = data[:end] + zlib.crc32(data[start:end]).to_bytes(4, "big") + data[end + 4 :]
+    np.testing.assert_array_equal(decode(data), decode(plain.getvalue()))
+    assert "forged" not in capfd.readouterr().err
+
+
 def test_two_png_headers_are_refused() -> None:
     data = encoded("png")
     with pytest.raises(NotAnImage, match="two headers"):

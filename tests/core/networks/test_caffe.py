@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from core.errors import InvalidModel
 from core.networks.caffe import import_caffe
 from core.networks.network import Convolution, Normalization, Pooling, Relu, ShallowNetwork, load_network, save_network
+from tests.core.networks import in_process
 from tests.core.networks.caffe_writer import (
     HEAD,
     Array,
@@ -242,7 +243,10 @@ TARGETS = [
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(TARGETS), st.data())
-def test_a_mutated_model_is_refused_or_imported(imported: Any, content: bytes, draw: st.DataObject) -> None:
+def test_a_mutated_model_is_refused_or_imported(
+    imported: Any, monkeypatch: pytest.MonkeyPatch, content: bytes, draw: st.DataObject
+) -> None:
+    in_process.use(monkeypatch, "core.networks.caffemodel")
     mutated = bytearray(content)
     for _ in range(draw.draw(st.integers(1, 5))):
         # Descriptions are short and weights long: most changes are made where the descriptions are.

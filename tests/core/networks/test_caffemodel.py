@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.errors import InvalidModel
 from core.networks.caffemodel import read_caffemodel, read_mean
+from tests.core.networks import in_process
 
 IMAGE = np.random.default_rng(1).uniform(0, 255, (3, 20, 30)).astype(np.float32)
 
@@ -89,8 +90,9 @@ WHOLE = {"mean.npy": NPY_HEADER + bytes(48), "mean.binaryproto": binaryproto(IMA
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(WHOLE)), st.integers(0, 140), st.integers(0, 3), st.binary(max_size=4))
 def test_a_mutated_mean_file_is_refused_or_read(
-    tmp_path: Path, name: str, place: int, removed: int, added: bytes
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, place: int, removed: int, added: bytes
 ) -> None:
+    in_process.use(monkeypatch, "core.networks.caffemodel")
     content = WHOLE[name]
     (tmp_path / name).write_bytes(content[:place] + added + content[place + removed :])
     try:

@@ -13,8 +13,9 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from core.errors import InvalidModel
-from core.networks import checkpoints
+from core.networks import isolation
 from core.networks.checkpoints import read_checkpoint, under
+from tests.core.networks import in_process
 
 # Instructions of a pickle
 
@@ -24,7 +25,8 @@ def text(value: str) -> bytes:
 
 
 def whole(value: int) -> bytes:
-    return b"I%d\n" % value
+    content = value.to_bytes(9, "little", signed=True)
+    return b"\x8a" + bytes([len(content)]) + content
 
 
 def row(*values: bytes) -> bytes:
@@ -48,6 +50,7 @@ def zipped(path: Path, described: bytes, numbers: bytes = np.arange(4, dtype="<f
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("net/data.pkl", b"\x80\x02" + described + b".")
         archive.writestr("net/data/0", numbers)
+        archive.writestr("net/version", "3\n")
     return path
 
 
@@ -82,12 +85,9 @@ def state() -> dict[str, object]:
 
 
 @pytest.mark.parametrize("zipped_layout", [True, False])
-@pytest.mark.parametrize("protocol", [2, 4])
-def test_what_pytorch_writes_is_read_to_the_bit(
-    state: dict[str, object], tmp_path: Path, zipped_layout: bool, protocol: int
-) -> None:
+def test_what_pytorch_writes_is_read_to_the_bit(state: dict[str, object], tmp_path: Path, zipped_layout: bool) -> None:
     path = tmp_path / "model_best.pth.tar"
-    torch.save(state, path, pickle_protocol=protocol, _use_new_zipfile_serialization=zipped_layout)
+    torch.save(state, path, _use_new_zipfile_serialization=zipped_layout)
     found = read_checkpoint(path)
     wanted = {name: value for name, value in state.items() if isinstance(value, Tensor)}
     wanted |= {f"state_dict.{name}": value for name, value in state["state_dict"].items()}  # type: ignore[attr-defined]
@@ -118,18 +118,25 @@ def test_a_state_dict_alone_and_its_safetensors_sibling(tmp_path: Path) -> None:
 def test_a_whole_module_is_refused_with_what_to_do(tmp_path: Path) -> None:
     for zipped_layout in (True, False):
         torch.save(nn.Linear(2, 2), tmp_path / "whole.pth", _use_new_zipfile_serialization=zipped_layout)
-        with pytest.raises(InvalidModel, match=r"whole\.pth cannot be used\. .*save the network's state_dict"):
+        with pytest.raises(InvalidModel, match=r"whole\.pth cannot be used: .*Linear.*save the network's state_dict"):
             read_checkpoint(tmp_path / "whole.pth")
 
 
 # What others may write
 
 
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_process.use(monkeypatch, "core.networks.checkpoints")
+
+
+@pytest.mark.usefixtures("here")
 def test_the_hand_made_file_is_sound(tmp_path: Path) -> None:
     found = read_checkpoint(zipped(tmp_path / "a.pth", named(w=tensor([2, 2], [1, 2]))))
     assert found["w"].tolist() == [[0, 2], [1, 3]]
 
 
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     "described",
     [
@@ -155,71 +162,68 @@ def test_nothing_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, describ
     assert not (tmp_path / "made").exists()
 
 
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize(
     "described",
     [
-        tensor([1_000_000_000], [0]),  # one number repeated
         tensor([5], [1]),
         tensor([2], [1], offset=3),
         tensor([2, 2], [1, 3]),
         tensor([-1], [1]),
         tensor([2], [-1]),
         tensor([2**62, 2**62], [1, 1]),
-        tensor([1] * 9, [1] * 9),
         tensor([2, 2], [1]),
         tensor([2], [1], numbers=storage(count=-4)),
         tensor([2], [1], numbers=storage(kind=b"numpy\nFloatStorage")),
-        tensor([2], [1], numbers=storage(kind=b"torch\nQInt8Storage")),
         tensor([2], [1], numbers=storage()).replace(b"storage", b"modules", 1),
+        tensor([2], [1], numbers=storage("1")),
+        tensor([2], [1], numbers=storage("../0")),
+        tensor([2], [1], numbers=storage(count=5)),
         b"ctorch._utils\n_rebuild_tensor_v2\n)R",
         named() + b"q\x00" + text("again") + b"h\x00s",  # a dictionary within itself
         b"(((((",
         b"h\x07",
-        b"}" + b"N" + b"Ns",  # a key that is none
     ],
 )
 def test_descriptions_that_cannot_be(tmp_path: Path, described: bytes) -> None:
-    with pytest.raises(InvalidModel):
+    with pytest.raises(InvalidModel, match=r"a\.pth cannot be used"):
         read_checkpoint(zipped(tmp_path / "a.pth", named(w=described)))
 
 
-def test_numbers_that_are_missing_or_too_few(tmp_path: Path) -> None:
-    path = tmp_path / "a.pth"
-    for count, key in ((5, "0"), (4, "1"), (4, "../0")):
-        found = read_checkpoint(zipped(path, named(w=tensor([2], [1], numbers=storage(key, count)))))
-        with pytest.raises(InvalidModel, match="lacks the numbers"):
-            found["w"]
-    two_ways = named(w=tensor([2], [1]), v=tensor([2], [1], numbers=storage(count=2)))
-    with pytest.raises(InvalidModel, match="in two ways"):
-        read_checkpoint(zipped(path, two_ways))
-
-
+@pytest.mark.usefixtures("here")
 def test_what_is_small_in_the_file_cannot_be_endless(tmp_path: Path) -> None:
-    doubled = named(w=tensor([1], [1])) + b"q\x00"
+    folders = {"a": named(w=tensor([1], [1])) + b"q\x00"}
     for depth in range(1, 15):  # each has the one before it eleven times
-        inner = b"(" + b"".join(text(str(i)) + b"h" + bytes([depth - 1]) for i in range(11)) + b"u"
-        doubled += b"0}" + inner + b"q" + bytes([depth])
+        inner = b"}(" + b"".join(text(str(i)) + b"h" + bytes([depth - 1]) for i in range(11)) + b"u"
+        folders["a" * (depth + 1)] = inner + b"q" + bytes([depth])
     with pytest.raises(InvalidModel, match="too deep or too many"):
-        read_checkpoint(zipped(tmp_path / "a.pth", doubled))
-    long = named(**{"n" * 600: tensor([1], [1])})
-    with pytest.raises(InvalidModel, match="too long"):
-        read_checkpoint(zipped(tmp_path / "b.pth", long))
+        read_checkpoint(zipped(tmp_path / "a.pth", named(**folders)))
 
 
-def test_a_compressed_zip_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "a.pth", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("net/data.pkl", b"\x80\x02" + named(w=tensor([1], [1])) + b"." + bytes(100_000))
-    with pytest.raises(InvalidModel, match="compressed"):
+@pytest.mark.parametrize("described", [tensor([1_000_000_000], [0]), tensor([2], [1], numbers=storage(count=2**40))])
+def test_one_number_repeated_or_a_huge_announcement_takes_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, described: bytes
+) -> None:
+    monkeypatch.setattr(isolation, "SPARE_MEMORY", 2**29)
+    with pytest.raises(InvalidModel, match=r"a\.pth cannot be used"):
+        read_checkpoint(zipped(tmp_path / "a.pth", named(w=described)))
+
+
+def test_what_is_packed_small_takes_no_more_memory_than_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with zipfile.ZipFile(tmp_path / "a.pth", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        described = named(w=tensor([2**27], [1], numbers=storage(count=2**27)))
+        archive.writestr("net/data.pkl", b"\x80\x02" + described + b".")
+        archive.writestr("net/data/0", bytes(2**29))
+        archive.writestr("net/version", "3\n")
+    assert (tmp_path / "a.pth").stat().st_size < 10_000_000
+    monkeypatch.setattr(isolation, "SPARE_MEMORY", 2**28)
+    with pytest.raises(InvalidModel, match=r"a\.pth cannot be used"):
         read_checkpoint(tmp_path / "a.pth")
 
 
-def test_descriptions_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = zipped(tmp_path / "a.pth", named(w=tensor([2], [1])))
-    monkeypatch.setattr(checkpoints, "MAX_DESCRIPTION", 20)
-    with pytest.raises(InvalidModel, match="more than 20 bytes"):
-        read_checkpoint(path)
-
-
+@pytest.mark.usefixtures("here")
 @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", b"\x80\x02K\x01.", b"\x00" * 8 + b"{", b"\x80\x02"])
 def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.pth").write_bytes(content)
@@ -227,27 +231,3 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
         read_checkpoint(tmp_path / "a.pth")
     with pytest.raises(InvalidModel, match=r"b\.pth"):
         read_checkpoint(tmp_path / "b.pth")
-
-
-@pytest.mark.parametrize("zipped_layout", [True, False])
-def test_damaged_files_give_one_kind_of_error(state: dict[str, object], tmp_path: Path, zipped_layout: bool) -> None:
-    path = tmp_path / "a.pth"
-    torch.save(state, path, _use_new_zipfile_serialization=zipped_layout)
-    whole_file = path.read_bytes()
-    random = np.random.default_rng(0)
-    refused = 0
-    for attempt in range(300):
-        damaged = bytearray(whole_file)
-        if attempt % 3:
-            for place in random.integers(0, len(damaged), 3):
-                damaged[place] = random.integers(256)
-        else:
-            del damaged[random.integers(len(damaged)) :]
-        path.write_bytes(damaged)
-        try:
-            found = read_checkpoint(path)
-            for name in found:
-                found[name]
-        except InvalidModel:
-            refused += 1
-    assert refused > 100  # every one that is cut at the least

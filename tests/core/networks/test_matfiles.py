@@ -13,7 +13,7 @@ from scipy.io import savemat
 from scipy.io.matlab import MatlabObject
 
 from core.errors import InvalidModel
-from core.networks import matfiles
+from core.networks import isolation
 from core.networks.matfiles import Unreadable, is_mat, numbers, read_mat
 
 
@@ -96,15 +96,14 @@ def nested(depth: int) -> bytes:
     return b"".join(reversed(heads)) + struct.pack("<II", 14, len(number)) + number
 
 
-@pytest.mark.parametrize("depth", [40, 20_000])
 @pytest.mark.parametrize("compressed", [False, True])
-def test_nesting_ends_in_an_error_not_in_the_process(tmp_path: Path, depth: int, compressed: bool) -> None:
-    element = nested(depth)
+def test_nesting_ends_in_an_error_not_in_the_process(tmp_path: Path, compressed: bool) -> None:
+    element = nested(20_000)
     if compressed:
         packed = zlib.compress(element)
         element = struct.pack("<II", 15, len(packed)) + packed
     (tmp_path / "a.mat").write_bytes(HEADER + element)
-    with pytest.raises(InvalidModel, match="too deep"):
+    with pytest.raises(InvalidModel, match=r"a\.mat cannot be used"):
         read_mat(tmp_path / "a.mat")
 
 
@@ -114,11 +113,13 @@ def test_little_nesting_is_read(tmp_path: Path) -> None:
     assert number.tolist() == [[1.0]]
 
 
-def test_what_is_packed_small_is_counted_inflated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    savemat(tmp_path / "a.mat", {"zeros": np.zeros(1_000_000)}, do_compression=True)
-    assert (tmp_path / "a.mat").stat().st_size < 20_000
-    monkeypatch.setattr(matfiles, "MAX_BYTES", 1_000_000)
-    with pytest.raises(InvalidModel, match="cut, or has a variable of more than 1000000 bytes"):
+def test_what_is_packed_small_takes_no_more_memory_than_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    savemat(tmp_path / "a.mat", {"zeros": np.zeros(40_000_000)}, do_compression=True)
+    assert (tmp_path / "a.mat").stat().st_size < 500_000
+    monkeypatch.setattr(isolation, "SPARE_MEMORY", 2**28)
+    with pytest.raises(InvalidModel, match="too much memory"):
         read_mat(tmp_path / "a.mat")
 
 
@@ -131,26 +132,3 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
         read_mat(tmp_path / "a.mat")
     with pytest.raises(InvalidModel, match=r"b\.mat cannot be read"):
         read_mat(tmp_path / "b.mat")
-
-
-@pytest.mark.parametrize("compressed", [False, True])
-def test_damaged_files_give_one_kind_of_error(tmp_path: Path, compressed: bool) -> None:
-    path = tmp_path / "a.mat"
-    layers = cell(*({"type": "conv", "weights": cell(np.ones((3, 3)), np.ones(3))} for _ in range(4)))
-    savemat(path, {"net": {"layers": layers}}, do_compression=compressed)
-    whole_file = path.read_bytes()
-    random = np.random.default_rng(0)
-    refused = 0
-    for attempt in range(200):
-        damaged = bytearray(whole_file)
-        if attempt % 2:
-            for place in random.integers(0, len(damaged), 3):
-                damaged[place] = random.integers(256)
-        else:
-            del damaged[random.integers(len(damaged)) :]
-        path.write_bytes(damaged)
-        try:
-            read_mat(path)
-        except InvalidModel:
-            refused += 1
-    assert refused > 90
