@@ -39,7 +39,7 @@ class Export:
     """A map as it was at one time.
 
     map: the object, since a later map of the same id is another map.
-    state: what ``map.capturing.state()`` was then; the map has not changed as long as it gives the same object.
+    state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same object.
     file: the export file.
     readers: how many responses read it now.
     used: when it was last asked for, on the monotonic clock.

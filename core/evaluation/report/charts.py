@@ -68,7 +68,7 @@ def draw(name: str, alt: str, title: str, paint: Callable[[Axes], None], height:
             for text, handle in zip(legend.get_texts(), handles, strict=True):
                 text.set_fontweight("bold" if handle.get_gid() == FIRST else "normal")
         svg = _svg(figure)
-        figure.set_layout_engine("none")  # what was found out for the SVG holds for the file
+        figure.set_layout_engine(None)  # what was found out for the SVG holds for the file
         return Chart(name, plain(alt), svg, png_of(figure))
 
 
