@@ -187,7 +187,7 @@ def main(
     scenes = [draw(number) for number in range(places + 300 * operators)]
     strangers = [draw(100_000 + number).seen for number in range(60)]
     fixed = {f"fixed-{number:05d}": number for number in range(places)}
-    settings = {"EXPORT_SECONDS": 30}  # a moment that was exported keeps its files for so long
+    settings = {"EXPORT_SECONDS": 30}  # the file of an export is kept for so long
     with (
         tempfile.TemporaryDirectory() as text,
         service(Path(text) / "data", settings=settings, log=Path(text) / "log") as process,

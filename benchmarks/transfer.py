@@ -1,4 +1,4 @@
-"""What a map as a file costs: time and memory of taking a moment, of sending it, of checking and building it.
+"""What a map as a file costs: time and memory of writing it, of checking it, of building a map from it.
 
     python -m benchmarks.transfer [--places 2000 --places 8000] [--folder DIR]
 
@@ -26,7 +26,6 @@ from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from core.storage.archives.building import build
 from core.storage.archives.reading import Archive, check
-from core.storage.archives.virtual_archive import CHUNK_BYTES
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
 BATCH = 64
@@ -55,34 +54,25 @@ def made(folder: Path, places: int) -> None:
 
 
 def measured(folder: Path) -> dict[str, float]:
-    """Export the map, check the file, import it: seconds of each, MB (10^6 bytes) of the file, the disk and memory."""
-    atlas, file = Atlas(folder / "data"), folder / "lab.tar"
+    """Export the map, check the file, import it: seconds of each, MB (10^6 bytes) of the file and of memory."""
+    atlas = Atlas(folder / "data")
     lab = atlas.get("lab")
     before, began = peak_memory(os.getpid()), time.perf_counter()
-    virtual = lab.exporter.into(folder / "kept")
-    taken = time.perf_counter()
-    with file.open("wb") as out:
-        position = 0
-        while data := virtual.read(position, CHUNK_BYTES):
-            out.write(data)
-            position += len(data)
-    sent = time.perf_counter()
-    with Archive(file) as archive:
+    made = lab.exporter.write(folder / "lab.tar")
+    written = time.perf_counter()
+    with Archive(made.path) as archive:
         check(archive)
         checked = time.perf_counter()
         with atlas.building("copy") as unfinished:
             build(archive, unfinished, "copy")
     built = time.perf_counter()
     found = {
-        "file": virtual.size / 1e6,
-        "taken": taken - began,
-        "on_disk": sum(path.stat().st_size for path in virtual.folder.iterdir() if path.suffix != ".seg") / 1e6,
-        "read": sent - taken,
-        "checked": checked - sent,
+        "file": made.size / 1e6,
+        "written": written - began,
+        "checked": checked - written,
         "built": built - checked,
         "memory": peak_memory(os.getpid()) - before,
     }
-    virtual.discard()
     atlas.close()
     return found
 
@@ -97,7 +87,7 @@ def main(
         with tempfile.TemporaryDirectory(dir=folder) as text:
             _apart(made, Path(text), size)
             figures[size] = _apart(measured, Path(text))
-    columns = ["places", "file, MB", "taken, s", "on disk, MB", "read, s", "checked, s", "built, s", "memory, MB"]
+    columns = ["places", "file, MB", "written, s", "checked, s", "built, s", "memory, MB"]
     rows = [(size, *found.values()) for size, found in figures.items()]
     report("transfer", "A map as a file", columns, rows, {"sizes": figures})
 

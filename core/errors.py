@@ -173,5 +173,9 @@ class InvalidGroundTruth(PlacerecError):
     """A file that lists true references, or references to keep, cannot be used."""
 
 
+class MissingExtra(PlacerecError):
+    """A package is not installed that comes with an extra of placerec; the text names the extra."""
+
+
 class InvalidResults(PlacerecError):
     """A file of results or of similarities cannot be used."""

@@ -102,6 +102,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_version": Rule("open", "none"),
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
+    "read_documentation_file": Rule("open", "none"),
     "read_metrics": Rule("query", "all"),  # its series name all maps
     # Maps
     "list_maps": Rule("query", "shown"),

@@ -11,9 +11,9 @@ import faiss
 import torch
 from fastapi import APIRouter, Depends, FastAPI, Request
 from prometheus_client import CONTENT_TYPE_LATEST
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import Response
 
-from service.app.documentation import SECURITY_POLICY, page
+from service.app.documentation import PAGE, documentation_file
 from service.app.runtime import Runtime
 from service.app.schemas import EncoderPage, Health, Readiness, Version
 from service.errors.faults import NotReady
@@ -76,17 +76,18 @@ async def read_openapi(request: Request) -> Response:
 @router.get("/docs", include_in_schema=False)
 async def read_documentation(request: Request) -> Response:
     """Read the documentation of this interface; the page loads nothing from other sites."""
-    return HTMLResponse(_documentation_html(request.app), headers={"Content-Security-Policy": SECURITY_POLICY})
+    return await documentation_file(PAGE, request.scope)
+
+
+@router.get("/docs/{file}", include_in_schema=False)
+async def read_documentation_file(file: str, request: Request) -> Response:
+    """Read a file that the page of documentation loads."""
+    return await documentation_file(file, request.scope)
 
 
 @lru_cache(1)  # needs no key, and takes as long as a query
 def _openapi_json(app: FastAPI) -> bytes:
     return json.dumps(app.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
-
-
-@lru_cache(1)
-def _documentation_html(app: FastAPI) -> bytes:
-    return page(app.openapi()).encode()
 
 
 encoders = APIRouter(prefix="/v1/encoders", tags=["encoders"], dependencies=[Depends(single_values)])

@@ -129,6 +129,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
     faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
     # Traverses on disk, which only the command line reads
+    errors.MissingExtra: Kind(503, "missing-extra", "A package is not installed"),
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is not a traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
     errors.InvalidResults: Kind(422, "invalid-results", "The results cannot be used"),

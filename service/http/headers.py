@@ -1,16 +1,14 @@
-"""Request headers of RFC 9110: the preferred form of an answer, entity tags and conditions, and ranges of bytes."""
+"""Request headers of RFC 9110: the preferred form of an answer, entity tags and conditions."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from core.errors import RevisionMismatch
-from service.errors.faults import ExportGone, RangeNotSatisfiable
+from service.errors.faults import ExportGone
 
 _ETAG = re.compile(r'(W/)?"([^"]*)"')
-_RANGE = re.compile(r"bytes=\s*(?:(\d{1,18})-(\d{1,18})?|-(\d{1,18}))\s*", re.IGNORECASE)
 
 
 # Content negotiation (section 12.5.1)
@@ -102,51 +100,3 @@ def is_known(headers: Mapping[str, str], tag: str) -> bool:
     """Whether If-None-Match says that the caller has the content with this tag already."""
     held = headers.get("if-none-match")
     return held is not None and (held.strip() == "*" or tag in [found for _, found in _ETAG.findall(held)])
-
-
-# Range requests (section 14)
-
-
-@dataclass(frozen=True)
-class Slice:
-    """The bytes from ``start`` up to, not including, ``stop`` of ``size`` bytes."""
-
-    start: int
-    stop: int
-    size: int
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the slice is all of the content."""
-        return (self.start, self.stop) == (0, self.size)
-
-    @property
-    def content_range(self) -> str:
-        """The value of the Content-Range header."""
-        return f"bytes {self.start}-{self.stop - 1}/{self.size}"
-
-
-def wanted_slice(headers: Mapping[str, str], tag: str, size: int) -> Slice:
-    """The part of the content that the caller asks for.
-
-    It is all of the content unless the caller asks for one range, and for a range of the content with this tag.
-    Several ranges, other units and ranges that cannot be parsed may be ignored (section 14.2), and are.
-
-    Raises:
-        RangeNotSatisfiable: the range begins after the end.
-    """
-    whole = Slice(0, size, size)
-    named = _RANGE.fullmatch(headers.get("range", ""))
-    condition = headers.get("if-range")
-    if named is None or (condition is not None and tag not in strong_tags(condition)):
-        return whole
-    first, last, suffix = named.groups()
-    if suffix is not None:
-        start, stop = max(0, size - int(suffix)), size
-    else:
-        start, stop = int(first), size if last is None else min(size, int(last) + 1)
-        if last is not None and int(last) < start:
-            return whole
-    if start >= stop:
-        raise RangeNotSatisfiable(f"The export has {size} bytes; the requested range begins after its end.", size)
-    return Slice(start, stop, size)

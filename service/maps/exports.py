@@ -1,29 +1,35 @@
-"""Exports: maps as they were when a download began, kept for a while so that an interrupted download can go on."""
+"""Exports: the file of a map as it was when a download began, kept for a while so that the download can go on."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import secrets
 import shutil
 import time
 import weakref
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from anyio import CapacityLimiter, to_thread
-from starlette.responses import StreamingResponse
-from starlette.types import Receive, Scope, Send
+from anyio import CapacityLimiter, from_thread, to_thread
+from starlette.datastructures import Headers
+from starlette.responses import FileResponse
+from starlette.types import Message, Receive, Scope, Send
 
+from core.errors import StorageFull
 from core.storage import Map
-from core.storage.archives.virtual_archive import CHUNK_BYTES, VirtualArchive
-from service.errors.faults import NotReady, TooManyExports
-from service.http.headers import Slice
+from core.storage.archives.exporter import Exported
+from service.errors.faults import NotReady, RangeNotSatisfiable, TooManyExports
+from service.places.staging import RESERVE
 from service.settings import Settings
 
 FOLDER = "exports"
 MEDIA_TYPE = "application/x-tar"
+
+SECONDS_AFTER_THE_END = 300.0
+"""For which an export is kept at most after its last byte was sent: who asks again then rarely lost it."""
 
 log = logging.getLogger("placerec.exports")
 
@@ -33,16 +39,16 @@ class Export:
     """A map as it was at one time.
 
     map: the object, since a later map of the same id is another map.
-    state: what ``map.capturing.state()`` was then; the map has not changed as long as it gives the same object.
-    archive: gives the bytes of the export file.
-    readers: how many responses read from it now.
+    state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same object.
+    file: the export file.
+    readers: how many responses read it now.
     used: when it was last asked for, on the monotonic clock.
     expiry: removes the export when it has not been used for a while.
     """
 
     map: Map
     state: object
-    archive: VirtualArchive
+    file: Exported
     readers: int = 0
     used: float = 0.0
     expiry: asyncio.TimerHandle | None = None
@@ -61,8 +67,9 @@ class Exports:
         self._exports: dict[tuple[str, str], Export] = {}
         """By the id of the map and the tag of the export file."""
         self._under_way: dict[Map, asyncio.Task[Export]] = {}
-        self._creating = CapacityLimiter(1)  # each reads a whole map
-        self._reading = CapacityLimiter(4)
+        self._tags: weakref.WeakKeyDictionary[Map, tuple[object, str]] = weakref.WeakKeyDictionary()
+        """The state of each map when it was last exported, and the tag of that export, whether it is kept or not."""
+        self._creating = CapacityLimiter(1)  # each reads and writes a whole map
         self._closing = False
 
     def clean(self) -> None:
@@ -72,6 +79,11 @@ class Exports:
     def find(self, map_id: str, tags: list[str]) -> Export | None:
         """The export of a map that has one of these tags, even if the map was changed or deleted since."""
         return next((found for tag in tags if (found := self._exports.get((map_id, tag)))), None)
+
+    def tag_of(self, map_: Map) -> str | None:
+        """The tag that an export of the map would have now; None if that is not known without writing one."""
+        state, tag = self._tags.get(map_, (None, ""))
+        return tag if state is not None and state is map_.exporter.state() else None
 
     async def create(self, map_: Map) -> Export:
         """The export of a map as it is now; one that is kept if the map has not changed since.
@@ -99,7 +111,7 @@ class Exports:
             log.warning("the map %s could not be exported: %s", map_.record.id, error)
 
     def _make_room(self) -> None:
-        """Remove the exports that were not read for the longest time until one more may be made."""
+        """Remove the export that was not read for the longest time if as many are kept as may be."""
         self._check_open()
         idle = sorted((export for export in self._exports.values() if not export.readers), key=lambda one: one.used)
         while len(self._exports) + len(self._under_way) >= self._max_exports:
@@ -112,49 +124,70 @@ class Exports:
             raise NotReady("The service is stopping.", {"service": "it is stopping"})
 
     async def _create(self, map_: Map) -> Export:
-        folder = self._folder / secrets.token_hex(8)
+        path = self._folder / f"{secrets.token_hex(8)}.tar"
         began = time.perf_counter()
 
-        def work() -> tuple[object, VirtualArchive]:
+        def work() -> tuple[object, Exported]:
             map_.open()
             state = map_.exporter.state()  # read first, so that a change meanwhile is noticed
-            return state, map_.exporter.into(folder, lambda _read: self._check_open())
+            self._folder.mkdir(exist_ok=True)
+            return state, map_.exporter.write(
+                path, lambda _written: self._check_open(), lambda size: from_thread.run(self._make_space, size)
+            )
 
-        state, archive = await to_thread.run_sync(work, limiter=self._creating)
+        state, file = await to_thread.run_sync(work, limiter=self._creating)
         seconds = round(time.perf_counter() - began, 3)
-        map_id = archive.manifest.map.id
-        facts = {"map": map_id, "places": archive.manifest.places, "bytes": archive.size, "seconds": seconds}
-        log.info("export taken", extra=facts)
-        export = self._exports.get((map_id, archive.tag))
+        map_id = file.manifest.map.id
+        facts = {"map": map_id, "places": file.manifest.places, "bytes": file.size, "seconds": seconds}
+        log.info("export written", extra=facts)
+        self._tags[map_] = state, file.tag
+        export = self._exports.get((map_id, file.tag))
         if export is not None:  # the map is what it was before
             export.map, export.state = map_, state
-            await to_thread.run_sync(archive.discard)
+            await to_thread.run_sync(_delete, file)
         else:
-            export = self._exports[map_id, archive.tag] = Export(map_, state, archive)
+            export = self._exports[map_id, file.tag] = Export(map_, state, file)
         self._renew(export)
         return export
 
-    def hold(self, export: Export) -> Callable[[], None]:
-        """Keep an export until the function that this returns is called; calling it again does nothing."""
+    async def _make_space(self, size: int) -> None:
+        """Remove the exports that were not read for the longest time until there is room for one of this size
+        and for what enrolments need.
+
+        Raises:
+            StorageFull: it has not.
+        """
+        while shutil.disk_usage(self._folder).free < size + RESERVE:
+            idle = [export for export in self._exports.values() if not export.readers]
+            if not idle:
+                raise StorageFull(f"The disk has no room for the map as a file of {size} bytes beside the maps.")
+            await self._remove(min(idle, key=lambda one: one.used))
+
+    def hold(self, export: Export) -> Callable[[bool], None]:
+        """Keep an export until the function that this returns is called; calling it again does nothing.
+
+        The function is told whether the last byte of the file was sent.
+        """
         held = True
 
-        def release() -> None:
+        def release(ended: bool) -> None:
             nonlocal held
             if held:
                 held = False
                 export.readers -= 1
-                self._renew(export)
+                self._renew(export, SECONDS_AFTER_THE_END if ended else math.inf)
 
         export.readers += 1
         return release
 
-    def _renew(self, export: Export) -> None:
-        """Keep an export for the full time from now on."""
+    def _renew(self, export: Export, seconds: float = math.inf) -> None:
+        """Keep an export from now on for the full time, or less."""
         export.used = time.monotonic()
         if export.expiry is not None:
             export.expiry.cancel()
         if not self._closing:
-            export.expiry = asyncio.get_running_loop().call_later(self._seconds, self._expire, export)
+            wait = min(seconds, self._seconds)
+            export.expiry = asyncio.get_running_loop().call_later(wait, self._expire, export)
 
     def _expire(self, export: Export) -> None:
         if export.readers:
@@ -162,26 +195,12 @@ class Exports:
         else:
             self._remove(export)
 
-    def _remove(self, export: Export) -> None:
+    def _remove(self, export: Export) -> asyncio.Future[None]:
+        """Forget an export now; its file is gone when the returned future is done."""
         if export.expiry is not None:
             export.expiry.cancel()
-        key = (export.archive.manifest.map.id, export.archive.tag)
-        if self._exports.get(key) is export:
-            del self._exports[key]
-            asyncio.get_running_loop().run_in_executor(None, export.archive.discard)
-
-    async def read(self, export: Export, part: Slice) -> AsyncIterator[bytes]:
-        """Read a part of an export file, chunk by chunk.
-
-        Raises:
-            StorageFailure: the disk refuses, possibly after some chunks.
-        """
-        position = part.start
-        while position < part.stop:
-            most = min(CHUNK_BYTES, part.stop - position)
-            chunk = await to_thread.run_sync(export.archive.read, position, most, limiter=self._reading)
-            position += len(chunk)
-            yield chunk
+        self._exports.pop((export.file.manifest.map.id, export.file.tag), None)
+        return asyncio.get_running_loop().run_in_executor(None, _delete, export.file)
 
     async def close(self) -> None:
         """Stop the exports that are being made, and remove all."""
@@ -196,16 +215,59 @@ class Exports:
         await to_thread.run_sync(self.clean)
 
 
-class ExportResponse(StreamingResponse):
-    """A part of an export file; the export is kept until the response was sent or is dropped."""
+def _delete(file: Exported) -> None:
+    with suppress(OSError):
+        file.path.unlink()
 
-    def __init__(self, exports: Exports, export: Export, part: Slice, status: int, headers: dict[str, str]) -> None:
-        super().__init__(exports.read(export, part), status, headers, MEDIA_TYPE)
+
+class _MalformedRange(Exception):
+    pass
+
+
+class ExportResponse(FileResponse):
+    """An export file or the ranges of it that the request asks for; the export is kept until the response ends.
+
+    A range that cannot be read is passed over (RFC 9110, section 14.2).
+
+    Raises:
+        RangeNotSatisfiable: on sending, if a range begins after the end.
+    """
+
+    chunk_size = 1 << 20
+
+    def __init__(self, exports: Exports, export: Export, headers: dict[str, str]) -> None:
+        super().__init__(export.file.path, headers=headers, media_type=MEDIA_TYPE)
+        self._size = export.file.size
         self._release = exports.hold(export)
-        weakref.finalize(self, self._release)
+        weakref.finalize(self, self._release, False)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        reaches_end = ended = False
+
+        async def checked(message: Message) -> None:
+            """Answer what is wrong with a range as this service does, and note whether the last byte was sent."""
+            nonlocal reaches_end, ended
+            if message["type"] == "http.response.start":
+                if message["status"] == 416:
+                    said = f"The export has {self._size} bytes; the requested range begins after its end."
+                    raise RangeNotSatisfiable(said, self._size)
+                if message["status"] == 400:
+                    raise _MalformedRange
+                told = Headers(raw=message["headers"]).get("content-range", "")
+                reaches_end = message["status"] == 200 or told.endswith(f"-{self._size - 1}/{self._size}")
+            await send(message)
+            ended = reaches_end and message["type"] == "http.response.body" and not message.get("more_body")
+
+        method = scope["state"]["method"]
+        if method == "HEAD":  # for which Range has no meaning
+            scope = {**_without_range(scope), "method": method}
         try:
-            await super().__call__(scope, receive, send)
+            await super().__call__(scope, receive, checked)
+        except _MalformedRange:
+            await super().__call__(_without_range(scope), receive, checked)
         finally:
-            self._release()
+            self._release(ended and method != "HEAD")
+
+
+def _without_range(scope: Scope) -> Scope:
+    return {**scope, "headers": [(name, value) for name, value in scope["headers"] if name != b"range"]}

@@ -30,7 +30,7 @@ from service.errors.faults import (
 )
 from service.errors.problems import problem_documentation
 from service.http.bodies import intake_of
-from service.http.headers import check_match, entity_tag, is_known, named_tags, wanted_slice
+from service.http.headers import check_match, entity_tag, is_known, named_tags
 from service.http.openapi import BINARY
 from service.http.routing import EngineDep, FromState, MapId, PrincipalDep, StrictRoute, single_values
 from service.http.schemas import Parameters
@@ -106,26 +106,22 @@ async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports
     """
     export = exports.find(map_id, named_tags(request.headers))
     if export is None:
-        export = await exports.create(await engine.map(map_id))
-    archive = export.archive
+        map_ = await engine.map(map_id)
+        tag = exports.tag_of(map_)
+        if tag is None or not is_known(request.headers, tag):
+            export = await exports.create(map_)
+            tag = export.file.tag
+    else:
+        tag = export.file.tag
     headers = {
-        "ETag": f'"{archive.tag}"',
-        "Accept-Ranges": "bytes",
+        "ETag": f'"{tag}"',
         "Cache-Control": "private, no-cache",
         "Content-Disposition": f'attachment; filename="{map_id}.tar"',
     }
-    check_match(request.headers, archive.tag)
-    if is_known(request.headers, archive.tag):
-        return Response(status_code=304, headers=headers)
-    is_head = request.state.method == "HEAD"
-    # Range has a meaning only for GET (RFC 9110, section 14.2).
-    part = wanted_slice({**request.headers, **({"range": ""} if is_head else {})}, archive.tag, archive.size)
-    headers["Content-Length"] = str(part.stop - part.start)
-    if is_head:
-        return Response(None, headers={**headers, "Content-Type": MEDIA_TYPE})
-    if part.is_whole:
-        return ExportResponse(exports, export, part, 200, headers)
-    return ExportResponse(exports, export, part, 206, {**headers, "Content-Range": part.content_range})
+    check_match(request.headers, tag)
+    if export is None or is_known(request.headers, tag):
+        return Response(status_code=304, headers={**headers, "Accept-Ranges": "bytes"})
+    return ExportResponse(exports, export, headers)
 
 
 BODY: dict[str, Any] = {

@@ -52,7 +52,7 @@ def test_a_circle_is_found() -> None:
     assert circles(graph) == [["a", "b", "c"], ["d", "e"]]
 
 
-KNOWN_CROWDS = {"tests/core/evaluation/report", "tests/core/storage"}
+KNOWN_CROWDS = {"tests/core/storage"}
 """Folders of tests with more modules, to be divided when one of them grows."""
 
 

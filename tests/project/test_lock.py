@@ -45,7 +45,7 @@ def test_torch_is_pinned_exactly_and_alone() -> None:
         assert [entry for entry in locked(name) if re.match(r"torch$|triton|nvidia-|cuda-", entry)] == []
 
 
-@pytest.mark.parametrize(("name", "extras"), [("service", []), ("development", ["dev"])])
+@pytest.mark.parametrize(("name", "extras"), [("service", []), ("development", ["dev", "report"])])
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:
     texts = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"]
     for extra in extras:

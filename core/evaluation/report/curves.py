@@ -1,4 +1,4 @@
-"""Precision–recall and ROC curves of all systems together."""
+"""Precision–recall, ROC, recall and reliability curves of all systems together."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import numpy as np
 
 from core.evaluation.protocol.figures import recall_at_k
 from core.evaluation.protocol.outcomes import answerable, best_matched, best_scores, has_true_reference
-from core.evaluation.report.drawing import EndLabel, Margins, Plot, Sheet, label_ends, render, shares
+from core.evaluation.report.charts import Chart, draw, plot_line, shares
 from core.evaluation.report.text import enumerate_words, number
-from core.evaluation.report.theme import Cast, Mark, Theme
-from core.judgement.curves import Curve, pr_curve, roc_curve
+from core.evaluation.report.theme import LIGHT, Cast, Mark
+from core.judgement.curves import pr_curve, roc_curve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from core.evaluation.protocol.comparison import Run
+    from core.evaluation.protocol.trust import Trust
 
 
-def plot_pr(runs: Sequence[Run], cast: Cast) -> Plot | None:
-    """Each system's precision over its recall, named where its curve ends; None where no system has a right match."""
+def plot_pr(runs: Sequence[Run], cast: Cast) -> Chart | None:
+    """Each system's precision over its recall; None where no system has a right match."""
     drawn = [
         (mark, curve, run.evaluation.auc_pr)
         for run, mark in zip(runs, cast.runs, strict=True)
@@ -29,20 +30,19 @@ def plot_pr(runs: Sequence[Run], cast: Cast) -> Plot | None:
     ]
     if not drawn:
         return None
-    sheet = _sheet("Precision over recall", len(drawn))
 
-    def paint(axes: Axes, theme: Theme) -> None:
+    def paint(axes: Axes) -> None:
         shares(axes, x=True, y=True)
         axes.set(xlabel="recall, of right matches", ylabel="precision")
-        _draw(axes, theme, [(mark, curve) for mark, curve, _ in drawn])
-        ends = [EndLabel(mark, float(y[-1]), number(area)) for mark, (_, y), area in drawn]
-        label_ends(axes, theme, sheet, ends)
+        for mark, (x, y), area in drawn:
+            plot_line(axes, mark, x, y, number(area))
 
     areas = [f"{mark.label} {number(area)}" for mark, _, area in drawn]
-    return render("pr", f"Precision–recall curves. Area under each: {enumerate_words(areas)}.", sheet, paint)
+    alt = f"Precision–recall curves. Area under each: {enumerate_words(areas)}."
+    return draw("pr", alt, "Precision over recall", paint, height_for(drawn))
 
 
-def plot_roc(runs: Sequence[Run], cast: Cast) -> Plot | None:
+def plot_roc(runs: Sequence[Run], cast: Cast) -> Chart | None:
     """Each system's true over its false positive rate, the largest area first in the key; None without negatives."""
     drawn = [
         (mark, curve, run.evaluation.auc_roc)
@@ -51,23 +51,21 @@ def plot_roc(runs: Sequence[Run], cast: Cast) -> Plot | None:
     ]
     if not drawn:
         return None
-    sheet = _sheet("True over false positives (ROC)", len(drawn))
     drawn.sort(key=lambda entry: -(entry[2] or 0.0))
 
-    def paint(axes: Axes, theme: Theme) -> None:
+    def paint(axes: Axes) -> None:
         shares(axes, x=True, y=True)
         axes.set(xlabel="negatives accepted", ylabel="positives accepted")
-        axes.plot([0, 1], [0, 1], color=theme.muted, linewidth=0.8, linestyle=(0, (2, 3)))
-        _draw(axes, theme, [(mark, curve) for mark, curve, _ in drawn])
-        # All these curves end in one point, so the names stand as a key, in the order of the areas.
-        key = [EndLabel(mark, 1.0 - index * 1e-6, number(area)) for index, (mark, _, area) in enumerate(drawn)]
-        label_ends(axes, theme, sheet, key, leaders=False)
+        _diagonal(axes)
+        for mark, (x, y), area in drawn:
+            plot_line(axes, mark, x, y, number(area))
 
     areas = [f"{mark.label} {number(area)}" for mark, _, area in drawn]
-    return render("roc", f"ROC curves. Area under each: {enumerate_words(areas)}.", sheet, paint)
+    alt = f"ROC curves. Area under each: {enumerate_words(areas)}."
+    return draw("roc", alt, "True over false positives (ROC)", paint, height_for(drawn))
 
 
-def plot_recall(runs: Sequence[Run], cast: Cast) -> Plot | None:
+def plot_recall(runs: Sequence[Run], cast: Cast) -> Chart | None:
     """Recall over how many best matches are looked at; None unless there is a choice of two."""
     depths = min(25, runs[0].scores.shape[1])
     drawn = [
@@ -77,28 +75,52 @@ def plot_recall(runs: Sequence[Run], cast: Cast) -> Plot | None:
     ]
     if not drawn or depths < 2:
         return None
-    sheet = _sheet("Recall among the best N", len(drawn))
-    depth = np.arange(1, depths + 1, dtype=np.float64)
 
-    def paint(axes: Axes, theme: Theme) -> None:
+    def paint(axes: Axes) -> None:
         shares(axes, x=False, y=True)
         axes.set(xlabel="N best matches", ylabel="recall@N", xlim=(1, depths))
         axes.set_xticks(sorted({1, *(tick for tick in (5, 10, 15, 20, 25) if tick <= depths)}))
-        _draw(axes, theme, [(mark, (depth, curve)) for mark, curve in drawn])
-        label_ends(
-            axes, theme, sheet, [EndLabel(mark, float(curve[-1]), number(float(curve[-1]))) for mark, curve in drawn]
-        )
+        for mark, curve in sorted(drawn, key=lambda entry: -entry[1][-1]):  # the legend in the order of the ends
+            plot_line(axes, mark, range(1, depths + 1), curve, number(float(curve[-1])))
 
     said = [f"{mark.label} {number(float(curve[0]))} to {number(float(curve[-1]))}" for mark, curve in drawn]
     alt = f"Recall among the best matches, from recall@1 to recall@{depths}: {enumerate_words(said)}."
-    return render("recall", alt, sheet, paint)
+    return draw("recall", alt, "Recall among the best N", paint, height_for(drawn))
 
 
-def _sheet(title: str, lines: int) -> Sheet:
-    return Sheet(title, height=max(380, 15 * lines + 90), margins=Margins(right=206))
+def trusted(runs: Sequence[Run], cast: Cast) -> list[tuple[Mark, Trust]]:
+    """The systems whose answers have probabilities."""
+    pairs = zip(runs, cast.runs, strict=True)
+    return [(mark, found) for run, mark in pairs if (found := run.evaluation.trust) is not None]
 
 
-def _draw(axes: Axes, theme: Theme, curves: Sequence[tuple[Mark, Curve]]) -> None:
-    """The best system lies on top."""
-    for mark, (x, y) in sorted(curves, key=lambda curve: -curve[0].place):
-        axes.plot(x, y, color=mark.color(theme), linestyle=mark.linestyle, linewidth=mark.width, alpha=mark.alpha)
+def plot_reliability(runs: Sequence[Run], cast: Cast) -> Chart | None:
+    """Share of right answers over their probability, a point a bin; None where no system has probabilities."""
+    drawn = trusted(runs, cast)
+    if not drawn:
+        return None
+
+    def paint(axes: Axes) -> None:
+        shares(axes, x=True, y=True)
+        axes.set(xlabel="probability, mean of a bin", ylabel="share that is right")
+        _diagonal(axes)
+        for mark, found in drawn:
+            bins = found.reliability.bins
+            x, y = [one.probability for one in bins], [one.right.value or 0.0 for one in bins]
+            plot_line(axes, mark, x, y, number(found.reliability.ece), marker="o", markersize=3.5)
+        mark, found = drawn[0]
+        for one in found.reliability.bins:
+            axes.plot([one.probability] * 2, [one.right.low, one.right.high], color=mark.color(LIGHT), linewidth=0.9)
+
+    errors = [f"{mark.label} {number(found.reliability.ece)}" for mark, found in drawn]
+    alt = f"Reliability. Calibration error of each: {enumerate_words(errors)}."
+    return draw("reliability", alt, "Right answers over their probability", paint, height_for(drawn))
+
+
+def height_for(lines: Sequence[object], least: int = 380) -> int:
+    """Pixels of the page that a chart of so many lines needs for its legend."""
+    return max(least, 16 * len(lines) + 90)
+
+
+def _diagonal(axes: Axes) -> None:
+    axes.plot([0, 1], [0, 1], color=LIGHT.muted, linewidth=0.8, linestyle=(0, (2, 3)))

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from core.evaluation.report.text import escape, number
-from core.evaluation.report.thumbnails import Thumbnails, show
+from core.evaluation.report.text import number
+from core.evaluation.report.thumbnails import Thumbnail, Thumbnails
 
 if TYPE_CHECKING:
     from core.baselines.encoders import Box
@@ -68,59 +68,84 @@ def case(comparison: Comparison, run: Run, query: int) -> Case:
     return Case(query, outcome, shown, float(run.scores[query, column]) if is_kept else None)
 
 
-def gallery(comparison: Comparison, run: Run, thumbnails: Thumbnails, regions: Regions | None, most: int) -> str:
-    """Up to ``most`` wrong matches and half as many right ones, as HTML; fewer when ``thumbnails`` is full."""
-    chosen = wrong_first(run.outcomes, most, max(1, most // 2))
-    total = len(run.outcomes)
-    hits = sum(outcome.matched for outcome in run.outcomes)
-    parts: dict[bool, list[str]] = {False: [], True: []}
-    for query in chosen:
+@dataclass(frozen=True)
+class Panel:
+    """One of the three images of a case.
+
+    what: it is.
+    index: of the image; None where the query has no true reference.
+    remark: what is said of it.
+    name: of its file; "" where there is none.
+    picture: None where the file is gone or holds no image.
+    boxes: regions of interest as x, y, width, height in pixels of the picture.
+    """
+
+    what: str
+    index: int | None
+    remark: str = ""
+    name: str = ""
+    picture: Thumbnail | None = None
+    boxes: Sequence[Box] = ()
+
+
+@dataclass(frozen=True)
+class Group:
+    """The wrong or the right matches of a run.
+
+    total: how many there are.
+    cases: query, best match and truth of those that are shown.
+    """
+
+    title: str
+    order: str
+    kind: str
+    total: int
+    cases: Sequence[Sequence[Panel]]
+
+
+def gallery(
+    comparison: Comparison, run: Run, thumbnails: Thumbnails, regions: Regions | None, most: int
+) -> tuple[Group, Group]:
+    """Up to ``most`` wrong matches and half as many right ones; fewer when ``thumbnails`` is full."""
+    parts: dict[bool, list[Sequence[Panel]]] = {False: [], True: []}
+    for query in wrong_first(run.outcomes, most, max(1, most // 2)):
         if not thumbnails.full:
             found = case(comparison, run, query)
-            parts[found.outcome.matched].append(_article(comparison, found, thumbnails, regions))
-    drawn = any('class="regions"' in part for part in parts[False] + parts[True])
-    return "".join(
-        [
-            _switch(drawn),
-            _group("Wrong matches", "the most confident first", "wrong", parts[False], total - hits),
-            _group("Right matches", "from the most to the least confident", "right", parts[True], hits),
-        ]
-    )
-
-
-def _switch(drawn: bool) -> str:
-    if not drawn:
-        return ""
-    return '<label class="switch regions-switch"><input type="checkbox" checked> regions of interest</label>'
-
-
-def _group(title: str, order: str, kind: str, articles: Sequence[str], total: int) -> str:
-    if total == 0:
-        return f'<h4>{title}</h4><p class="quiet">There is none.</p>'
-    if not articles:
-        return f'<h4>{title}</h4><p class="quiet">All {total} are left out, to keep the page small.</p>'
-    count = f"all {total}" if len(articles) == total else f"{len(articles)} of {total}"
+            parts[found.outcome.matched].append(_panels(comparison, found, thumbnails, regions))
+    hits = sum(outcome.matched for outcome in run.outcomes)
+    order = "from the most to the least confident"
     return (
-        f'<h4>{title} <span class="quiet">{count}, {order}</span></h4>'
-        f'<div class="cases {kind}">{"".join(articles)}</div>'
+        Group("Wrong matches", "the most confident first", "wrong", len(run.outcomes) - hits, parts[False]),
+        Group("Right matches", order, "right", hits, parts[True]),
     )
 
 
-def _article(comparison: Comparison, found: Case, thumbnails: Thumbnails, regions: Regions | None) -> str:
+def _panels(
+    comparison: Comparison, found: Case, thumbnails: Thumbnails, regions: Regions | None
+) -> tuple[Panel, Panel, Panel]:
     """Three images and what they are."""
-    outcome = found.outcome
-    verdict = "right" if outcome.matched else "wrong"
-    references, score = comparison.references, f"score {number(outcome.score)}"
-    word = f'<span class="verdict">{verdict}</span>'
-    panels = [
-        _panel(Panel("Query", found.query), comparison.queries, thumbnails, regions),
-        _panel(Panel("Best match", outcome.retrieved, score, word, "found"), references, thumbnails, regions),
-    ]
-    if found.truth is None:
-        panels.append('<figure><div class="absent">none</div><figcaption><b>True reference</b></figcaption></figure>')
-    else:
-        panels.append(_panel(Panel("Truth", found.truth, _standing(found)), references, thumbnails, regions))
-    return f'<article class="case {verdict}">{"".join(panels)}</article>'
+
+    def panel(what: str, index: int, paths: Sequence[Path], remark: str = "") -> Panel:
+        path = paths[index] if index < len(paths) else None
+        picture = None if path is None else thumbnails.add(path)
+        if path is None or picture is None:
+            return Panel(what, index, remark, "" if path is None else path.name)
+        boxes = list(dict.fromkeys((regions(path) or ()) if regions else ()))[:MOST_BOXES]
+        width, height = picture.width, picture.height
+        scaled = [
+            (left * width, top * height, (right - left) * width, (bottom - top) * height)
+            for left, top, right, bottom in boxes
+        ]
+        return Panel(what, index, remark, path.name, picture, scaled)
+
+    score, references = f"score {number(found.outcome.score)}", comparison.references
+    return (
+        panel("Query", found.query, comparison.queries),
+        panel("Best match", found.outcome.retrieved, references, score),
+        Panel("True reference", None)
+        if found.truth is None
+        else panel("Truth", found.truth, references, _standing(found)),
+    )
 
 
 def _standing(found: Case) -> str:
@@ -130,31 +155,3 @@ def _standing(found: Case) -> str:
     if found.outcome.matched or found.outcome.rank is None:
         return f"score {number(found.truth_score)}"
     return f"score {number(found.truth_score)}, rank {found.outcome.rank}"
-
-
-@dataclass(frozen=True)
-class Panel:
-    """One of the three images of a case: what it is, its number, what is said of it."""
-
-    what: str
-    index: int
-    remark: str = ""
-    verdict: str = ""
-    style: str = ""
-
-
-def _panel(panel: Panel, paths: Sequence[Path], thumbnails: Thumbnails, regions: Regions | None) -> str:
-    """One image and its caption; where there is no image, the caption alone."""
-    path = paths[panel.index] if panel.index < len(paths) else None
-    thumbnail = None if path is None else thumbnails.add(path)
-    if path is None or thumbnail is None:
-        shown = '<div class="absent">no image</div>'
-    else:
-        boxes = list(dict.fromkeys((regions(path) or ()) if regions else ()))[:MOST_BOXES]
-        shown = show(thumbnail, f"{panel.what}: image {panel.index}, {path.name}", boxes)
-    remark = f'<span class="score">{escape(panel.remark)}</span>' if panel.remark else ""
-    name = "" if path is None else f'<span class="file">{escape(path.name)}</span>'
-    return (
-        f'<figure class="{panel.style}">{shown}<figcaption><b>{panel.what}</b> {panel.index} '
-        f"{panel.verdict}{remark}{name}</figcaption></figure>"
-    )

@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from core.evaluation.report.drawing import SHARPNESS, Margins, Sheet, paint_png
+from core.evaluation.report.charts import house_style, make_figure, png_of
 from core.evaluation.report.text import counted
-from core.evaluation.report.theme import LIGHT, Theme, rgb
+from core.evaluation.report.theme import rgb
 from core.frames.traverses import Truth
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
     from core.evaluation import Outcome
 
 Drawing = NDArray[np.uint8]
@@ -138,41 +136,27 @@ def describe_matrix(system: str, shape: tuple[int, int]) -> str:
     )
 
 
-def _key(axes: Axes) -> None:
-    """What the colours mean, under the axes."""
-    for x, filled, color, text in (
-        (0, False, TRUTH, "true"),
-        (52, True, RIGHT, "found, right"),
-        (142, True, WRONG, "wrong"),
-    ):
-        at = (x * SHARPNESS, -54 * SHARPNESS)
-        axes.annotate("\N{BLACK SQUARE}" if filled else "\N{WHITE SQUARE}", at, color=color, xycoords="axes pixels")
-        axes.annotate(text, (at[0] + 14 * SHARPNESS, at[1]), xycoords="axes pixels")
-
-
 def matrix_file(system: str, drawn: Layers, shape: tuple[int, int]) -> bytes:
     """The three layers with axes, as a PNG file.
 
     Args:
         shape: Q, R'.
     """
-    height, width = drawn.heat.shape
-    longest = 400
-    inner = (round(longest * width / max(height, width)), round(longest * height / max(height, width)))
-    sheet = Sheet(f"Similarity, {system}", inner[0] + 74, inner[1] + 98, Margins(bottom=64), full_color=True)
+    from matplotlib.patches import Patch
+    from matplotlib.ticker import MaxNLocator
 
-    def paint(axes: Axes, theme: Theme) -> None:
-        from matplotlib.ticker import MaxNLocator
-
+    height, width = (round(400 * side / max(drawn.heat.shape)) for side in drawn.heat.shape)
+    with house_style("similarity"):
+        figure = make_figure(max(260, width + 80), height + 110)
+        axes = figure.add_subplot(title=f"Similarity, {system}", xlabel="kept references", ylabel="queries")
         axes.grid(False)
         extent = (-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5)
-        grey = cv2.cvtColor(drawn.heat, cv2.COLOR_GRAY2RGB)
-        for layer in (grey, drawn.truth, drawn.matches):
+        for layer in (cv2.cvtColor(drawn.heat, cv2.COLOR_GRAY2RGB), drawn.truth, drawn.matches):
             axes.imshow(layer, extent=extent, aspect="auto", interpolation="antialiased")
-        axes.set(xlabel="kept references", ylabel="queries")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
         axes.spines[["right", "top"]].set_visible(True)
-        _key(axes)
-
-    return paint_png(sheet, LIGHT, paint)
+        key = [Patch(fill=False, edgecolor=TRUTH, label="true")]
+        key += [Patch(color=color, label=label) for color, label in ((RIGHT, "found, right"), (WRONG, "wrong"))]
+        figure.legend(handles=key, loc="outside lower left", ncols=3, handlelength=1)
+        return png_of(figure)

@@ -1,4 +1,4 @@
-"""The figures of all systems as a table that can be sorted by each of its columns."""
+"""The figures of all systems: the columns of the table that can be sorted by each of them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from core.evaluation import DEPTHS, STAGES
-from core.evaluation.report.text import escape, milliseconds, number, size
-from core.evaluation.report.theme import Cast, Mark
+from core.evaluation.report.text import milliseconds, number, size
 from core.evaluation.report.trends import time_per_query
 
 if TYPE_CHECKING:
@@ -29,6 +28,13 @@ class Column:
     """Its best figure stands out."""
     bar: bool = False
     """Its size, of 1, is drawn behind it."""
+
+    def best(self, runs: Sequence[Run]) -> float | None:
+        """The figure that stands out; None where there is no contest."""
+        values = [value for run in runs if (value := self.value(run)) is not None]
+        if len(runs) < 2 or not values or not self.contest:
+            return None
+        return max(values) if self.higher_is_better else min(values)
 
 
 def columns(runs: Sequence[Run]) -> list[Column]:
@@ -84,69 +90,3 @@ def _stage_column(stage: str) -> Column:
 
 def _size(value: float | None) -> str:
     return size(int(value or 0))
-
-
-def figures_table(runs: Sequence[Run], cast: Cast) -> str:
-    """The table as HTML; the best figure of each column stands out where there are several systems."""
-    shown = columns(runs)
-    groups = dict.fromkeys(column.group for column in shown)
-    spans = "".join(
-        f'<th scope="colgroup" colspan="{sum(column.group == group for column in shown)}">{group}</th>'
-        for group in groups
-    )
-    heads = "".join(_head(column, first=index == 0) for index, column in enumerate(shown))
-    best = [_best(column, runs) for column in shown]
-    rows = "".join(_row(run, mark, shown, best) for run, mark in zip(runs, cast.runs, strict=True))
-    return (
-        '<div class="wide" tabindex="0" role="region" aria-label="Table of all figures">'
-        '<table class="figures sortable">'
-        f'<thead><tr class="groups"><td></td>{spans}</tr>'
-        f'<tr><th scope="col"><button type="button">System</button></th>{heads}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div>"
-    )
-
-
-def _head(column: Column, *, first: bool) -> str:
-    sort = ' aria-sort="descending"' if first else ""
-    rising = "" if column.higher_is_better else ' data-first="ascending"'
-    return (
-        f'<th scope="col"{sort}{rising} title="{escape(column.meaning)}">'
-        f'<button type="button">{escape(column.heading)}</button></th>'
-    )
-
-
-def _best(column: Column, runs: Sequence[Run]) -> float | None:
-    values = [value for run in runs if (value := column.value(run)) is not None]
-    if len(runs) < 2 or not values or not column.contest:
-        return None
-    return max(values) if column.higher_is_better else min(values)
-
-
-def _row(run: Run, mark: Mark, shown: Sequence[Column], best: Sequence[float | None]) -> str:
-    cells = "".join(_cell(run, column, top) for column, top in zip(shown, best, strict=True))
-    name = f'<a href="#run-{mark.place}">{swatch(mark)}{escape(mark.label)}</a>'
-    return f'<tr><th scope="row" data-value="{escape(mark.label.lower())}">{name}</th>{cells}</tr>'
-
-
-def _cell(run: Run, column: Column, best: float | None) -> str:
-    value = column.value(run)
-    if value is None:
-        return f'<td class="none">{column.form(None)}</td>'
-    text = escape(column.form(value))
-    word = run.evaluation.one_class if column.heading == "AUC-PR" else None
-    if word is not None:
-        text += f' <span class="word">{escape(word)}</span>'
-    classes = [name for name, holds in (("best", value == best), ("bar", column.bar)) if holds]
-    named = f' class="{" ".join(classes)}"' if classes else ""
-    filled = f' style="--size:{100 * value:.1f}%"' if column.bar else ""
-    return f'<td data-value="{float(value)!r}"{named}{filled}>{text}</td>'
-
-
-def swatch(mark: Mark) -> str:
-    """A short line in the system's colour and style."""
-    dashes = " ".join(f"{2 * length:g}" for length in mark.dashes)
-    style = f' stroke-dasharray="{dashes}"' if dashes else ""
-    return (
-        f'<svg class="swatch" viewBox="0 0 22 8" aria-hidden="true"><line x1="1" x2="21" y1="4" y2="4" '
-        f'class="hue-{mark.hue}"{style}/></svg>'
-    )

@@ -1,8 +1,7 @@
-"""How names and numbers stand on the page: escaped, rounded, with their unit."""
+"""How names and numbers stand on the page: without control characters, rounded, with their unit."""
 
 from __future__ import annotations
 
-import html
 import re
 import unicodedata
 from collections.abc import Sequence
@@ -20,11 +19,6 @@ def plain(text: str) -> str:
     return "".join(
         "\N{REPLACEMENT CHARACTER}" if unicodedata.category(letter)[0] == "C" else letter for letter in whole
     )
-
-
-def escape(text: str) -> str:
-    """Text for the inside of an element or of a quoted attribute."""
-    return html.escape(plain(text), quote=True)
 
 
 def number(value: float | None, digits: int = 3) -> str:

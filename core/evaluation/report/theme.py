@@ -69,9 +69,15 @@ def rgb(color: str) -> tuple[int, int, int]:
     return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
+def variables(theme: Theme) -> dict[str, str]:
+    """The colours of a theme by the names that they have in the page's style sheet."""
+    names = ("paper", "ink", "muted", "rule", "tp", "fp", "tn", "fn")
+    return {name: getattr(theme, name) for name in names} | {f"hue-{i}": hue for i, hue in enumerate(theme.hues)}
+
+
 @dataclass(frozen=True)
 class Mark:
-    """How a system is called and drawn, the same in every plot and table.
+    """How a system is called and drawn, the same in every chart and table.
 
     place: its number among all systems, from 0.
     """

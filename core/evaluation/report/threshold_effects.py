@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from core.evaluation.report.drawing import Margins, Plot, Sheet, render
-from core.evaluation.report.labels import Name, place_labels
+from core.evaluation.report.charts import Chart, draw
 from core.evaluation.report.text import enumerate_words, number
-from core.evaluation.report.theme import Theme
+from core.evaluation.report.theme import LIGHT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +46,7 @@ def scores_by_fate(outcomes: Sequence[Outcome], threshold: float | None) -> Scor
     return {name: np.sort(np.array(scores, np.float64))[::-1] for name, scores in found.items()}
 
 
-def plot_fates(name: str, system: str, outcomes: Sequence[Outcome], threshold: float | None) -> list[Plot]:
+def plot_fates(name: str, system: str, outcomes: Sequence[Outcome], threshold: float | None) -> list[Chart]:
     """The scores of each fate before and, where there is a threshold, after it, on the same axes."""
     states: list[tuple[str, str, float | None]] = [("before", "Before the threshold", None)]
     if threshold is not None:
@@ -74,37 +73,21 @@ class Frame:
     threshold: float | None
 
 
-def _plot(name: str, title: str, system: str, found: Scores, frame: Frame) -> Plot:
-    sheet = Sheet(title, height=320, margins=Margins(right=118))
-
-    def paint(axes: Axes, theme: Theme) -> None:
+def _plot(name: str, title: str, system: str, found: Scores, frame: Frame) -> Chart:
+    def paint(axes: Axes) -> None:
         from matplotlib.ticker import MaxNLocator
 
         axes.set(xlabel="queries, by falling score", ylabel="score of the best match")
-        axes.set_xlim(0, max(2, frame.longest) * 1.02)
-        axes.set_ylim(frame.low, frame.high)
+        axes.set(xlim=(0, max(2, frame.longest) * 1.02), ylim=(frame.low, frame.high))
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-        _draw(axes, theme, found, frame)
+        for fate, scores in found.items():
+            if len(scores):
+                shown = {"color": getattr(LIGHT, fate), "label": f"{fate.upper()} {len(scores)}"}
+                size = 2.6 if frame.longest < 150 else 0
+                axes.plot(range(1, len(scores) + 1), scores, linewidth=1.6, marker="o", markersize=size, **shown)
+        if frame.threshold is not None:
+            label = f"threshold {number(frame.threshold)}"
+            axes.axhline(frame.threshold, color=LIGHT.ink, linewidth=0.9, linestyle=(0, (4, 3)), label=label)
 
     counts = [f"{len(scores)} {fate.upper()}" for fate, scores in found.items()]
-    return render(name, f"{title}, scores of {system}: {enumerate_words(counts)}.", sheet, paint)
-
-
-def _draw(axes: Axes, theme: Theme, found: Scores, frame: Frame) -> None:
-    """A line for each fate, as long as it has queries, named at its end."""
-    right = axes.get_xlim()[1]
-    names: list[Name] = []
-    dots: list[tuple[float, float]] = []
-    if frame.threshold is not None:
-        least = frame.threshold
-        axes.axhline(least, color=theme.ink, linewidth=0.9, linestyle=(0, (4, 3)))
-        names.append(Name(f"threshold {number(least)}", right, least, bold=True))
-        dots += [(x, least) for x in np.linspace(0, right, 60)]
-    for fate, scores in found.items():
-        if len(scores):
-            color = str(getattr(theme, fate))
-            x = np.arange(1, len(scores) + 1)
-            axes.plot(x, scores, color=color, linewidth=1.6, marker="o", markersize=2.6 if frame.longest < 150 else 0)
-            names.append(Name(f"{fate.upper()} {len(scores)}", float(x[-1]), float(scores[-1]), True, color))
-            dots += list(zip(x.tolist(), scores.tolist(), strict=True))
-    place_labels(axes, names, dots)
+    return draw(name, f"{title}, scores of {system}: {enumerate_words(counts)}.", title, paint, height=320)

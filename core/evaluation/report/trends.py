@@ -6,19 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from core.evaluation.report.drawing import (
-    EndLabel,
-    Margins,
-    Plot,
-    Sheet,
-    label_ends,
-    plain_log_ticks,
-    render,
-    shares,
-)
-from core.evaluation.report.labels import Name, place_labels
+from core.evaluation.report.charts import FIRST, HEIGHT, Chart, draw, plain_log_ticks, plot_line, shares
+from core.evaluation.report.curves import height_for
 from core.evaluation.report.text import enumerate_words, file_stems, milliseconds, number, plain
-from core.evaluation.report.theme import Cast, Mark, Theme, short
+from core.evaluation.report.theme import LIGHT, Cast, Mark, short
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,6 +19,9 @@ if TYPE_CHECKING:
 
 SHORTEST = 1e-3
 """Milliseconds: shorter times are drawn as this, for an axis by factors has no zero."""
+
+SHAPES = ("o", "s", "^", "D")
+"""Of the points of systems that share a hue."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +42,7 @@ def time_per_query(run: Run) -> float | None:
     return sum(stages.values()) if stages else None
 
 
-def plot_cost(runs: Sequence[Run], cast: Cast) -> Plot | None:
+def plot_cost(runs: Sequence[Run], cast: Cast) -> Chart | None:
     """Accuracy over the time of a query; None unless two systems have both."""
     points = [
         (mark, time, run.evaluation.auc_pr)
@@ -57,26 +51,26 @@ def plot_cost(runs: Sequence[Run], cast: Cast) -> Plot | None:
     ]
     if len(points) < 2:
         return None
-    sheet = Sheet("Accuracy and time")
 
-    def paint(axes: Axes, theme: Theme) -> None:
-        times, areas = [time for _, time, _ in points], [area for _, _, area in points]
+    def paint(axes: Axes) -> None:
+        areas = [area for _, _, area in points]
         air = 0.12 * (max(areas) - min(areas)) or 0.1
         axes.set_ylim(max(0, min(areas) - air), min(1.015, max(areas) + air))
-        axes.set(xlabel="milliseconds per query, all stages", ylabel="AUC-PR")
-        axes.set_xscale("log")
-        axes.set_xlim(min(times) / 1.6, max(times) * 2.6)
-        plain_log_ticks(axes.xaxis)
+        axes.set(xlabel="milliseconds per query, all stages", ylabel="AUC-PR", xscale="log")
+        axes.margins(x=0.12)
         for mark, time, area in points:
-            axes.plot([time], [area], "o", color=mark.color(theme), markersize=7, markeredgecolor=theme.paper)
-        names = [Name(short(mark).label, time, area, bold=mark.place == 0) for mark, time, area in points]
-        place_labels(axes, names, [(time, area) for _, time, area in points])
+            label = f"{number(area)}  {short(mark).label}"
+            shape = SHAPES[mark.place // len(LIGHT.hues) % len(SHAPES)]
+            gid = FIRST if mark.place == 0 else None
+            axes.plot([time], [area], shape, label=label, color=mark.color(LIGHT), markersize=7, gid=gid)
+        plain_log_ticks(axes.xaxis)
 
     said = [f"{mark.label} {number(area)} at {milliseconds(time)} ms" for mark, time, area in points]
-    return render("cost", f"AUC-PR over milliseconds per query: {enumerate_words(said)}.", sheet, paint)
+    alt = f"AUC-PR over milliseconds per query: {enumerate_words(said)}."
+    return draw("cost", alt, "Accuracy and time", paint, height_for(points, HEIGHT))
 
 
-def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Plot]:
+def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Chart]:
     """Accuracy and matching time as the references grow (thesis, Figure 3.9)."""
     systems = list(dict.fromkeys(point.system for point in points))
     of_system = {
@@ -102,7 +96,7 @@ def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Plot]:
     return plots
 
 
-def plot_severity(curves: Sequence[SeverityCurve], cast: Cast) -> list[Plot]:
+def plot_severity(curves: Sequence[SeverityCurve], cast: Cast) -> list[Chart]:
     """AUC-PR and recall@1 as each disturbance grows, in the order of the disturbances.
 
     Two plots, for AUC-PR alone would mislead: of a few right matches it can rise as all else falls.
@@ -131,51 +125,40 @@ def _trend(
     *,
     logarithmic: bool = False,
     is_time: bool = False,
-) -> Plot:
+) -> Chart:
     """Lines with a dot at each point, named at their ends.
 
     Args:
         logarithmic: x grows by factors.
         is_time: y is in milliseconds, and grows by factors too; otherwise it is a share.
     """
-    sheet = Sheet(title, height=max(320, 15 * len(lines) + 90), margins=Margins(right=206))
     form = milliseconds if is_time else number
 
     def drawn(line: Line) -> Sequence[float]:
         return [max(value, SHORTEST) for value in line.y] if is_time else line.y
 
-    def paint(axes: Axes, theme: Theme) -> None:
+    def paint(axes: Axes) -> None:
         axes.set(xlabel=x, ylabel=y)
         starts, ends = [line.x[0] for line in lines], [line.x[-1] for line in lines]
         if is_time:
             values = [value for line in lines for value in drawn(line)]
-            axes.set_yscale("log")
-            axes.set_ylim(min(values) / 1.4, max(values) * 1.4)
+            axes.set(yscale="log", ylim=(min(values) / 1.4, max(values) * 1.4))
             plain_log_ticks(axes.yaxis)
         else:
             shares(axes, x=False, y=True)
         if logarithmic:
-            axes.set_xscale("log")
-            axes.set_xlim(min(starts) / 1.03, max(max(ends), min(starts) * 1.5))
+            axes.set(xscale="log", xlim=(min(starts) / 1.03, max(max(ends), min(starts) * 1.5)))
             plain_log_ticks(axes.xaxis)
         else:
             span = (max(ends) - min(starts)) or 1.0
             axes.set_xlim(min(starts) - 0.02 * span, max(max(ends), min(starts) + span))
-        for line in sorted(lines, key=lambda line: -line.mark.place):
-            axes.plot(
-                line.x,
-                drawn(line),
-                color=line.mark.color(theme),
-                linestyle=line.mark.linestyle,
-                linewidth=line.mark.width,
-                marker="o",
-                markersize=3.2,
-                clip_on=False,
-            )
-        label_ends(axes, theme, sheet, [EndLabel(line.mark, drawn(line)[-1], form(line.y[-1])) for line in lines])
+        for line in sorted(lines, key=lambda line: -line.y[-1]):  # the legend in the order of the ends
+            label = form(line.y[-1])
+            plot_line(axes, line.mark, line.x, drawn(line), label, marker="o", markersize=3.2, clip_on=False)
 
     said = [
         f"{line.mark.label} from {form(line.y[0])} at {line.x[0]:g} to {form(line.y[-1])} at {line.x[-1]:g}"
         for line in lines
     ]
-    return render(name, f"{title}: {y} over {x}. {enumerate_words(said)}.", sheet, paint)
+    alt = f"{title}: {y} over {x}. {enumerate_words(said)}."
+    return draw(name, alt, title, paint, height_for(lines, 320))

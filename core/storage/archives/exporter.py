@@ -1,18 +1,17 @@
-"""Exporting a map: keeping its state at one moment in a folder, from which the export file is then read.
+"""Exporting a map: writing its state of one moment as one file.
 
-The content of the database is copied, including pictures.  Descriptors are not copied: their files only ever grow, so a
-hard link to each keeps all rows of that moment, whatever happens to the map.
+The map is read in one transaction, which does not hold up writes.  It is read twice: first the lines, for the sizes of
+all parts, from which it follows how long the file will be and where each part lies; then everything, to write it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
-import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,33 +25,55 @@ from core.storage.archives.manifest import (
     FORMAT,
     MANIFEST,
     MOST_MANIFEST_BYTES,
+    SEAL,
     SEQUENCES,
     VERSION,
     ArchivedRecord,
     Manifest,
     Part,
     group_names,
+    seal_of,
     tag_of,
     written,
 )
-from core.storage.archives.virtual_archive import ROW, ROWS, LinkedSegments, VirtualArchive
+from core.storage.archives.tar_layout import BLOCK, END_BYTES, TarLayout, header, padded
 from core.storage.cameras import Access
 from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE
-from core.storage.database.ledger import segment_entries
-from core.storage.files.segment_files import Layout, segment_name
+from core.storage.files.row_reader import RowReader
+from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap, read_layout
 
 PLACES_PER_GROUP = 1024
 BYTES_PER_GROUP = 256 << 20
 """A group is also full when it has so many bytes of pictures or of descriptors."""
 
+CHUNK_BYTES = 1 << 20
+"""Bytes of descriptors that are read and written at a time."""
+
 Advance = Callable[[int], None]
-"""Is called with the number of places that were read; what it raises ends the work."""
+"""Is called with the number of places that were written; what it raises ends the work."""
+
+Expect = Callable[[int], None]
+"""Is called with the size of the file in bytes before it is made; what it raises ends the work."""
+
+
+@dataclass(frozen=True)
+class Exported:
+    """An export file.
+
+    tag: the SHA-256 of its manifest, which identifies all bytes of the file.
+    size: in bytes.
+    """
+
+    path: Path
+    manifest: Manifest
+    tag: str
+    size: int
 
 
 class Exporter:
-    """Keeps moments of one map for export.  Any thread may use it.
+    """Writes export files of one map.  Any thread may use it.
 
     Args:
         folder: of the map.
@@ -75,66 +96,118 @@ class Exporter:
         opened = self._opened()
         return None if opened is None else opened.database.state
 
-    def into(self, folder: Path, advance: Advance = lambda _read: None) -> VirtualArchive:
-        """Keep the present state of the map in ``folder``, which is made; nothing of it is left if this raises.
+    def write(
+        self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
+    ) -> Exported:
+        """Write the present state of the map as a new file, which a crash may lose; nothing is left if this raises.
 
-        The database is read in one transaction, which does not hold up writes; then the descriptors are read and
-        checked once, independently of the map.
+        Every row of the database and every descriptor is compared with its checksum.
 
         Raises:
             UnknownMap, MapQuarantined: the map was deleted meanwhile, or is damaged.
             StorageFull, StorageFailure.
         """
-        try:
-            with self._guarded("export"):
-                folder.mkdir(parents=True)
-                # Deleting the map waits for its readers, so this ends as soon as the map is closed.
-                with self._reading() as connection, self._files_kept():
-                    taken = self._take(connection, folder, advance)
-                return _described(taken, folder, advance)
-        except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+        # Deleting the map waits for its readers, so this ends as soon as the map is closed.
+        with self._guarded("export"), self._reading() as connection, self._files_kept():
+            connection.execute("BEGIN")
+            try:
+                record, layout = read_layout(connection)
+                for table in ("places", "cameras"):
+                    if broken := row_checksums.mismatched(connection, table):
+                        raise Damage(f"{FILE}: {broken[0]!r} of {table} does not match its checksum")
+                manifest = self._planned(connection, ArchivedRecord.model_validate(record.model_dump()), layout)
+                tape = TarLayout(manifest, len(written(manifest)))
+                expect(tape.size)
+                with path.open("xb") as file:
+                    try:
+                        return self._write(file, path, connection, manifest, tape, layout, advance)
+                    except BaseException:
+                        path.unlink(missing_ok=True)
+                        raise
+            finally:
+                if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
+                    connection.execute("ROLLBACK")
 
-    def _take(self, connection: sqlite3.Connection, folder: Path, advance: Advance) -> _Taken:
-        connection.execute("BEGIN")
-        try:
-            record, layout = read_layout(connection)
-            for table in ("places", "cameras"):
-                if broken := row_checksums.mismatched(connection, table):
-                    raise Damage(f"{FILE}: {broken[0]!r} of {table} does not match its checksum")
-            entries = segment_entries(connection, layout)
-            for segment in entries:
-                if segment.removed:
-                    continue
-                self._expect_there()
-                _link(self._folder / segment_name(segment.number), folder / segment_name(segment.number))
-            taken = _Taken(ArchivedRecord.model_validate(record.model_dump()), layout)
-            taken.parts.append(_write_lines(folder / SEQUENCES, sequence_lines(connection)))
-            taken.parts.append(_write_lines(folder / CAMERAS, camera_lines(connection)))
-            with (folder / ROWS).open("wb") as rows:
-                for group in self._grouped(connection, layout):
-                    taken.groups.append(_write_group(folder, len(taken.groups), connection, group, rows))
-                    taken.places += len(group)
-                    advance(taken.places)
-            return taken
-        finally:
-            if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
-                connection.execute("ROLLBACK")
+    def _planned(self, connection: sqlite3.Connection, record: ArchivedRecord, layout: Layout) -> Manifest:
+        """The manifest of the file with the sizes of all parts, without their SHA-256.
 
-    def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[list[StoredLine]]:
+        Raises:
+            StorageFailure: it would be too long for an import.
+        """
+        parts = []
+        for name, lines in ((SEQUENCES, sequence_lines(connection)), (CAMERAS, camera_lines(connection))):
+            sizes = [len(line) for line in lines]
+            parts.append(_unread(name, len(sizes), sum(sizes)))
+        places = 0
+        for group in self._grouped(connection, layout):
+            rows, text, pictures = group
+            sizes = [text, rows * layout.frame.itemsize, pictures]
+            names = group_names((len(parts) - 2) // 3)
+            parts += [_unread(name, rows, size) for name, size in zip(names, sizes, strict=True)]
+            places += rows
+        manifest = Manifest(format=FORMAT, version=VERSION, map=record, places=places, parts=parts)
+        if len(written(manifest)) > MOST_MANIFEST_BYTES:
+            more = f"{len(parts)} parts, which no import takes"
+            raise StorageFailure(f"The map has too many places for one file: {more}.")
+        return manifest
+
+    def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[tuple[int, int, int]]:
+        """Of each group its places, and the bytes of its lines and pictures."""
         most = max(1, min(PLACES_PER_GROUP, BYTES_PER_GROUP // layout.frame.itemsize))
-        group: list[StoredLine] = []
-        held = 0
+        rows = text = pictures = 0
         for line in place_lines(connection):
-            if len(group) == most or (group and held + line.picture_bytes > BYTES_PER_GROUP):
-                yield group
+            if rows == most or (rows and pictures + line.picture_bytes > BYTES_PER_GROUP):
+                yield rows, text, pictures
                 self._expect_there()
-                group, held = [], 0
-            group.append(line)
-            held += line.picture_bytes
-        if group:
-            yield group
+                rows = text = pictures = 0
+            rows, text, pictures = rows + 1, text + len(line.text), pictures + line.picture_bytes
+        if rows:
+            yield rows, text, pictures
+
+    def _write(
+        self,
+        file: BinaryIO,
+        path: Path,
+        connection: sqlite3.Connection,
+        planned: Manifest,
+        tape: TarLayout,
+        layout: Layout,
+        advance: Advance,
+    ) -> Exported:
+        file.seek(tape.members[2].start - BLOCK)  # the manifest comes last, when it is known
+        sequences, cameras = planned.parts[:2]
+        parts = [
+            _write_part(file, sequences, sequence_lines(connection)),
+            _write_part(file, cameras, camera_lines(connection)),
+        ]
+        lines, done = place_lines(connection), 0
+        for number in range(planned.groups):
+            places, frames, pictures = planned.group(number)
+            group = list(islice(lines, places.rows))
+            parts += [
+                _write_part(file, places, (line.text for line in group)),
+                _write_part(file, frames, self._frames(group, layout)),
+                _write_part(file, pictures, _pictures(connection, group)),
+            ]
+            done += len(group)
+            advance(done)
+        file.write(bytes(END_BYTES))
+        manifest = planned.model_copy(update={"parts": parts})
+        text = written(manifest)
+        file.seek(0)
+        for name, data in ((MANIFEST, text), (SEAL, seal_of(text))):
+            file.write(header(name, len(data)) + data.ljust(padded(len(data)), b"\0"))
+        return Exported(path, manifest, tag_of(text), tape.size)
+
+    def _frames(self, group: list[StoredLine], layout: Layout) -> Iterator[memoryview]:
+        """The descriptors of places as they are stored (:attr:`Layout.frame`), in their order."""
+        reader, step = RowReader(self._folder, layout), max(1, CHUNK_BYTES // layout.record.itemsize)
+        for first in range(0, len(group), step):
+            some = group[first : first + step]
+            rows = np.array([line.row for line in some], np.int64)
+            checksums = np.array([line.checksum for line in some], np.uint32)
+            yield reader.frames(rows, checksums).view(np.uint8).data
+            self._expect_there()
 
     def _files_kept(self) -> AbstractContextManager[None]:
         """No segment file is deleted during the block."""
@@ -146,73 +219,26 @@ class Exporter:
             raise UnknownMap(f"The map {self._folder.name!r} was deleted or closed while it was read.")
 
 
-@dataclass
-class _Taken:
-    """What was read in the transaction.  groups: the parts of places and of pictures of each group."""
-
-    record: ArchivedRecord
-    layout: Layout
-    places: int = 0
-    parts: list[Part] = field(default_factory=list)
-    groups: list[tuple[Part, Part]] = field(default_factory=list)
+def _unread(name: str, rows: int, size: int) -> Part:
+    return Part(name=name, rows=rows, bytes=size, sha256="0" * 64)
 
 
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except FileNotFoundError:
-        raise UnknownMap(f"The map {source.parent.name!r} was deleted while it was read.") from None
-    except OSError:  # the file system has no hard links, or no more of them
-        shutil.copyfile(source, target)
+def _pictures(connection: sqlite3.Connection, group: Iterable[StoredLine]) -> Iterator[bytes]:
+    for line in group:
+        if line.picture_bytes:
+            content = ledger.picture(connection, line.number, line.id)
+            assert content is not None
+            yield content
 
 
-def _write_lines(path: Path, lines: Iterator[bytes]) -> Part:
-    digest, rows, size = hashlib.sha256(), 0, 0
-    with path.open("wb") as file:
-        for line in lines:
-            file.write(line)
-            digest.update(line)
-            rows, size = rows + 1, size + len(line)
-    return Part(name=path.name, rows=rows, bytes=size, sha256=digest.hexdigest())
-
-
-def _write_group(
-    folder: Path, number: int, connection: sqlite3.Connection, group: list[StoredLine], rows: BinaryIO
-) -> tuple[Part, Part]:
-    """Write the lines and pictures of a group, and the rows of its descriptors."""
-    places_name, _, pictures_name = group_names(number)
-    places = _write_lines(folder / places_name, (line.text for line in group))
+def _write_part(file: BinaryIO, part: Part, chunks: Iterable[bytes | memoryview]) -> Part:
+    """Write a part with its header; return it with its SHA-256."""
+    file.write(header(part.name, part.bytes))
     digest, size = hashlib.sha256(), 0
-    with (folder / pictures_name).open("wb") as file:
-        for line in group:
-            if line.picture_bytes:
-                content = ledger.picture(connection, line.number, line.id)
-                assert content is not None
-                file.write(content)
-                digest.update(content)
-                size += len(content)
-    rows.write(np.array([(line.row, line.checksum) for line in group], ROW).tobytes())
-    return places, Part(name=pictures_name, rows=len(group), bytes=size, sha256=digest.hexdigest())
-
-
-def _described(taken: _Taken, folder: Path, advance: Advance) -> VirtualArchive:
-    """Read and check all descriptors for their SHA-256, and write the manifest."""
-    parts = list(taken.parts)
-    links, first = LinkedSegments(folder, taken.layout), 0
-    for number, (places, pictures) in enumerate(taken.groups):
-        digest, size = hashlib.sha256(), 0
-        rows = np.fromfile(folder / ROWS, ROW, places.rows, offset=first * ROW.itemsize)
-        for frames in links.chunks(rows):
-            content = frames.view(np.uint8).data
-            digest.update(content)
-            size += len(content)
-        first += places.rows
-        name = group_names(number)[1]
-        parts += [places, Part(name=name, rows=places.rows, bytes=size, sha256=digest.hexdigest()), pictures]
-        advance(taken.places)
-    manifest = Manifest(format=FORMAT, version=VERSION, map=taken.record, places=taken.places, parts=parts)
-    text = written(manifest)
-    if len(text) > MOST_MANIFEST_BYTES:
-        raise StorageFailure(f"The map has too many places for one file: {len(parts)} parts, which no import takes.")
-    (folder / MANIFEST).write_bytes(text)
-    return VirtualArchive(folder, manifest, text, tag_of(text), links)
+    for chunk in chunks:
+        file.write(chunk)
+        digest.update(chunk)
+        size += len(chunk)
+    assert size == part.bytes, f"{part.name} has another size than a moment before, in one transaction"
+    file.write(bytes(padded(size) - size))
+    return part.model_copy(update={"sha256": digest.hexdigest()})

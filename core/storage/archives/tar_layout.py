@@ -6,7 +6,6 @@ Because it does, a reader need not trust a tar: it knows beforehand what every h
 from __future__ import annotations
 
 import tarfile
-from bisect import bisect_right
 from dataclasses import dataclass
 
 from core.errors import InvalidArchive
@@ -56,11 +55,6 @@ class TarLayout:
             position = self.members[-1].end
         self.end = position
         self.size = position + END_BYTES
-        self._heads = [member.start - BLOCK for member in self.members]
-
-    def member_at(self, position: int) -> Member | None:
-        """The member to which a byte belongs, its header and the zeros behind it included; None at the file's end."""
-        return None if position >= self.end else self.members[bisect_right(self._heads, position) - 1]
 
 
 def manifest_size(first: bytes) -> int:

@@ -82,6 +82,18 @@ class RowReader:
             return np.empty((len(rows), *NO_LOCAL), np.int8)
         return self._layout.locals_of(self._checked(self._last, rows, checksums, "local"))
 
+    def frames(self, rows: Rows, checksums: Checksums) -> NDArray[np.void]:
+        """All that is stored of rows (:attr:`Layout.frame`); all checksums of each record are compared."""
+        records = self._read(rows, 0, self._layout.record)
+        for row, expected, record in zip(rows.tolist(), checksums.tolist(), records, strict=True):
+            if record["checksum"] != expected or not self._layout.is_sound(record, row):
+                name = segment_name(row // self._layout.rows_per_segment)
+                raise Damage(f"{name}: row {row} does not match its checksum")
+        frames = np.empty(len(rows), self._layout.frame)
+        for name in ("descriptor", "local"):
+            frames[name] = records[name]
+        return frames
+
     def _first_parts(self, rows: Rows, checksums: Checksums) -> NDArray[np.void]:
         return self._checked(self._first, rows, checksums, "descriptor")
 

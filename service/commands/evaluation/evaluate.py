@@ -231,6 +231,10 @@ def evaluate(
         raise typer.BadParameter("--transposed goes with --from-similarity")
     if no_cache and cache is not None:
         raise typer.BadParameter("give --cache or --no-cache, not both")
+    if report is not None:
+        from core.evaluation.report import check_installed
+
+        check_installed()  # before what may take hours
     options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed)
     options.check()
     if report is not None:

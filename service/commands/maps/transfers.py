@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 PIECE_BYTES = 16 << 20
 """Bytes of one request: they are in memory at one time, and lost if the connection breaks."""
 
-PATIENCE = 600.0
-"""Seconds for which the request for a piece is repeated while the service is overloaded, restarts or reads a map."""
+PATIENCE = 3600.0
+"""Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
+a map, which for 100 000 places takes minutes."""
 
 RESTARTS = 3
 """How often a download begins again because the service no longer keeps the export of which a part is here."""

@@ -1,21 +1,12 @@
-"""The preferred form of an answer, entity tags, conditions and ranges of bytes."""
+"""The preferred form of an answer, entity tags and conditions."""
 
 from __future__ import annotations
 
 import pytest
 
 from core.errors import RevisionMismatch
-from service.errors.faults import ExportGone, RangeNotSatisfiable
-from service.http.headers import (
-    Slice,
-    check_match,
-    entity_tag,
-    expected_revision,
-    is_known,
-    named_tags,
-    preferred,
-    wanted_slice,
-)
+from service.errors.faults import ExportGone
+from service.http.headers import check_match, entity_tag, expected_revision, is_known, named_tags, preferred
 
 
 @pytest.mark.parametrize(
@@ -50,39 +41,6 @@ def test_the_revision_that_an_edit_requires(if_match: str | None, expected: int 
 def test_an_edit_of_another_revision_is_refused(if_match: str) -> None:
     with pytest.raises(RevisionMismatch, match="revision 7"):
         expected_revision(if_match, 7)
-
-
-@pytest.mark.parametrize(
-    ("header", "start", "stop"),
-    [
-        ("bytes=0-", 0, 100), ("bytes=0-0", 0, 1), ("bytes=10-19", 10, 20), ("bytes=90-1000", 90, 100),
-        ("bytes=-10", 90, 100), ("bytes=-1000", 0, 100), ("BYTES=5-6", 5, 7), ("bytes= 99-", 99, 100),
-        # Whatever cannot be read, or is more than one range, is passed over.
-        ("", 0, 100), ("bytes=", 0, 100), ("bytes=-", 0, 100), ("bytes=5-4", 0, 100), ("bytes=0-1,5-6", 0, 100),
-        ("lines=1-2", 0, 100), ("bytes=a-b", 0, 100), ("bytes=1-2-3", 0, 100), ("bytes=" + "9" * 400 + "-", 0, 100),
-    ],
-)  # fmt: skip
-def test_ranges(header: str, start: int, stop: int) -> None:
-    part = wanted_slice({"range": header}, "t", 100)
-    assert part == Slice(start, stop, 100)
-    assert part.is_whole == ((start, stop) == (0, 100))
-    if header == "bytes=10-19":
-        assert part.content_range == "bytes 10-19/100"
-
-
-@pytest.mark.parametrize("header", ["bytes=100-", "bytes=100-200", "bytes=-0"])
-def test_a_range_behind_the_end(header: str) -> None:
-    with pytest.raises(RangeNotSatisfiable) as refused:
-        wanted_slice({"range": header}, "t", 100)
-    assert refused.value.headers == {"Content-Range": "bytes */100"}
-
-
-@pytest.mark.parametrize(
-    ("condition", "given"), [('"t"', True), ('"u"', False), ('W/"t"', False), ("Sat, 21 Nov 2026 10:00:00 GMT", False)]
-)
-def test_if_range(condition: str, given: bool) -> None:
-    part = wanted_slice({"range": "bytes=5-", "if-range": condition}, "t", 100)
-    assert part.is_whole is not given
 
 
 def test_conditions() -> None:

@@ -309,10 +309,11 @@ def large(server: Server) -> bytes:
 @pytest.mark.timeout(300)  # the service is started twice
 def test_killed_at_every_stage(apart: Path) -> None:
     """Killed while a file arrives, a request makes a map and a job another: no map is incomplete, the job continues."""
-    settings = {"export_seconds": 1, "max_exports": 1, "max_imports": 3, "max_import_bytes": 1 << 28}
+    settings = {"max_imports": 3, "max_import_bytes": 1 << 28}
     server = Server(apart, settings).wait()
     content = large(server)
-    _limits(server)
+    with begun(server, "/v1/maps/import", 1 << 29, b"") as connection:
+        assert connection.recv(100).startswith(b"HTTP/1.1 413")
     job = import_file(server, content, "by-job", background="true").headers["location"]
     making = begun(server, "/v1/maps/import?id=by-request", len(content), content)
     wait_until(lambda: any(server.data_dir.glob("maps/.making-by-request-*/descriptors-000001.seg")))
@@ -327,7 +328,9 @@ def test_killed_at_every_stage(apart: Path) -> None:
     server.kill()
     for connection in (making, arriving):
         connection.close()
+    assert any(server.data_dir.glob("exports/*.tar"))
     server = Server(apart).wait()
+    assert not (server.data_dir / "exports").exists()
     assert (
         server.client.get("/v1/maps/by-request").status_code
         == server.client.get("/v1/maps/arriving").status_code
@@ -350,20 +353,3 @@ def test_killed_at_every_stage(apart: Path) -> None:
             check(archive)
     assert server.stop() == 0
     assert not (apart / "data" / "exports").exists()
-
-
-def _limits(server: Server) -> None:
-    """Files may have 256 MiB; exports are kept for a second, and one at a time."""
-    with begun(server, "/v1/maps/import", 1 << 29, b"") as connection:
-        assert connection.recv(100).startswith(b"HTTP/1.1 413")
-    for name in ("a", "b"):
-        server.create_map(name, encoder="coarse")
-    tag = export(server, "a").headers["etag"]
-    assert export(server, "a", if_match=tag).status_code == 200
-    assert server.enrol("a", "p", jpeg(1)).status_code == 201
-    assert export(server, "b").status_code == 200, "the export of a is removed, since nobody reads it"
-    wait_until(lambda: export(server, "a", if_match=tag).status_code != 503)  # until the export of b has ended
-    assert_problem(export(server, "a", if_match=tag), 412, "export-gone")
-    wait_until(lambda: not any(server.data_dir.glob("exports/*")))
-    for name in ("a", "b"):
-        assert server.client.delete(f"/v1/maps/{name}").status_code == 204

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.baselines.system import About
 from core.evaluation import Comparison, Outcome, Run, judge, summarize
+from core.evaluation.report import write_report
 from core.frames.traverses import Truth, tolerance_truth
 
 TIMES: dict[str, float | None] = {"forward": 4.25, "regions": None, "vlad": None, "match": 0.5}
@@ -87,7 +88,7 @@ class Page(HTMLParser):
 
     elements: list[Element] = field(default_factory=list)
 
-    VOID = frozenset({"img", "meta", "link", "source", "input", "br"})
+    VOID = frozenset({"img", "meta", "link", "input", "br"})
 
     def __post_init__(self) -> None:
         super().__init__(convert_charrefs=True)
@@ -114,6 +115,12 @@ class Page(HTMLParser):
         """The elements of a tag, or those of them that have a class."""
         found = [element for element in self.elements if element.tag == tag]
         return [one for one in found if style is None or style in (one.attributes.get("class") or "").split()]
+
+
+def written_page(folder: Path, comparison: Comparison) -> Page:
+    """The page of a comparison, written to a folder and read again."""
+    write_report(folder, comparison)
+    return read_page((folder / "index.html").read_text("utf-8"))
 
 
 def read_page(html: str) -> Page:

@@ -4,10 +4,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from core.evaluation.report.gallery import MOST_BOXES, case, gallery, wrong_first
 from core.evaluation.report.thumbnails import Thumbnails
-from tests.core.evaluation.report.comparisons import make_comparison, make_run, outcome, read_page
+from tests.core.evaluation.report.comparisons import make_comparison, make_run, outcome, written_page
 
 
 def test_the_most_confident_wrong_match_is_first() -> None:
@@ -38,20 +39,23 @@ def test_which_true_reference_is_shown(tmp_path: Path) -> None:
     ]
 
 
-def test_full_page_says_what_it_leaves_out(tmp_path: Path) -> None:
+def test_full_page_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     comparison = make_comparison(tmp_path, systems=1)
-    run = comparison.runs[0]
-    empty = gallery(comparison, run, Thumbnails(budget=0), None, most=4)
-    assert "are left out, to keep the page small" in empty
-    assert "<svg" not in empty
-    small = read_page(gallery(comparison, run, Thumbnails(budget=1), None, most=4))
-    assert len(small.named("article")) == 1
+    empty = gallery(comparison, comparison.runs[0], Thumbnails(budget=0), None, most=4)
+    assert [len(group.cases) for group in empty] == [0, 0] and sum(group.total for group in empty) == 8
+    small = gallery(comparison, comparison.runs[0], Thumbnails(budget=1), None, most=4)
+    assert sum(len(group.cases) for group in small) == 1
+    monkeypatch.setattr("core.evaluation.report.page.Thumbnails", lambda: Thumbnails(budget=0))
+    page = written_page(tmp_path / "report", comparison)
+    assert "are left out, to keep the page small" in page.named("section", "run")[0].text
+    assert page.named("article") == page.named("image") == []
 
 
 def test_number_of_cases_and_of_boxes_is_bounded(tmp_path: Path) -> None:
     comparison = make_comparison(tmp_path, systems=1, noise=6.0, count=30)
     boxes = [(0.0, 0.0, 1.0, (place + 1) / 100) for place in range(100)]
-    page = read_page(gallery(comparison, comparison.runs[0], Thumbnails(), lambda path: boxes, most=4))
-    articles = page.named("article")
-    assert [article.attributes["class"] for article in articles] == ["case wrong"] * 4 + ["case right"] * 2
-    assert len(page.named("rect")) == 18 * MOST_BOXES
+    groups = gallery(comparison, comparison.runs[0], Thumbnails(), lambda path: boxes, most=4)
+    assert [(group.kind, len(group.cases)) for group in groups] == [("wrong", 4), ("right", 2)]
+    panels = [panel for group in groups for case in group.cases for panel in case]
+    assert [len(panel.boxes) for panel in panels] == [MOST_BOXES] * 18
+    assert panels[0].boxes[9] == pytest.approx((0.0, 0.0, 48.0, 3.6)), "pixels of the picture"

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from core.evaluation.report.table import columns, figures_table, stages
-from core.evaluation.report.theme import Cast
+from core.evaluation.report.table import columns, stages
 from core.frames.traverses import tolerance_truth
-from tests.core.evaluation.report.comparisons import make_comparison, make_run, read_page
+from tests.core.evaluation.report.comparisons import make_comparison, make_run, written_page
 
 
 def test_columns_without_any_figure_are_left_out(tmp_path: Path) -> None:
@@ -31,26 +30,27 @@ def test_best_figure_of_a_column_stands_out(tmp_path: Path) -> None:
     kept, truth = np.arange(3), tolerance_truth(3, 3, 0)
     good = make_run("good", np.eye(3, dtype=np.float32), kept, truth, nbytes=9000)
     poor = make_run("poor", np.array([[1, 0, 0], [2, 0, 0], [0, 0, 1]], np.float32), kept, truth, nbytes=10)
-    page = read_page(figures_table([good, poor], Cast([good, poor])))
+    comparison = make_comparison(tmp_path, systems=1, count=3)
+    page = written_page(tmp_path / "two", replace(comparison, runs=[good, poor]))
     best = [cell.text for cell in page.named("td", "best")]
     assert best[0] == "1.000 all right"
     assert best[-1] == "10\N{NO-BREAK SPACE}B", "less memory is better"
     assert "9.0\N{NO-BREAK SPACE}KB" not in best
-    assert not read_page(figures_table([good], Cast([good]))).named("td", "best")
+    assert not written_page(tmp_path / "one", replace(comparison, runs=[good])).named("td", "best")
 
 
 def test_a_missing_figure_cannot_be_mistaken_for_a_number(tmp_path: Path) -> None:
-    first, second = make_comparison(tmp_path, systems=2).runs
-    runs = [first, replace(second, milliseconds={})]
-    page = read_page(figures_table(runs, Cast(runs)))
+    comparison = make_comparison(tmp_path, systems=2)
+    first, second = comparison.runs
+    page = written_page(tmp_path / "report", replace(comparison, runs=[first, replace(second, milliseconds={})]))
     missing = page.named("td", "none")
     assert [cell.text for cell in missing] == ["–"] * 3  # total, forward, match
     assert all("data-value" not in cell.attributes for cell in missing)
 
 
 def test_sorted_as_it_comes(tmp_path: Path) -> None:
-    runs = make_comparison(tmp_path, systems=2).runs
-    page = read_page(figures_table(runs, Cast(runs)))
+    comparison = make_comparison(tmp_path, systems=2)
+    page = written_page(tmp_path / "report", comparison)
     sorted_heads = [head for head in page.named("th") if "aria-sort" in head.attributes]
     assert [(head.text, head.attributes["aria-sort"]) for head in sorted_heads] == [("AUC-PR", "descending")]
-    assert len(page.named("button")) == len(columns(runs)) + 1
+    assert len(page.named("button")) == len(columns(comparison.runs)) + 1

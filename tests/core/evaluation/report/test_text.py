@@ -4,13 +4,9 @@ import os
 
 import pytest
 
-from core.evaluation.report.text import counted, enumerate_words, escape, file_stems, milliseconds, number, plain, size
+from core.evaluation.report.text import counted, enumerate_words, file_stems, milliseconds, number, plain, size
 
 SPACE = "\N{NO-BREAK SPACE}"
-
-
-def test_escape_leaves_no_markup() -> None:
-    assert escape("<b a=\"1\" c='2'>&") == "&lt;b a=&quot;1&quot; c=&#x27;2&#x27;&gt;&amp;"
 
 
 def test_plain_is_always_text() -> None:

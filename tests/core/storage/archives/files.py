@@ -20,13 +20,13 @@ from core.storage.atlas import Atlas
 Parts = dict[str, bytes]
 
 
-def exported(map_: Map, folder: Path) -> bytes:
-    """The whole file of a map."""
-    export = map_.exporter.into(folder)
+def exported(map_: Map, path: Path) -> bytes:
+    """The whole file of a map, which is written to ``path`` and removed."""
+    map_.exporter.write(path)
     try:
-        return export.read(0, export.size)
+        return path.read_bytes()
     finally:
-        export.discard()
+        path.unlink()
 
 
 def parts_of(content: bytes) -> tuple[dict[str, Any], Parts]:

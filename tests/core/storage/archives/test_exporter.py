@@ -1,4 +1,4 @@
-"""A moment of a map: whole, the same bytes whatever becomes of the map, in no writer's way."""
+"""The file of a map: whole, the same bytes for the same content, in no writer's way, and nothing if it fails."""
 
 from __future__ import annotations
 
@@ -57,21 +57,14 @@ def test_what_comes_back_is_what_was_there(
     other.close()
 
 
-def test_any_range_at_any_time(full: Map, atlas: Atlas, tmp_path: Path) -> None:
-    export = full.exporter.into(tmp_path / "kept")
-    whole = export.read(0, export.size)
-    full.enrol([frame("p1", "another"), *(frame(f"later{i}") for i in range(9))])
-    full.forget("p2")
-    full.cameras.forget("rear")
-    assert export.read(0, 1 << 30) == whole
-    atlas.delete("lab")
-    for start in range(0, export.size, 311):
-        assert export.read(start, 401) == whole[start : start + 401]
-    assert export.read(export.size, 10) == b""
-    _, parts = parts_of(whole)
-    assert b"later" not in parts["places-000001.jsonl"]
-    export.discard()
-    assert not (tmp_path / "kept").exists()
+def test_the_same_content_is_the_same_file(full: Map, tmp_path: Path) -> None:
+    first, second = full.exporter.write(tmp_path / "first.tar"), full.exporter.write(tmp_path / "second.tar")
+    content = first.path.read_bytes()
+    assert content == second.path.read_bytes() and first.tag == second.tag
+    assert first.size == len(content) and first.tag in content[:8192].decode("ascii", "ignore")
+    with pytest.raises(StorageFailure):  # a file that is there is never written over
+        full.exporter.write(first.path)
+    assert first.path.read_bytes() == content
 
 
 def test_rows_of_forgotten_places_are_left_behind(content: bytes) -> None:
@@ -81,15 +74,22 @@ def test_rows_of_forgotten_places_are_left_behind(content: bytes) -> None:
     assert len(parts["descriptors-000001.bin"]) == 9 * (2 * DIMENSION + 15)
 
 
-def test_segments_of_which_nothing_lives_any_more(full: Map, directory: Path, tmp_path: Path) -> None:
-    """Their files go: those that a moment was taken of before are still there for it, later ones do without."""
-    before = full.exporter.into(tmp_path / "before")
-    whole = before.read(0, before.size)
-    for name in ("p0", "p1", "p2"):  # the fourth of the first segment was replaced
-        full.forget(name)
+def test_segments_of_which_nothing_lives_any_more(
+    full: Map, directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their files go: one that is being exported finishes with them, later ones do without."""
+    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 1)
+    whole = exported(full, tmp_path / "before")
+
+    def forget(written: int) -> None:
+        if written == 1:
+            for name in ("p0", "p1", "p2"):  # the fourth of the first segment was replaced
+                full.forget(name)
+
+    meanwhile = full.exporter.write(tmp_path / "meanwhile.tar", forget)
+    assert meanwhile.path.read_bytes() == whole
     full.enrol([frame("next")])
     assert not (directory / "maps" / "lab" / "descriptors-000001.seg").exists()
-    assert before.read(0, before.size) == whole
     path = tmp_path / "after.tar"
     path.write_bytes(exported(full, tmp_path / "after"))
     other = Atlas(tmp_path / "other")
@@ -129,9 +129,11 @@ def test_enrolment_goes_on_while_it_is_read(full: Map, tmp_path: Path) -> None:
         going.set()
         assert done.wait(10), "a write waits for an export"
 
-    export = full.exporter.into(tmp_path / "kept", advance)
+    export = full.exporter.write(tmp_path / "kept.tar", advance)
     thread.join()
     assert export.manifest.places == 9 and len(full.snapshot()) == 10
+    _, parts = parts_of(export.path.read_bytes())
+    assert b"meanwhile" not in parts["places-000001.jsonl"]
 
 
 def test_a_map_that_is_deleted_does_not_wait_for_its_export(
@@ -153,9 +155,9 @@ def test_a_map_that_is_deleted_does_not_wait_for_its_export(
             threading.Event().wait(0.001)
 
     with pytest.raises(UnknownMap):
-        full.exporter.into(tmp_path / "kept", advance)
+        full.exporter.write(tmp_path / "kept.tar", advance)
     thread.join(10)
-    assert not thread.is_alive() and not (tmp_path / "kept").exists()
+    assert not thread.is_alive() and list(tmp_path.glob("*.tar")) == []
 
 
 def test_the_state_changes_with_every_write(full: Map) -> None:
@@ -177,31 +179,35 @@ def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pyte
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(exporter, "_write_group", refuse)
+    monkeypatch.setattr(exporter, "_pictures", refuse)
     with pytest.raises(StorageFull):
-        full.exporter.into(tmp_path / "kept")
-    assert not (tmp_path / "kept").exists()
+        full.exporter.write(tmp_path / "kept.tar")
+    assert list(tmp_path.glob("*.tar")) == []
     assert full.verify().ok
 
 
-def test_where_there_are_no_links_files_are_copied(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    content = exported(full, tmp_path / "linked")
+def test_the_size_is_known_before_anything_is_written(full: Map, tmp_path: Path) -> None:
+    told = []
 
-    def refuse(*_: object) -> None:
-        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+    def expect(size: int) -> None:
+        assert not (tmp_path / "kept.tar").exists()
+        told.append(size)
+        if len(told) > 1:
+            raise StorageFull("no room")
 
-    monkeypatch.setattr(os, "link", refuse)
-    assert exported(full, tmp_path / "copied") == content
+    made = full.exporter.write(tmp_path / "kept.tar", expect=expect)
+    assert told == [made.size] == [made.path.stat().st_size]
+    made.path.unlink()
+    with pytest.raises(StorageFull, match="no room"):
+        full.exporter.write(tmp_path / "kept.tar", expect=expect)
+    assert list(tmp_path.glob("*.tar")) == []
 
 
 def test_damage_is_found_and_not_exported(full: Map, directory: Path, tmp_path: Path) -> None:
-    export = full.exporter.into(tmp_path / "kept")
     flip(directory / "maps" / "lab" / "descriptors-000001.seg", 4096 + 3)
-    with pytest.raises(StorageFailure, match="row 0 does not match its checksum"):
-        export.read(0, export.size)
-    with pytest.raises(MapQuarantined, match="row 0"):
-        full.exporter.into(tmp_path / "other")
-    assert not (tmp_path / "other").exists()
+    with pytest.raises(MapQuarantined, match="row 0 does not match its checksum"):
+        full.exporter.write(tmp_path / "kept.tar")
+    assert list(tmp_path.glob("*.tar")) == []
 
 
 def test_it_can_be_asked_of_a_map_that_is_not_open(directory: Path, full: Map, atlas: Atlas, tmp_path: Path) -> None:
@@ -223,11 +229,11 @@ def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(exporter, "read_layout", ended)
     with pytest.raises(RuntimeError, match="the first of it"):
-        full.exporter.into(tmp_path / "kept")
+        full.exporter.write(tmp_path / "kept.tar")
 
 
 def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
     with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
-        full.exporter.into(tmp_path / "kept")
-    assert not (tmp_path / "kept").exists()
+        full.exporter.write(tmp_path / "kept.tar")
+    assert list(tmp_path.glob("*.tar")) == []

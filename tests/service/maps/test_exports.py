@@ -1,0 +1,249 @@
+"""Exports that are kept: how many, for how long, in how much room; and what a download of one is answered."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections import namedtuple
+from collections.abc import Callable, Coroutine, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.types import Message
+
+from core.errors import StorageFull
+from core.storage import Atlas, Map, MapSettings
+from service.errors.faults import RangeNotSatisfiable, TooManyExports
+from service.maps.exports import FOLDER, Export, ExportResponse, Exports
+from service.settings import Settings
+from tests.service.engines import ENCODER, enrolments
+
+Usage = namedtuple("Usage", "total used free")
+
+
+@dataclass
+class Place:
+    """Three maps, and exports of them of which at most two are kept."""
+
+    exports: Exports
+    maps: dict[str, Map]
+    folder: Path
+
+    @property
+    def files(self) -> set[Path]:
+        return set(self.folder.glob("*"))
+
+    async def settled(self, kept: set[Path]) -> None:
+        """Wait until these files are left."""
+        while self.files != kept:
+            await asyncio.sleep(0.01)
+
+    async def sent(self, export: Export, method: str = "GET", **headers: str) -> tuple[int, dict[str, str], bytes]:
+        """Status, headers and body of a download."""
+        messages: list[Message] = []
+
+        async def send(message: Message) -> None:
+            messages.append(message)
+
+        async def receive() -> Message:
+            await asyncio.sleep(60)
+            return {"type": "http.disconnect"}
+
+        given = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
+        scope = {"type": "http", "method": "GET", "headers": given, "state": {"method": method}}
+        response = ExportResponse(self.exports, export, {"ETag": f'"{export.file.tag}"'})
+        assert export.readers == 1
+        try:
+            await response(scope, receive, send)
+        finally:
+            assert export.readers == 0
+        start, *bodies = messages
+        answered = {name.decode(): value.decode() for name, value in start["headers"]}
+        return start["status"], answered, b"".join(one.get("body", b"") for one in bodies)
+
+
+Work = Callable[[Place], Coroutine[Any, Any, None]]
+Run = Callable[[Work], None]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[Run]:
+    """Runs a test on an event loop."""
+    settings = Settings(data_dir=tmp_path / "data", max_exports=2)
+    atlas, maps = Atlas(settings.data_dir), {}
+    for name in ("a", "b", "c"):
+        maps[name] = atlas.create(name, ENCODER, 8, MapSettings(keep="none"))
+        maps[name].enrol(enrolments(1, 3, "p", "monday"))
+
+    async def to_the_end(work: Work) -> None:
+        place = Place(Exports(settings), maps, settings.data_dir / FOLDER)
+        async with asyncio.timeout(60):
+            await work(place)
+            await place.exports.close()
+        assert not place.folder.exists()
+
+    yield lambda work: asyncio.run(to_the_end(work))
+    atlas.close()
+
+
+@pytest.mark.parametrize(
+    ("header", "start", "stop"),
+    [
+        ("bytes=0-", 0, None), ("bytes=0-0", 0, 1), ("bytes=10-19", 10, 20), ("bytes=-10", -10, None),
+        ("bytes=90-99999999", 90, None), ("BYTES=5-6", 5, 7), ("bytes=-99999999", 0, None),
+    ],
+)  # fmt: skip
+def test_a_range(run: Run, header: str, start: int, stop: int | None) -> None:
+    async def work(place: Place) -> None:
+        export = await place.exports.create(place.maps["a"])
+        whole = export.file.path.read_bytes()
+        status, headers, body = await place.sent(export, range=header)
+        assert status == 206 and body == whole[start:stop]
+        first = start % len(whole)
+        assert headers["content-range"] == f"bytes {first}-{first + len(body) - 1}/{len(whole)}"
+        assert int(headers["content-length"]) == len(body)
+
+    run(work)
+
+
+@pytest.mark.parametrize(
+    ("method", "headers"),
+    [
+        ("GET", {}),
+        ("HEAD", {}),
+        ("HEAD", {"range": "bytes=5-"}),
+        ("HEAD", {"range": "bytes=99999999-"}),
+        ("GET", {"range": "bytes=5-", "if_range": '"another"'}),
+        *(("GET", {"range": given}) for given in ("", "bytes=", "bytes=-", "bytes=5-4", "lines=1-2", "bytes=a-b", "x")),
+        ("GET", {"range": "bytes=" + "9" * 5000 + "-"}),
+    ],
+)
+def test_what_names_no_range_of_this_file_is_answered_with_all_of_it(
+    run: Run, method: str, headers: dict[str, str]
+) -> None:
+    async def work(place: Place) -> None:
+        export = await place.exports.create(place.maps["a"])
+        whole = export.file.path.read_bytes()
+        status, answered, body = await place.sent(export, method, **headers)
+        assert (status, body) == (200, whole if method == "GET" else b"")
+        assert answered["content-length"] == str(len(whole)) and answered["accept-ranges"] == "bytes"
+        assert answered["etag"] == f'"{export.file.tag}"'
+
+    run(work)
+
+
+@pytest.mark.parametrize("header", ["bytes=99999999-", "bytes=-0", "bytes=99999999-99999999"])
+def test_a_range_behind_the_end(run: Run, header: str) -> None:
+    async def work(place: Place) -> None:
+        export = await place.exports.create(place.maps["a"])
+        with pytest.raises(RangeNotSatisfiable) as refused:
+            await place.sent(export, range=header)
+        assert refused.value.headers == {"Content-Range": f"bytes */{export.file.size}"}
+        assert export.readers == 0
+
+    run(work)
+
+
+def test_several_ranges_come_in_parts(run: Run) -> None:
+    async def work(place: Place) -> None:
+        export = await place.exports.create(place.maps["a"])
+        whole = export.file.path.read_bytes()
+        status, headers, body = await place.sent(export, range="bytes=0-99, 600-699", if_range=f'"{export.file.tag}"')
+        assert status == 206 and headers["content-type"].startswith("multipart/byteranges")
+        assert whole[:100] in body and whole[600:700] in body
+
+    run(work)
+
+
+def test_a_map_that_has_not_changed_is_written_once(run: Run) -> None:
+    async def work(place: Place) -> None:
+        a = place.maps["a"]
+        assert place.exports.tag_of(a) is None
+        first, second = await asyncio.gather(place.exports.create(a), place.exports.create(a))
+        assert first is second and await place.exports.create(a) is first
+        assert place.files == {first.file.path} and place.exports.tag_of(a) == first.file.tag
+        a.enrol(enrolments(7, 1, "later", "monday"))
+        assert place.exports.tag_of(a) is None
+        other = await place.exports.create(a)
+        assert other is not first and place.exports.find("a", [first.file.tag]) is first
+        # What is known of a map outlasts its file.
+        for name in ("b", "c"):
+            await place.exports.create(place.maps[name])
+        assert place.exports.find("a", [other.file.tag]) is None
+        assert place.exports.tag_of(a) == other.file.tag
+
+    run(work)
+
+
+def test_the_one_that_was_not_read_for_longest_makes_room(run: Run) -> None:
+    async def work(place: Place) -> None:
+        made = [await place.exports.create(place.maps[name]) for name in ("a", "b", "c")]
+        await place.settled({export.file.path for export in made[1:]})
+        releases = [place.exports.hold(export) for export in made[1:]]
+        with pytest.raises(TooManyExports):
+            await place.exports.create(place.maps["a"])
+        for release in releases:
+            release(False)
+        await place.exports.create(place.maps["a"])
+        await place.settled(place.files - {made[1].file.path})
+        assert made[2].file.path in place.files
+
+    run(work)
+
+
+def test_a_full_disk_costs_idle_exports_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work(place: Place) -> None:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 41, 0, 0 if place.files else 1 << 40))
+        first = await place.exports.create(place.maps["a"])
+        release = place.exports.hold(first)
+        with pytest.raises(StorageFull, match="no room for the map as a file"):
+            await place.exports.create(place.maps["b"])
+        assert place.files == {first.file.path}
+        release(False)
+        second = await place.exports.create(place.maps["b"])
+        assert place.files == {second.file.path}
+
+    run(work)
+
+
+def test_it_goes_when_it_was_not_used_for_its_time(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work(place: Place) -> None:
+        monkeypatch.setattr(place.exports, "_seconds", 0.01)
+        export = await place.exports.create(place.maps["a"])
+        release, timer = place.exports.hold(export), export.expiry
+        while export.expiry is timer:  # until the time is over
+            await asyncio.sleep(0.01)
+        assert export.file.path.exists(), "it is being read"
+        release(False)
+        await place.settled(set())
+
+    run(work)
+
+
+@pytest.mark.parametrize(
+    ("headers", "seconds"),
+    [({}, 300), ({"range": "bytes=-1"}, 300), ({"range": "bytes=0-99"}, 3600), ({"range": "bytes=0-9, 50-59"}, 3600)],
+)
+def test_it_goes_sooner_when_its_last_byte_was_sent(run: Run, headers: dict[str, str], seconds: float) -> None:
+    async def work(place: Place) -> None:
+        export = await place.exports.create(place.maps["a"])
+        await place.sent(export, **headers)
+        assert export.expiry is not None
+        left = export.expiry.when() - asyncio.get_running_loop().time()
+        assert seconds - 60 < left <= seconds
+        await place.sent(export, "HEAD")
+        assert export.expiry.when() - asyncio.get_running_loop().time() > 3540, "somebody asks for it again"
+
+    run(work)
+
+
+def test_what_a_crash_left_is_removed(run: Run) -> None:
+    async def work(place: Place) -> None:
+        place.folder.mkdir()
+        (place.folder / "0123.tar").write_bytes(b"half of a file")
+        place.exports.clean()
+        assert not place.folder.exists()
+
+    run(work)
