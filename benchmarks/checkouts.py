@@ -1,4 +1,4 @@
-"""Two checkouts of this repository side by side: encoding, queries by 1 and 16 robots, enrolment, start, memory.
+"""Two checkouts of this repository side by side: encoding, queries by 1, 4 and 16 robots, enrolment, start, memory.
 
     python -m benchmarks.checkouts ../other-checkout
 
@@ -93,7 +93,7 @@ def main(
             for name in list(checkouts)[:: 1 if turn % 2 else -1]:
                 values, (client, _) = found[name], services[name]
                 values["encode ms"].append(asked(encoders[name], 60))
-                for robots in (1, 16):
+                for robots in (1, 4, 16):
                     seen = load(str(client.base_url), folder / "frames", robots, seconds)
                     values[f"{robots} robots, answers/s"].append(len(seen["milliseconds"]) / seen["seconds"])
                     values[f"{robots} robots, p50 ms"].append(float(np.median(seen["milliseconds"])))

@@ -19,7 +19,7 @@ from core.frames.images import decode
 from core.frames.preprocessing import contrast, prepare
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from core.method.vlad import Words, aggregate
+from core.method.vlad import aggregate
 from core.threads import cores, share_cores
 from service.commands.malloc import configure_malloc
 
@@ -35,7 +35,7 @@ def stage_runs(encoder: Encoder, data: bytes) -> dict[str, Callable[[], object]]
     image = torch.from_numpy(prepare(pixels, extractor.backbone.input)[None]).permute(0, 3, 1, 2)
     maps = extractor.activations([pixels])[0]
     products = extractor.products(maps)
-    features, words = extractor.regions(maps, products).features, Words(encoder.centers)
+    features, words = extractor.regions(maps, products).features, encoder.centers
 
     def forward() -> object:
         with torch.inference_mode():

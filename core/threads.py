@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import cache
 from typing import TypeVar
 
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import LibController, ThreadpoolController
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -84,6 +84,25 @@ def keep_to(number: int | None) -> None:
             os.sched_setaffinity(0, every if number is None else [every[number % len(every)]])
 
 
+@cache
+def _openmp() -> list[LibController]:
+    """The OpenMP libraries of torch and FAISS."""
+    import faiss
+    import torch
+
+    torch.get_num_threads(), faiss.omp_get_max_threads()
+    return [library for library in ThreadpoolController().lib_controllers if library.user_api == "openmp"]
+
+
+def use_threads(threads: int) -> None:
+    """Let what this thread computes from now on use so many threads, itself among them; others keep their number."""
+    import torch
+
+    torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following
+    for library in _openmp():
+        library.set_num_threads(threads)  # OpenMP keeps this number for each thread
+
+
 def compute_alone(number: int | None = None) -> None:
     """Let this thread compute without the help of others, which use the other cores.
 
@@ -91,13 +110,8 @@ def compute_alone(number: int | None = None) -> None:
         number: of this thread, from 0, if each of several threads is to have a core of its own.  Otherwise the system
             may leave two threads on one core for milliseconds while another core is idle.
     """
-    import torch
-
     keep_to(number)
-    torch.get_num_threads()  # torch sets a thread's number at its first use, which would undo the following
-    for library in ThreadpoolController().lib_controllers:
-        if library.user_api == "openmp":
-            library.set_num_threads(1)  # OpenMP keeps this number for each thread
+    use_threads(1)
 
 
 @cache

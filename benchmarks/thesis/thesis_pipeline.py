@@ -26,7 +26,7 @@ from core.frames.images import decode
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.method.regions import extract_regions
-from core.method.vlad import Words, aggregate
+from core.method.vlad import aggregate
 
 LIMIT = 40.0
 THESIS = "m-region-vlad-thesis"
@@ -51,7 +51,7 @@ def _plain(backbone: torch.nn.Module) -> torch.nn.Module:
     return _PLAIN[id(backbone)]
 
 
-def ours(encoder: Encoder, data: bytes, step: float, words: Words) -> NDArray[np.float32]:
+def ours(encoder: Encoder, data: bytes, step: float, words: NDArray[np.float32]) -> NDArray[np.float32]:
     """The same vector as this project computes it, at any step."""
     definition = encoder.definition
     layers = encoder.extractor.activations([decode(data)])[0]
@@ -66,7 +66,7 @@ def main(
     """Compare the vectors, then the times."""
     thesis, default = EncoderCatalogue().get(THESIS), EncoderCatalogue().get(DEFAULT_ENCODER)
     data, coarse = jpeg(sample_frame()), thesis.definition.steps[0]
-    words = Words(thesis.centers)
+    words = thesis.centers
     for step in (coarse, fine):
         a, b = literal(thesis, data, step), ours(thesis, data, step, words)
         cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from core.kernels.correspondence import WHOLE_WORDS, squared_sums
+from core.kernels.correspondence import squared_sums
 from core.kernels.projections import quantize
 
 Array = NDArray[np.float32]
@@ -116,9 +116,9 @@ def correspondences(query: Cells, reference: Cells, columns: int, reach: tuple[i
 
 @dataclass(frozen=True)
 class ScatteredCells:
-    """The cells of k frames where they lie in memory, C cells of L values each: they need not be copied to be compared.
+    """The cells of k frames where they lie in memory, C cells of L values each.
 
-    blocks: int8 [n, C, L] each, contiguous; at least one.
+    blocks: int8 [n, C, L] each; at least one.
     block: int64 [k], the block that holds a frame's cells.
     row: int64 [k], the frame's position in that block.
     """
@@ -142,28 +142,6 @@ class ScatteredCells:
             found[position] = self.blocks[block][row]
         return found
 
-    def addresses(self) -> NDArray[np.int64]:
-        """The address of the first value of each frame, int64 [k]; valid as long as this object lives.
-
-        Raises:
-            IndexError: a block has no such row.
-            ValueError: a block is not contiguous, or has another shape.
-        """
-        lengths = np.array([len(block) for block in self.blocks])
-        if len(self) and (self.row.min() < 0 or (self.row >= lengths[self.block]).any()):
-            raise IndexError("a block of cells has no such row")
-        for block in self.blocks:
-            if block.shape[1:] != self.shape[1:] or block.dtype != np.int8 or not block.flags.c_contiguous:
-                raise ValueError("blocks of cells are alike and contiguous")
-        firsts = np.array([block.ctypes.data for block in self.blocks], np.int64)
-        return np.asarray(firsts[self.block] + self.row * int(np.prod(self.shape[1:])))
-
-
-def in_one_block(cells: Cells) -> ScatteredCells:
-    """Cells that lie in one array: int8 [k, C, L], copied only if it is not contiguous."""
-    count = len(cells)
-    return ScatteredCells((np.ascontiguousarray(cells, np.int8),), np.zeros(count, np.int64), np.arange(count))
-
 
 def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, definition: AgreementDefinition) -> Array:
     """What each candidate's score gains: ``share`` times the mean over all cells of the squared cosines.
@@ -182,12 +160,9 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
     if query.shape != candidates.shape[1:] or len(query) % columns:
         shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
         raise ValueError(f"cells of {shapes} in {columns} columns cannot be compared")
-    if missing := -query.shape[1] % WHOLE_WORDS:
-        if isinstance(candidates, ScatteredCells):
-            candidates = candidates.together()
-        candidates = np.pad(candidates, [(0, 0), (0, 0), (0, missing)])
-        query = np.pad(query, [(0, 0), (0, missing)])
-    lying = candidates if isinstance(candidates, ScatteredCells) else in_one_block(candidates)
-    asked = np.require(query, np.int8, ["C", "W"])  # numba would compile the loop again for a read-only array
-    sums: Array = squared_sums(asked, lying.addresses(), columns, *definition.reach, np.float32(1 / RESOLUTION**2))
+    if isinstance(candidates, ScatteredCells):
+        candidates = candidates.together()
+    # numba would compile the loop again for arrays that are read-only or not contiguous.
+    asked, shown = (np.require(cells, np.int8, ["C", "W"]) for cells in (query, candidates))
+    sums: Array = squared_sums(asked, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))
     return sums * np.float32(definition.share / len(query))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +20,7 @@ from core.method.agreement import AgreementDefinition, Cells, ScatteredCells, ag
 from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
 from core.method.regions import Regions
-from core.method.vlad import Words, aggregate, scores
+from core.method.vlad import aggregate, scores
 from core.method.vocabulary import Vocabulary
 from core.networks.forward import Device, Precision, has_bfloat16
 from core.networks.identity import json_digest, tensors_digest
@@ -29,9 +28,6 @@ from core.networks.network import ShallowNetwork
 from core.threads import each
 
 Array = NDArray[np.float32]
-
-FRAMES_A_PASS = 4
-"""At most this many frames share a forward pass; with more, their maps would not stay in the caches."""
 
 GOLDEN_COSINE = 0.999
 """Least cosine of the descriptors of a machine, or of a lower precision, to the golden ones."""
@@ -67,7 +63,8 @@ class Encoding:
     descriptor: float32 [D]; zeros if the frame has no region.
     local: int8 [C, L], local descriptors of the C cells for the second stage, zeros if the frame has no region;
         [0, 0] for an encoder without a second stage.
-    milliseconds: of the stages ``forward``, ``regions`` and ``vlad``; the last includes the local descriptors.
+    milliseconds: of the stages ``forward``, ``regions`` and ``vlad``; the second includes the cells' products with the
+        projections, the last the local descriptors.
     """
 
     descriptor: Array
@@ -113,7 +110,7 @@ class Encoder:
         if len(vocabulary.centers) != definition.words:
             raise InvalidModel(f"{name} needs {definition.words} words, its vocabulary has {len(vocabulary.centers)}.")
         self.name, self.extractor, self.definition = name, extractor, definition
-        self.centers, self._words = vocabulary.centers, Words(vocabulary.centers)
+        self.centers = vocabulary.centers
         self.calibration, self._golden = calibration, golden
         self.dimension = int(self.centers.size)
         self.identity = encoder_identity(name, definition, vocabulary)
@@ -149,11 +146,16 @@ class Encoder:
         return agreement(query, candidates, self.grid[1], stage)
 
     def encode(self, pixels: Pixels, mask: Mask | None = None) -> Encoding:
-        """Encode one frame, uint8 [H, W, 3], BGR, of any size; a mask hides a part of it.  The pass uses all cores."""
-        return self._encode([pixels], [mask])[0]
+        """Encode one frame, uint8 [H, W, 3], BGR, of any size; a mask hides a part of it.
+
+        The forward pass uses all cores, unless the calling thread computes alone (``core.threads``).
+        """
+        started = time.perf_counter()
+        activations = self.extractor.activations([pixels], [mask])[0]
+        return self.describe(activations, 1e3 * (time.perf_counter() - started))
 
     def encode_batch(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[Encoding]:
-        """Encode frames, a few in each forward pass and one pass on each core, which is faster than one by one.
+        """Encode frames: each core takes one after the other, which is faster than all cores together.
 
         Args:
             frames: uint8 [H, W, 3] each, BGR, of any sizes.
@@ -165,42 +167,22 @@ class Encoder:
         hidden = [None] * len(frames) if masks is None else masks
         if len(hidden) != len(frames):
             raise ValueError(f"{len(hidden)} masks for {len(frames)} frames")
-        threads = torch.get_num_threads()
-        passes = max(min(threads, len(frames)), -(-len(frames) // FRAMES_A_PASS))
-        cuts = [len(frames) * index // max(passes, 1) for index in range(passes + 1)]
+        shown = list(zip(frames, hidden, strict=True))
+        return each(lambda frame: self.encode(*frame), shown, torch.get_num_threads())
 
-        def encode(part: tuple[int, int]) -> list[Encoding]:
-            return self._encode(frames[part[0] : part[1]], hidden[part[0] : part[1]])
-
-        return [encoding for made in each(encode, list(pairwise(cuts)), threads) for encoding in made]
-
-    def _encode(self, frames: Sequence[Pixels], masks: Sequence[Mask | None]) -> list[Encoding]:
-        """Encode frames with one forward pass; ``forward`` is each frame's share of it."""
-        started = time.perf_counter()
-        maps = self.extractor.maps(frames, masks)
-        products = self.extractor.products(maps)
-        forward = 1e3 * (time.perf_counter() - started) / len(frames)
-        return [
-            self.describe([layer[i] for layer in maps], forward, {name: layer[i] for name, layer in products.items()})
-            for i in range(len(frames))
-        ]
-
-    def describe(
-        self, activations: Sequence[Array], forward: float = 0.0, products: Mapping[str, Array] | None = None
-    ) -> Encoding:
+    def describe(self, activations: Sequence[Array], forward: float = 0.0) -> Encoding:
         """Encode a frame whose activations are known.
 
         Args:
             activations: of each output, float32 [X, Y, K], as ``extractor.activations`` gives them.
-            forward: milliseconds that they and the products took.
-            products: as ``extractor.products`` gives them, if they are known.
+            forward: milliseconds that they took.
         """
         definition = self.definition
         began = time.perf_counter()
-        products = self.extractor.products(activations) if products is None else products
+        products = self.extractor.products(activations)
         regions = self.extractor.regions(activations, products)
         between = time.perf_counter()
-        descriptor = aggregate(regions.features, self._words, definition.gamma, definition.normalization)
+        descriptor = aggregate(regions.features, self.centers, definition.gamma, definition.normalization)
         local = self.local(activations, products) if len(regions) else np.zeros(self.local_shape, np.int8)
         ended = time.perf_counter()
         times = {"forward": forward, "regions": 1e3 * (between - began), "vlad": 1e3 * (ended - between)}

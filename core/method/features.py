@@ -19,7 +19,7 @@ from core.method.equations import unit_length
 from core.method.projection import Projection
 from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
 from core.networks.backbone import Backbone
-from core.networks.forward import CudaPass, Device, Precision, fused_pass
+from core.networks.forward import Device, GraphPass, Precision, TorchPass
 from core.networks.identity import json_digest, tensors_digest
 from core.networks.network import ShallowNetwork
 from core.threads import keep_numpy_single_threaded
@@ -103,15 +103,12 @@ class FeatureExtractor:
         Raises:
             InvalidModel: this machine or this network cannot compute so.
         """
-        network = self.backbone
+        network, plain = self.backbone, (precision, device) == ("float32", "cpu")
         self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
         """The forward pass in use: float32 [B, 3, H, W] to one float32 [B, K, X, Y] for each output."""
         if isinstance(network, ShallowNetwork):
-            made = CudaPass(network) if device == "cuda" else fused_pass(network, precision)
-            if made is None and precision != "float32":
-                raise InvalidModel(f"this build of torch cannot compute {network.definition.name} in {precision}.")
-            self.forward = made or network
-        elif (precision, device) != ("float32", "cpu"):
+            self.forward = GraphPass(network) if plain else TorchPass(network, precision, device)
+        elif not plain:
             raise InvalidModel(
                 "a plugged network runs on the CPU in float32, unless it moves itself to another device."
             )

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.projections import ConstantMatrix, finish_rows
+from core.kernels.projections import finish_rows
 from core.method.equations import unit_length
 
 Array = NDArray[np.float32]
@@ -51,11 +51,7 @@ class Projection:
 
     def products(self, features: Array) -> Array:
         """f W of features f, float32 [n, K] to [n, d]; the product of a sum of features is the sum of products."""
-        return self._product(features)
-
-    @cached_property
-    def _product(self) -> ConstantMatrix:
-        return ConstantMatrix(self.matrix)
+        return np.asarray(features @ self.matrix, np.float32)
 
     @cached_property
     def shift(self) -> Array:

@@ -9,40 +9,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.projections import ConstantMatrix
 from core.kernels.vlad import aggregated
 from core.method.equations import Normalization
 
 Array = NDArray[np.float32]
 
 
-class Words:
-    """The words of a vocabulary, prepared once for the features of many frames.
-
-    Args:
-        centers: float32 [V, K].
-    """
-
-    def __init__(self, centers: Array) -> None:
-        self.centers = np.ascontiguousarray(centers, np.float32)
-        self.closeness = ConstantMatrix(self.centers.T, np.float32(-0.5) * np.einsum("vk,vk->v", centers, centers))
-        """f·o - ‖o‖²/2, float32 [T, K] to [T, V]: the highest value of a row is the nearest word's."""
-
-
-def aggregate(features: Array, centers: Array | Words, gamma: float, normalization: Normalization) -> Array:
+def aggregate(features: Array, centers: Array, gamma: float, normalization: Normalization) -> Array:
     """The VLAD of one frame, flattened.
 
     Args:
         features: float32 [T, K]; T = 0 gives zeros.
-        centers: float32 [V, K], or the same prepared.
+        centers: float32 [V, K].
         gamma: γ, the exponent of the power normalization.
 
     Returns:
         float32 [V·K].
     """
-    words = centers if isinstance(centers, Words) else Words(centers)
-    closeness = words.closeness(features)
-    vectors = aggregated(features, words.centers, closeness, np.float32(gamma), normalization == "intra")
+    centers = np.ascontiguousarray(centers, np.float32)
+    # f·o - ‖o‖²/2: the highest value of a row is the nearest word's.
+    closeness = features @ centers.T - np.float32(0.5) * np.einsum("vk,vk->v", centers, centers)
+    vectors = aggregated(features, centers, closeness, np.float32(gamma), normalization == "intra")
     return np.asarray(vectors, np.float32).reshape(-1)
 
 

@@ -20,7 +20,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.recognition.selection import Selection
 from core.storage import Atlas, Map, MapRecord
-from service.engine.microbatches import AfterEncoding, Encoded
+from service.engine.encoder_threads import AfterEncoding, Encoded
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
@@ -258,11 +258,11 @@ class Engine:
             EncoderNotInstalled: the encoder is not installed.
         """
         async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
-            async for some in outcomes:
-                for _, outcome in some:
-                    if isinstance(outcome, UnknownEncoder):
-                        raise EncoderNotInstalled(str(outcome)) from outcome
-                yield some
+            try:
+                async for some in outcomes:
+                    yield some
+            except UnknownEncoder as error:
+                raise EncoderNotInstalled(str(error)) from error
 
     async def encode_all(
         self,

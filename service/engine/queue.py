@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -16,14 +17,7 @@ from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.threads import cores, share_cores
-from service.engine.microbatches import (
-    MOST_FRAMES,
-    AfterEncoding,
-    Encoded,
-    MicroBatches,
-    QueuedFrame,
-    deadline_exceeded,
-)
+from service.engine.encoder_threads import AfterEncoding, Encoded, EncoderThreads, QueuedFrame, deadline_exceeded
 from service.errors.faults import ClientGone, QueueFull
 from service.telemetry.metrics import Metrics
 
@@ -32,7 +26,7 @@ __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadl
 Outcomes = list[tuple[int, Encoded | Exception]]
 """Some frames of a request, each with its index: encoded, or the error that kept it from being encoded."""
 
-AHEAD = 2 * MOST_FRAMES * max(2, cores())
+AHEAD = 8 * max(2, cores())
 """Frames of one bulk request that wait at a time: enough that the encoder never runs out of them."""
 
 UNWATCHED = 0.25
@@ -68,11 +62,13 @@ class EncoderQueue:
         self._queue_length, self._waiting, self._bulk = queue_length, 0, 0
         self._loaded: dict[str, Encoder] = {}
         share_cores(threads or torch.get_num_threads())
-        self._batches = MicroBatches(self._load, limits, metrics.encoded_together.observe)
+        self._threads = EncoderThreads(limits)
+        self._loader = ThreadPoolExecutor(1, "encoder-loader")
 
     def close(self) -> None:
         """Cancel the waiting frames and end the encoder's threads; blocks."""
-        self._batches.close()
+        self._loader.shutdown(cancel_futures=True)
+        self._threads.close()
 
     def check_room(self) -> None:
         """Raise QueueFull if there is no free place; a route calls it before it reads a body."""
@@ -118,7 +114,7 @@ class EncoderQueue:
         """
         if identity in self._loaded:
             return self._loaded[identity]
-        return await asyncio.wrap_future(self._batches.call(lambda: self._load(identity)))
+        return await asyncio.wrap_future(self._loader.submit(self._load, identity))
 
     def _load(self, identity: str) -> Encoder:
         if identity not in self._loaded:
@@ -126,6 +122,16 @@ class EncoderQueue:
             encoder.check_golden()
             self._loaded[identity] = encoder
         return self._loaded[identity]
+
+    async def _load_in_time(self, identity: str, deadline: RequestDeadline) -> Encoder:
+        if deadline.seconds_left() <= 0:
+            raise deadline_exceeded()
+        if identity in self._loaded:
+            return self._loaded[identity]
+        try:
+            return await asyncio.wait_for(self.load(identity), deadline.seconds_left())
+        except TimeoutError:
+            raise deadline_exceeded() from None
 
     async def encode(
         self,
@@ -147,10 +153,9 @@ class EncoderQueue:
             InvalidImage: the frame cannot be decoded.
             UnknownEncoder, InvalidModel: see ``load``.
         """
-        if deadline.seconds_left() <= 0:
-            raise deadline_exceeded()
-        frame = QueuedFrame(identity, data, mask, deadline.at, after_encoding=after_encoding)
-        self._batches.put([frame])
+        encoder = await self._load_in_time(identity, deadline)
+        frame = QueuedFrame(encoder, data, mask, deadline.at, after_encoding=after_encoding)
+        self._threads.put([frame])
         result = asyncio.wrap_future(frame.result)
         gone: asyncio.Future[Any] | None = None
         try:
@@ -180,17 +185,22 @@ class EncoderQueue:
     ) -> AsyncGenerator[Outcomes]:
         """Encode the frames of a bulk request; call it within ``place``.
 
-        At most ``AHEAD`` of them wait at a time.  They share forward passes with each other and with the frames of
-        other requests, and robots' frames go first.  When the generator is closed, waiting frames leave the queue.
+        At most ``AHEAD`` of them wait at a time, and robots' frames go first.  When the generator is closed, waiting
+        frames leave the queue.
 
         Args:
             frames: the bytes of the files.
             masks: for each frame the part that is ignored; None: all frames are used whole.
 
         Yields:
-            Frames that are done, with their indices: in order, except that those that fail come early.  An error is
-            one of ``encode``; it concerns one frame, or all (a deadline, a damaged encoder).
+            Frames that are done, with their indices, as they are done.  An error concerns one frame.
+
+        Raises:
+            Others: see ``encode``; they concern all frames.
         """
+        if not frames:
+            return
+        encoder = await self._load_in_time(identity, deadline)
         hidden = [None] * len(frames) if masks is None else masks
         open_: dict[asyncio.Future[Encoded], tuple[int, QueuedFrame]] = {}
         begun, bulk = 0, len(frames) > 1
@@ -198,10 +208,8 @@ class EncoderQueue:
         try:
             while begun < len(frames) or open_:
                 following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
-                queued = [
-                    QueuedFrame(identity, frames[i], hidden[i], deadline.at, bulk, from_robot=False) for i in following
-                ]
-                self._batches.put(queued)
+                queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk) for i in following]
+                self._threads.put(queued)
                 open_ |= {
                     asyncio.wrap_future(frame.result): (i, frame) for i, frame in zip(following, queued, strict=True)
                 }

@@ -22,7 +22,7 @@ from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
 from core.threads import cores
-from service.engine.microbatches import Encoded
+from service.engine.encoder_threads import Encoded
 
 MOST_TOGETHER = 8
 """The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""
@@ -44,18 +44,17 @@ class Recognized:
 
 @dataclass(frozen=True)
 class SearchAhead:
-    """A search of a map that is done in the encoder's thread; frames of a batch with equal values share one search."""
+    """A search of a map that is done in the encoder's thread."""
 
     map_: Map
     k: int
 
-    def __call__(self, encoded: Sequence[Encoded]) -> list[list[Answer] | None]:
-        """The answer for each frame; None for a frame that is left to :meth:`Searches.recognize`."""
-        seen = [one for one in encoded if len(one.encoding.regions)]
-        if not seen or not self.map_.snapshot().holds:  # its descriptors would have to be read from disk
-            return [None] * len(encoded)
-        found = iter(locate(self.map_, seen[0].encoder, [one.encoding for one in seen], self.k))
-        return [[next(found)] if len(one.encoding.regions) else None for one in encoded]
+    def __call__(self, encoded: Encoded) -> Answer | None:
+        """The answer for a frame; None for a frame that is left to :meth:`Searches.recognize`."""
+        if not len(encoded.encoding.regions) or not self.map_.snapshot().holds:  # it would have to read from the disk
+            return None
+        (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k)
+        return answer
 
 
 def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
@@ -106,7 +105,7 @@ class Searches:
         """
         seen = [frame for frame in frames if len(frame.encoding.regions)]
         if len(seen) == 1 and seen[0].search_result is not None:
-            answers: list[Answer] = seen[0].search_result
+            answers: list[Answer] = [seen[0].search_result]
         else:
             encodings = [frame.encoding for frame in seen]
             answers = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []

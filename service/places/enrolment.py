@@ -12,8 +12,8 @@ from core.frames.masks import Mask
 from core.places import Place, PlaceFields
 from core.recognition.recognition import describe, frame_digest
 from core.storage import Change, Enrolment, Map, SameFrame
+from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine
-from service.engine.microbatches import Encoded
 from service.engine.queue import AHEAD, RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import BatchTurn, Stage

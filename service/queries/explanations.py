@@ -17,8 +17,8 @@ from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
 from core.places import Place
 from core.storage import Map
+from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
-from service.engine.microbatches import Encoded
 from service.engine.queue import RequestDeadline
 from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
 from service.queries.schemas import (

@@ -13,8 +13,8 @@ from core.places import Place, check_place_id
 from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
 from core.storage import Map
+from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
-from service.engine.microbatches import Encoded
 from service.errors.faults import (
     EncoderNotInstalled,
     PlaceTaken,

@@ -16,8 +16,8 @@ from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
 from core.storage import Map
+from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
-from service.engine.microbatches import Encoded
 from service.engine.queue import RequestDeadline
 from service.errors.faults import EncoderNotInstalled
 from service.worker_threads import in_thread

@@ -15,7 +15,6 @@ from core.judgement.verdict import Verdict
 FAST = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5)
 SECONDS = (*FAST, 5.0, 10.0, 30.0)
 SCORES = tuple(round(0.05 * step, 2) for step in range(-2, 21))
-TOGETHER = (1, 2, 4, 8, 16, 32, 64, 128)
 ITEMS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -77,12 +76,6 @@ class Metrics:
             "Time of one stage of encoding a frame.",
             ["stage"],
             buckets=FAST,
-            registry=self.registry,
-        )
-        self.encoded_together = Histogram(
-            "placerec_encoded_together",
-            "Frames that waited together and were encoded together.",
-            buckets=TOGETHER,
             registry=self.registry,
         )
         self.searches = Histogram(

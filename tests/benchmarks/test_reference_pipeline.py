@@ -10,7 +10,7 @@ from benchmarks.thesis.thesis_pipeline import THESIS, literal, ours
 from core.evaluation.samples import jpeg, sample_frame
 from core.frames.images import decode
 from core.method.catalogue import EncoderCatalogue
-from core.method.vlad import Words, aggregate
+from core.method.vlad import aggregate
 
 
 def test_the_literal_vlad_is_the_compiled_one() -> None:
@@ -24,7 +24,7 @@ def test_the_literal_vlad_is_the_compiled_one() -> None:
 def test_both_pipelines_give_one_vector(step: float) -> None:
     encoder = EncoderCatalogue().get(THESIS)
     data = jpeg(sample_frame(3))
-    a, b = literal(encoder, data, step), ours(encoder, data, step, Words(encoder.centers))
+    a, b = literal(encoder, data, step), ours(encoder, data, step, encoder.centers)
     assert float(a @ b) >= 0.995 * np.linalg.norm(a) * np.linalg.norm(b)
 
 
@@ -32,5 +32,5 @@ def test_at_the_packaged_step_it_is_the_encoders_own_vector() -> None:
     encoder = EncoderCatalogue().get(THESIS)
     frame = sample_frame(4)
     data = jpeg(frame)
-    vector = ours(encoder, data, encoder.definition.steps[0], Words(encoder.centers))
+    vector = ours(encoder, data, encoder.definition.steps[0], encoder.centers)
     np.testing.assert_allclose(vector, encoder.encode(decode(data)).descriptor, atol=1e-5)

@@ -74,7 +74,7 @@ def test_examples_know_nothing_of_the_project() -> None:
 
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {"core/evaluation/report": {"report"}, "core/networks": {"models"}, "training": {"report"}}
+EXTRAS = {"core/evaluation/report": {"report"}, "training": {"report"}}
 """Folders that may import what an extra brings; tests and benchmarks may import all."""
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from core.method.equations import Normalization, vlad
-from core.method.vlad import Words, aggregate
+from core.method.vlad import aggregate
 
 
 @pytest.mark.parametrize("normalization", ["intra", "global"])
@@ -17,7 +17,7 @@ def test_equals_the_equations(shape: tuple[int, int, int], gamma: float, normali
     generator = np.random.default_rng(words)
     features = generator.random((count, values)).astype(np.float32)
     centers = generator.random((words, values)).astype(np.float32)
-    made = aggregate(features, Words(centers), gamma, normalization)
+    made = aggregate(features, centers, gamma, normalization)
     wanted = vlad(features.astype(np.float64), centers.astype(np.float64), gamma, normalization)
     assert made.dtype == np.float32
     # A residual near 0 is a difference of nearly equal numbers, and a power under 1 magnifies its rounding.

@@ -13,7 +13,6 @@ from core.method.agreement import (
     ScatteredCells,
     agreement,
     correspondences,
-    in_one_block,
     local_descriptors,
 )
 
@@ -112,7 +111,7 @@ def test_together_they_stand_in_order() -> None:
     assert lying.blocks[2][4].any()
 
 
-@pytest.mark.parametrize("values", [8, 6, 3])
+@pytest.mark.parametrize("values", [8, 3])
 def test_they_agree_with_a_frame_as_copies_do(values: int) -> None:
     lying = scattered(values)
     stage = definition(values=values)
@@ -124,31 +123,6 @@ def test_they_agree_with_a_frame_as_copies_do(values: int) -> None:
     np.testing.assert_allclose(gains[::-1], agreement(query, backwards, COLUMNS, stage), rtol=1e-6)
     query.flags.writeable = False
     np.testing.assert_allclose(gains, agreement(query, lying, COLUMNS, stage), rtol=1e-6)
-
-
-def test_addresses_are_those_of_the_blocks() -> None:
-    lying = scattered(8)
-    size = ROWS * COLUMNS * 8
-    assert lying.addresses().tolist() == [
-        lying.blocks[block].ctypes.data + row * size for block, row in ((2, 4), (0, 0), (1, 0), (2, 1), (2, 4))
-    ]
-    nothing = in_one_block(np.empty((0, 4, 8), np.int8))
-    assert (len(nothing), nothing.addresses().tolist()) == (0, [])
-
-
-@pytest.mark.parametrize(("block", "row"), [(0, 3), (1, 1), (2, -1)])
-def test_a_row_that_is_not_there_is_refused(block: int, row: int) -> None:
-    with pytest.raises(IndexError):
-        ScatteredCells(scattered(8).blocks, np.array([0, block]), np.array([0, row])).addresses()
-
-
-@pytest.mark.parametrize(
-    "other", [np.zeros((2, 12, 9), np.int8), np.zeros((2, 12, 16), np.int8)[:, :, ::2], np.zeros((2, 12, 8), np.int16)]
-)
-def test_blocks_of_another_kind_are_refused(other: np.ndarray) -> None:
-    blocks = (np.zeros((2, 12, 8), np.int8), other)
-    with pytest.raises(ValueError, match="alike"):
-        ScatteredCells(blocks, np.array([0]), np.array([0])).addresses()
 
 
 def test_grids_that_are_not_alike_are_refused() -> None:

@@ -12,10 +12,13 @@ from statistics import median
 
 import httpx
 import pytest
+import torch
 
 from core.errors import NotAnImage, UnknownEncoder
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from service.engine.encoder_threads import Encoded, QueuedFrame
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
@@ -45,15 +48,21 @@ async def queue() -> AsyncIterator[EncoderQueue]:
 
 @pytest.fixture
 def busy(queue: EncoderQueue) -> Iterator[threading.Event]:
-    """The encoder is at work until the event is set."""
-    done, begun = threading.Event(), threading.Event()
+    """The encoder's threads are at work until the event is set."""
+    done, begun = threading.Event(), threading.Semaphore(0)
 
-    def work() -> None:
-        begun.set()
+    def work(_: Encoded) -> None:
+        begun.release()
         done.wait(30)
 
-    queue._batches.call(work)
-    assert begun.wait(30)
+    encoder = queue._loaded[IDENTITY]
+    frames = [
+        QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=work)
+        for _ in range(torch.get_num_threads())
+    ]
+    queue._threads.put(frames)
+    for _ in frames:
+        assert begun.acquire(timeout=30)
     yield done
     done.set()
 
@@ -139,20 +148,26 @@ async def test_an_encoder_that_is_not_there(queue: EncoderQueue) -> None:
         await queue.encode("absent", jpeg(1), deadline())
 
 
-async def test_frames_are_encoded_in_order(queue: EncoderQueue, busy: threading.Event) -> None:
-    order: list[int] = []
+async def test_a_deadline_holds_while_the_encoder_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    free = threading.Event()
+    get = EncoderCatalogue.get
 
-    async def one(number: int) -> None:
-        await queue.encode(IDENTITY, jpeg(number), deadline())
-        order.append(number)
+    def slow(self: EncoderCatalogue, identity: str) -> Encoder:
+        free.wait(30)
+        return get(self, identity)
 
-    waiting = []
-    for number in range(4):
-        waiting.append(asyncio.ensure_future(one(number)))
-        await asyncio.sleep(0.01)
-    busy.set()
-    await asyncio.gather(*waiting)
-    assert order == [0, 1, 2, 3]
+    monkeypatch.setattr(EncoderCatalogue, "get", slow)
+    queue = EncoderQueue(EncoderCatalogue(), Limits(), queue_length=2, threads=0, metrics=Metrics())
+    try:
+        with pytest.raises(DeadlineExceeded):
+            await queue.encode(IDENTITY, jpeg(1), deadline(0.1))
+        with pytest.raises(DeadlineExceeded):
+            await anext(queue.encode_many(IDENTITY, [jpeg(1)], deadline(0.1)))
+        free.set()
+        assert (await queue.encode(IDENTITY, jpeg(1), deadline())).encoder is await queue.load(IDENTITY)
+    finally:
+        free.set()
+        queue.close()
 
 
 HEADERS = {"Content-Type": "image/jpeg"}
