@@ -78,9 +78,6 @@ _OLD_TYPES = {
 }  # fmt: skip
 
 
-_LIBRARY = "google.protobuf"
-
-
 @dataclass(frozen=True)
 class CaffeLayer:
     """A layer of either generation, as the file describes it.
@@ -128,7 +125,7 @@ def read_caffemodel(path: Path) -> CaffeNetwork:
     Raises:
         InvalidModel: the file cannot be read or is damaged; or protobuf is not installed.
     """
-    contents = read_in_child(__name__, path, "network", library=_LIBRARY, framework="numpy")
+    contents = read_in_child(__name__, path, "network", framework="numpy")
     net: Part = contents.tree
     shapes = [shape.get("dim", []) for shape in net.get("input_shape", [])]
     return CaffeNetwork(
@@ -181,7 +178,7 @@ def read_mean(path: Path) -> tuple[float, float, float]:
         if image.dtype.kind not in "fiu":
             raise InvalidModel(f"{path.name} does not hold numbers.")
     else:
-        contents = read_in_child(__name__, path, "mean", library=_LIBRARY, framework="numpy")
+        contents = read_in_child(__name__, path, "mean", framework="numpy")
         image = _array(contents, contents.tree, path.name)
     if image.ndim == 4 and len(image) == 1:
         image = image[0]

@@ -43,7 +43,7 @@ def read_checkpoint(path: Path) -> Mapping[str, Tensor]:
             raise InvalidModel(f"{path.name} is not a readable safetensors file: {error}") from error
     if not start.startswith(_STARTS):
         raise InvalidModel(f"{path.name} is neither a PyTorch checkpoint nor a safetensors file.")
-    return read_in_child(__name__, path, library="torch", framework="pt")
+    return read_in_child(__name__, path, framework="pt")
 
 
 def under(checkpoint: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

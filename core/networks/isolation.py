@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -65,25 +64,16 @@ class Contents(Mapping[str, Any]):
         return self._file.get_tensor(name)
 
 
-def read_in_child(
-    module: str, path: Path, *arguments: str, library: str, framework: Literal["pt", "numpy"]
-) -> Contents:
+def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"]) -> Contents:
     """What a module of this room finds in a file when it is run in a child process.
 
     Args:
         module: calls :func:`serve` when it is run.
         arguments: what the module's reader takes besides the path.
-        library: the package that it needs.
 
     Raises:
-        InvalidModel: the file cannot be read or is not what the module reads; or the package is not installed.
+        InvalidModel: the file cannot be read or is not what the module reads.
     """
-    try:
-        installed = find_spec(library) is not None
-    except ModuleNotFoundError:  # of a package within another one
-        installed = False
-    if not installed:
-        raise InvalidModel(f"{path.name} cannot be read without the package {library}; install placerec[models].")
     size = len(first_bytes(path, 1)) and path.stat().st_size
     if not 0 < size <= MAX_FILE:
         raise InvalidModel(f"{path.name} has {size} bytes; from 1 to {MAX_FILE} are read.")

@@ -43,7 +43,7 @@ def read_mat(path: Path) -> dict[str, Value]:
         raise InvalidModel(f"{path.name} is of MATLAB's 7.3 format (HDF5); save it in MATLAB again, with '-v7'.")
     if header[126:] != b"IM":
         raise InvalidModel(f"{path.name} is not a MATLAB file of level 5 from a little-endian machine.")
-    contents = read_in_child(__name__, path, library="scipy", framework="numpy")
+    contents = read_in_child(__name__, path, framework="numpy")
     return {name: _value(described, contents) for name, described in contents.tree.items()}
 
 

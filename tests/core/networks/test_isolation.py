@@ -26,7 +26,7 @@ MISBEHAVING = "tests.core.networks.misbehaving"
 
 def read(path: Path, text: str) -> Contents:
     (path / "file").write_text(text)
-    return read_in_child(MISBEHAVING, path / "file", library="numpy", framework="numpy")
+    return read_in_child(MISBEHAVING, path / "file", framework="numpy")
 
 
 def test_what_the_child_found_comes_back(tmp_path: Path) -> None:
@@ -62,17 +62,10 @@ def test_files_that_are_not_read_at_all(tmp_path: Path, monkeypatch: pytest.Monk
     for name, message in ((".", "there is no such file"), ("none", "there is no such file"), ("empty", "0 bytes")):
         (tmp_path / "empty").touch()
         with pytest.raises(InvalidModel, match=message):
-            read_in_child(MISBEHAVING, tmp_path / name, library="numpy", framework="numpy")
+            read_in_child(MISBEHAVING, tmp_path / name, framework="numpy")
     monkeypatch.setattr(isolation, "MAX_FILE", 3)
     with pytest.raises(InvalidModel, match="file has 5 bytes; from 1 to 3 are read"):
         read(tmp_path, "hello")
-
-
-@pytest.mark.parametrize("library", ["nowhere_to_be_found", "nowhere.to.be.found"])
-def test_a_missing_library_is_named_with_the_extra(tmp_path: Path, library: str) -> None:
-    (tmp_path / "file").write_text("hello")
-    with pytest.raises(InvalidModel, match=rf"without the package {library}; install placerec\[models\]"):
-        read_in_child(MISBEHAVING, tmp_path / "file", library=library, framework="numpy")
 
 
 def test_the_child_imports_nothing_from_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
