@@ -17,8 +17,6 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from core.kernels.codes import prefetch
-
 LANES = 16
 HELD = LANES - 1
 """Cells of a vector.  The last lane holds zeros: as bytes are held with 128 added, it tells how much that adds."""
@@ -224,20 +222,6 @@ def _generate_highest(typing_context: Any, address: Any) -> Any:
 
 
 highest: Any = intrinsic(_generate_highest)
-
-
-def _generate_fetch(typing_context: Any, address: Any) -> Any:
-    """Let the cache fetch the line at an address."""
-
-    def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: tuple[Any, ...]) -> ir.Value:
-        line = builder.inttoptr(arguments[0], _BYTE.as_pointer())
-        builder.call(prefetch(builder), [line, _INT(0), _INT(2), _INT(1)])  # to read, into the second cache, data
-        return context.get_dummy_value()
-
-    return types.void(types.int64), generate
-
-
-fetch: Any = intrinsic(_generate_fetch)
 
 
 def _generate_byte(typing_context: Any, address: Any) -> Any:

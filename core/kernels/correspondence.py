@@ -19,7 +19,6 @@ from core.kernels.cell_blocks import (
     LOWEST,
     MOVED,
     byte_at,
-    fetch,
     fewer_cells,
     highest,
     is_wide,
@@ -32,9 +31,6 @@ from core.kernels.cell_blocks import (
 
 WHOLE_WORDS = 4
 """The number of values of a cell must be a multiple of this."""
-
-LINE = 64
-"""Bytes of a cache line."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -174,11 +170,8 @@ def squared_sums(query, addresses, columns, rows_apart, columns_apart, cosine): 
     highs, backs = np.empty(columns, np.int32), np.empty(cells, np.int32)
     sums = np.empty(len(addresses), np.float32)
     for k in range(len(addresses)):
-        following = addresses[min(k + 1, len(addresses) - 1)]
         there[:] = LOWEST
         for row in range(rows):
-            for line in range(row * width, (row + 1) * width, LINE):
-                fetch(following + line)
             given = _words_given(addresses[k] + row * width, width, words)
             low, high = max(0, row - rows_apart), min(rows, row + rows_apart + 1)
             for part in range(parts):

@@ -104,7 +104,7 @@ def test_it_goes_on_in_its_own_format_in_every_tier(directory: Path, folder: Pat
     lab = atlas.get("lab")
     assert (lab.record.precision, lab.record.local_shape) == ("full", LOCAL_SHAPE)
     check(lab, names)
-    for step, tier in enumerate(("compact", "inverted", "exact")):
+    for step, tier in enumerate(("compact", "exact")):
         lab.edit({"index": tier})
         settled(lab, tier)
         check(lab, names)
