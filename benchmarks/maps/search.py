@@ -1,4 +1,4 @@
-"""How long one query takes against a map, and what it finds, by the number of places and the tier.
+"""How long one query takes against a map, and what it finds, by the number of places.
 
     python -m benchmarks.maps.search [--places 1000 --places 10000] [--rounds 30] [--queries 1040] [--keep FOLDER]
     python -m benchmarks.maps.search --million --keep FOLDER    # up to 1M places: a long run, 20 GB of disk
@@ -64,7 +64,7 @@ class Bar:
 
 BARS = {
     (100_000, "half"): Bar(50.0, 0.995, 8192, 98_000),
-    (MILLION, "compressed"): Bar(200.0, 0.98, 8000, 32_768),
+    (MILLION, "compressed"): Bar(150.0, 0.98, 8192, 32_768),
 }
 GROWTH = 4.0
 """A query against a million places is to take at most so many times as long as one against a hundred thousand."""
@@ -120,10 +120,10 @@ def _enrolment(row: int, descriptor: Array) -> Enrolment:
 
 
 def indexed(map_: Map) -> tuple[Snapshot, float]:
-    """The map with inverted lists, and the seconds that making what was not there took."""
+    """The map with codes, and the seconds that making what was not there took."""
     began = time.monotonic()
-    map_.edit({"index": "inverted"})
-    while (status := map_.index_status()).state == "building" or status.tier != "inverted":
+    map_.edit({"index": "compact"})
+    while (status := map_.index_status()).state == "building" or status.tier != "compact":
         time.sleep(0.1)
     return map_.snapshot(), time.monotonic() - began
 
@@ -186,7 +186,7 @@ def run(
     atlas = Atlas(folder)
     for places in sizes:
         map_, truth = atlas.get(_name(places)), np.load(folder / f"truth-{places}.npz")["rows"]
-        inverted, seconds = indexed(map_)
+        snapshot, seconds = indexed(map_)
         flat = flats[min(places, FLAT_PLACES)]
         contenders.append(
             Contender(
@@ -197,16 +197,15 @@ def run(
             )
         )
         facts.append({"memory": 4 * of.dimension, "recall": 1.0})
-        for tier, snapshot in (("compact", replace(inverted, lists=None)), ("inverted", inverted)):
-            contenders.append(Contender(places, tier, snapshot.search))
-            facts.append(
-                {
-                    "memory": snapshot.memory / places,
-                    "disk": disk_bytes(map_, encoder, precision, inverted.rows_per_segment),
-                    "recall": recall(snapshot, of.queries, truth),
-                    "build_seconds": seconds,
-                }
-            )
+        contenders.append(Contender(places, "compact", snapshot.search))
+        facts.append(
+            {
+                "memory": snapshot.memory / places,
+                "disk": disk_bytes(map_, encoder, precision, snapshot.rows_per_segment),
+                "recall": recall(snapshot, of.queries, truth),
+                "build_seconds": seconds,
+            }
+        )
     rows = []
     for contender, times, known in zip(contenders, measure(contenders, of.queries, rounds), facts, strict=True):
         low, middle, high = statistics.quantiles(times, n=4)
@@ -231,10 +230,9 @@ def bars(rows: Sequence[dict[str, Any]], precision: str) -> list[list[str]]:
             [f"{name}: bytes on disk a place", f"{row['disk']:.0f}", verdict(row["disk"], bar.disk)],
         ]
     times = {(row["places"], row["tier"]): row["milliseconds"] for row in rows}
-    for tier in ("compact", "inverted"):
-        if (MILLION, tier) in times and (100_000, tier) in times:
-            growth = times[MILLION, tier] / times[100_000, tier]
-            found.append([f"growth from 100,000 to 1,000,000, {tier}", f"{growth:.2f}", verdict(growth, GROWTH)])
+    if (MILLION, "compact") in times and (100_000, "compact") in times:
+        growth = times[MILLION, "compact"] / times[100_000, "compact"]
+        found.append(["growth from 100,000 to 1,000,000", f"{growth:.2f}", verdict(growth, GROWTH)])
     return found
 
 

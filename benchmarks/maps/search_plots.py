@@ -28,7 +28,7 @@ from matplotlib import pyplot as plt
 
 Array = NDArray[np.float32]
 
-TIERS = {"flat": "flat float32 (FAISS)", "compact": "compact", "inverted": "inverted lists"}
+TIERS = {"flat": "flat float32 (FAISS)", "compact": "compact"}
 BLOCK = 2000
 SHARED_PLACES = 100_000
 

@@ -1,67 +1,111 @@
-"""The codes of a map in memory, and the search over them: sketches of all rows, full codes of the best of those."""
+"""The codes of a map in memory, and the search over them.
+
+Codes lie in blocks.  Rows are appended to the last block, whose memory has room behind the rows that are there: a
+search names the rows that it may find, so rows that are written meanwhile disturb none.  In the background blocks are
+joined into larger ones, of which not every code has to be read: FAISS's fast scan over the first of the rotated values
+(``IndexIVFRaBitQFastScan`` with one list, which takes selectors) picks out candidates, and ``IndexRefine`` compares the
+whole codes of those.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from functools import cached_property
+from typing import NamedTuple
 
+import faiss
 import numpy as np
-from numpy.typing import NDArray
 
-from core.index.best_estimates import best_first, best_positions, together
-from core.index.codes import CodedQuery, Coder, Codes, PlaneQuery
-from core.kernels.codes import estimates_at, estimates_of
+from core.index.codes import Coder, Codes
+from core.index.flat import Array, Flags, Positions, in_one_thread, selector, stored
+from core.threads import cores, in_turns
 
-Array = NDArray[np.float32]
-Rows = NDArray[np.int64]
+ROWS_PER_BLOCK = 1024
+"""Rows of a block that is appended to."""
+LARGEST_BLOCK = 65_536
+LOOSE_ROWS = 8192
+"""Blocks that are not scanned are joined when they have so many rows: then reading every code takes too long."""
+SCANNED_VALUES = 2048
+"""The fast scan judges rows by so many of their rotated values; of fewer than twice as many all codes are compared."""
+CANDIDATES = 8
+"""For each row of the shortlist a scan leaves so many rows of a block, whose whole codes are compared."""
+SHARED_FROM = 16_384
+"""A search of so many rows is shared among threads."""
+_DECODED = 256
+"""Rows that are decoded at a time."""
 
-ROWS_PER_BLOCK = 65_536
-SURVIVORS = 8
-"""The full code is read of this many rows for each unit of √n, and of ``FEWEST_SURVIVORS`` at least."""
-FEWEST_SURVIVORS = 2048
-FEW = 8
-"""Where less than a row in this many is allowed, rows are picked; else all are judged and the others passed over."""
-_ROWS_PER_TASK = 32_768
-
-
-class Shortlist(NamedTuple):
-    """rows int64 [n] and estimated inner products float32 [n], best first."""
-
-    rows: Rows
-    estimates: Array
+Progress = Callable[[int, int], None]
 
 
-class Block(NamedTuple):
-    """Rows ``first`` … ``first + used`` of a table; behind them there may be room."""
+def _untold(done: int, total: int) -> None:
+    """Nobody is told."""
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Rows ``first`` … ``first + used`` of a table.
+
+    codes: the index of their codes; behind them there may be room.
+    scan: the same rows, of which a scan picks out candidates first; None where all codes are compared.
+    """
 
     first: int
     used: int
-    codes: Codes
+    codes: faiss.IndexRaBitQ
+    scan: faiss.IndexRefine | None = None
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no row will be added."""
+        return bool(self.used == self.codes.ntotal)
+
+    @property
+    def memory(self) -> int:
+        """Bytes of the rows, room included."""
+        scanned = 0 if self.scan is None else self.used * (SCANNED_VALUES // 8 + 16)  # factors and ids beside the bits
+        return int(self.codes.ntotal * self.codes.code_size + scanned)
+
+    def best(self, queries: Array, count: int, allowed: Flags | None) -> tuple[Array, Positions]:
+        """Estimates and rows of the table, float32 and int64 [B, count], -1 where there are fewer.
+
+        Args:
+            queries: rotated, float32 [B, D'].
+            allowed: bool [used], which rows may be returned; None: all.
+        """
+        if allowed is None and not self.is_full:
+            allowed = np.ones(self.used, np.bool_)
+        chosen = None
+        if allowed is not None:
+            flags = np.zeros(self.codes.ntotal, np.bool_)
+            flags[: self.used] = allowed
+            chosen = selector(flags)
+        found = self.used if allowed is None else int(np.count_nonzero(allowed))
+        if self.scan is None or found <= CANDIDATES * count:
+            index = self.codes
+            parameters = faiss.SearchParameters(sel=chosen)
+        else:
+            index = self.scan
+            base = faiss.SearchParametersPreTransform(index_params=faiss.SearchParametersIVF(sel=chosen, nprobe=1))
+            parameters = faiss.IndexRefineSearchParameters(k_factor=CANDIDATES, base_index_params=base)
+        with in_one_thread():
+            estimates, rows = index.search(queries, min(count, self.used), params=parameters)
+        return estimates, np.where(rows < 0, -1, rows + self.first)
 
 
-class Preselection(Protocol):
-    """What names the rows of a table that are worth judging, such as :class:`core.index.lists.InvertedLists`."""
+class Shortlist(NamedTuple):
+    """rows int64 [n] and estimated inner products float32 [n], best first; equal ones by row."""
 
-    def candidates(
-        self,
-        table: CodeTable,
-        query: CodedQuery,
-        count: int,
-        allowed: NDArray[np.bool_] | None = None,
-        executor: Executor | None = None,
-    ) -> Rows:
-        """About ``count`` rows or more that are allowed, ascending; fewer where there are not as many."""
-        ...
+    rows: Positions
+    estimates: Array
 
 
 @dataclass(frozen=True, eq=False)
 class CodeTable:
     """The codes of rows 0 … n of a map, an immutable value: appending gives a new one that shares its memory.
 
-    Blocks have room behind the last row, so that a write never copies the map.  A code is never changed: a deleted
-    place is left out by ``allowed``; a place whose descriptor changed has a new row.
+    A code is never changed: a deleted place is left out by ``allowed``; a place whose descriptor changed has a new row.
     """
 
     coder: Coder
@@ -72,173 +116,127 @@ class CodeTable:
         """Without rows."""
         return cls(coder)
 
-    @classmethod
-    def of(cls, coder: Coder, codes: Codes) -> CodeTable:
-        """Over codes as they are (mapped from a file, say), without a copy; rows appended later go elsewhere.
-
-        Raises:
-            ValueError: they are not of this coder's shape.
-        """
-        if (codes.sketches.shape[1], codes.bits.shape[1], codes.scales.shape[1]) != coder.shape:
-            raise ValueError("these codes are of another shape than the coder's")
-        return cls(coder, (Block(0, len(codes), codes),) if len(codes) else ())
-
     def __len__(self) -> int:
         return self.blocks[-1].first + self.blocks[-1].used if self.blocks else 0
+
+    @property
+    def memory(self) -> int:
+        """Bytes of all blocks."""
+        return sum(block.memory for block in self.blocks)
 
     def appended(self, codes: Codes) -> CodeTable:
         """With further rows.  Only on the newest table, by one thread at a time."""
         blocks, done = list(self.blocks), 0
         while done < len(codes):
-            if not blocks or blocks[-1].used == len(blocks[-1].codes):
-                blocks.append(Block(sum(block.used for block in blocks), 0, _room(self.coder)))
-            first, used, room = blocks[-1]
-            count = min(len(room) - used, len(codes) - done)
-            room.sketches[used : used + count] = codes.sketches[done : done + count]
-            room.bits[used : used + count] = codes.bits[done : done + count]
-            room.scales[used : used + count] = codes.scales[done : done + count]
-            blocks[-1], done = Block(first, used + count, room), done + count
+            if not blocks or blocks[-1].is_full:
+                # Many rows at once, such as those of a file, get a block of their own size.
+                room = min(LARGEST_BLOCK, max(ROWS_PER_BLOCK, len(codes) - done))
+                first = blocks[-1].first + blocks[-1].used if blocks else 0
+                blocks.append(Block(first, 0, self.coder.index(room)))
+            last = blocks[-1]
+            used = min(last.codes.ntotal, last.used + len(codes) - done)
+            stored(last.codes)[last.used : used] = codes[done : done + used - last.used]
+            blocks[-1], done = replace(last, used=used), done + used - last.used
         return replace(self, blocks=tuple(blocks))
 
     def codes(self, start: int, stop: int) -> Codes:
-        """Of rows start … stop, a copy unless they lie in one block."""
-        parts = []
-        for first, used, codes in self.blocks:
-            rows = slice(max(0, start - first), max(0, min(used, stop - first)))
-            if rows.start < rows.stop:
-                parts.append((codes.sketches[rows], codes.bits[rows], codes.scales[rows]))
-        if len(parts) == 1:
-            return Codes(*parts[0])
-        sketch, code, scales = self.coder.shape
-        parts.append(
-            (np.empty((0, sketch), np.uint64), np.empty((0, code), np.uint64), np.empty((0, scales), np.float32))
-        )
-        sketches, bits, factors = (np.concatenate([part[kind] for part in parts]) for kind in range(3))
-        return Codes(sketches, bits, factors)
+        """A copy of the codes of rows start … stop."""
+        parts = [self.coder.nothing(0)]
+        for block in self.blocks:
+            rows = slice(max(0, start - block.first), max(0, min(block.used, stop - block.first)))
+            parts.append(stored(block.codes)[rows])
+        return np.concatenate(parts)
 
-    def sketches_at(self, rows: Rows) -> Codes:
-        """Of some rows, in their order: codes without bits."""
-        sketch, _, scales = self.coder.shape
-        found = Codes(
-            np.empty((len(rows), sketch), np.uint64),
-            np.empty((len(rows), 0), np.uint64),
-            np.empty((len(rows), scales), np.float32),
-        )
-        for first, used, codes in self.blocks:
-            at = np.flatnonzero((rows >= first) & (rows < first + used))
-            found.sketches[at], found.scales[at] = codes.sketches[rows[at] - first], codes.scales[rows[at] - first]
-        return found
-
-    def shortlist(
-        self,
-        query: CodedQuery,
-        count: int,
-        allowed: NDArray[np.bool_] | None = None,
-        lists: Preselection | None = None,
-        executor: Executor | None = None,
-    ) -> Shortlist:
-        """The ``count`` rows with the highest estimates, fewer where there are not as many; equal ones by row.
+    def shortlists(
+        self, queries: Array, count: int, allowed: Flags | None = None, executor: Executor | None = None
+    ) -> list[Shortlist]:
+        """For each query the ``count`` rows with the highest estimates, fewer where there are not as many.
 
         Args:
-            allowed: bool [n], which rows may be returned (living and chosen by a filter); None: all.  Where few
-                are allowed only their codes are read.
-            lists: judge only the rows of the lists nearest to the query, and those that are in none yet.
+            queries: float32 [B, D].
+            allowed: bool [n], which rows may be returned (living and chosen by a filter); None: all.
             executor: shares the work; the calling thread takes part.  Not one whose threads call this.
 
         Raises:
-            ValueError: ``allowed`` is not of one value a row.
+            ValueError: ``allowed`` is not of one value a row, or the queries are of another length.
         """
-        n = len(self)
-        if allowed is not None and allowed.shape != (n,):
-            raise ValueError(f"which rows are allowed is said of all {n}")
-        survivors = max(FEWEST_SURVIVORS, count, int(SURVIVORS * np.sqrt(n)))
-        chosen = n if allowed is None else int(np.count_nonzero(allowed))
-        if chosen <= survivors:  # the full codes of all
-            rows = np.arange(n) if allowed is None else np.flatnonzero(allowed)
-        elif allowed is not None and chosen * FEW < n:
-            rows = np.flatnonzero(allowed)
-            rows = rows[best_positions(self._sketched_at(query, rows, executor), survivors)]
-        elif lists is not None:
-            rows = lists.candidates(self, query, survivors, allowed, executor)
-        else:
-            rows = np.empty(0, np.int64)
-        if len(rows) < min(survivors, chosen):  # without lists, or a filter left few of the rows that they hold
-            rows = best_positions(self.sketched(query, 0, n, allowed, executor), survivors)
-        estimates = self._estimated(query, rows, executor)
-        best = best_first(estimates, count)
-        return Shortlist(rows[best], estimates[best])
+        if allowed is not None and allowed.shape != (len(self),):
+            raise ValueError(f"which rows are allowed is said of all {len(self)}")
+        turned = self.coder.rotated(queries)
+        helpers = cores() - 1 if executor is not None and len(self) >= SHARED_FROM else 0
+        # A thread takes a block; where there are fewer blocks than threads, some of the queries.
+        portions = min(len(turned), -(-(1 + helpers) // max(1, len(self.blocks))))
+        found: dict[tuple[int, int], tuple[Array, Positions]] = {}
 
-    def sketched(
-        self,
-        query: CodedQuery,
-        start: int,
-        stop: int,
-        allowed: NDArray[np.bool_] | None = None,
-        executor: Executor | None = None,
-    ) -> Array:
-        """Estimates by sketch of rows start … stop, -inf for those that are not allowed: float32 [stop - start]."""
-        estimates = np.empty(stop - start, np.float32)
-        planes, step, total = query.sketch.planes, query.sketch.step, query.sketch.total
+        def search(part: tuple[int, int]) -> None:
+            number, portion = part
+            block, some = self.blocks[number], turned[portion::portions]
+            of_block = None if allowed is None else allowed[block.first : block.first + block.used]
+            found[part] = block.best(some, count, of_block)
 
-        def judge(codes: Codes, begin: int, end: int, first: int) -> None:
-            made = estimates[first + begin - start : first + end - start]
-            estimates_of(codes.sketches[begin:end], codes.scales[begin:end, 0], planes, step, total, made)
-            if allowed is not None:
-                made[~allowed[first + begin : first + end]] = -np.inf
-
-        tasks = [
-            _task(judge, codes, begin, min(used, stop - first, begin + _ROWS_PER_TASK), first)
-            for first, used, codes in self.blocks
-            for begin in range(max(0, start - first), min(used, stop - first), _ROWS_PER_TASK)
+        parts = [(number, portion) for number in range(len(self.blocks)) for portion in range(portions)]
+        in_turns(search, parts, executor, min(helpers, len(parts) - 1))
+        return [
+            _merged([found[number, i % portions] for number in range(len(self.blocks))], i // portions, count)
+            for i in range(len(turned))
         ]
-        together(tasks, executor)
-        return estimates
 
-    def _sketched_at(self, query: CodedQuery, rows: Rows, executor: Executor | None) -> Array:
-        """Estimates by sketch of some rows, ascending."""
-        return self._estimates_at(query.sketch, lambda codes: (codes.sketches, codes.scales[:, 0]), rows, executor)
+    @cached_property
+    def loose_rows(self) -> int:
+        """Rows of full blocks that are not scanned but would be if they were joined."""
+        if self.coder.width < 2 * SCANNED_VALUES:
+            return 0
+        return sum(block.used for block in self.blocks if block.scan is None and block.is_full)
 
-    def _estimated(self, query: CodedQuery, rows: Rows, executor: Executor | None) -> Array:
-        """Estimates by the full codes of some rows, ascending."""
-        return self._estimates_at(query.code, lambda codes: (codes.bits, codes.scales[:, 1]), rows, executor)
+    def joined(self, progress: Progress = _untold) -> Block | None:
+        """A block that can take the place of some that are not scanned; None while these have few rows.
 
-    def _estimates_at(
-        self,
-        query: PlaneQuery,
-        signs_and_scales: Callable[[Codes], tuple[NDArray[np.uint64], Array]],
-        rows: Rows,
-        executor: Executor | None,
-    ) -> Array:
-        """Estimates of some rows, ascending, by one kind of their codes."""
-        estimates = np.empty(len(rows), np.float32)
+        Args:
+            progress: is called with the rows done and all rows; what it raises ends the work.
+        """
+        if self.loose_rows < LOOSE_ROWS:
+            return None
+        start = next(number for number, block in enumerate(self.blocks) if block.scan is None)
+        if start and self.blocks[start - 1].used + self.blocks[start].used <= LARGEST_BLOCK:
+            start -= 1
+        first, stop = self.blocks[start].first, self.blocks[start].first
+        for block in self.blocks[start:]:
+            if not block.is_full or block.first + block.used - first > LARGEST_BLOCK:
+                break
+            stop = block.first + block.used
+        return self._scanned(first, stop, progress)
 
-        def judge(codes: Codes, start: int, stop: int, first: int) -> None:
-            at = rows[start:stop] - first
-            estimates_at(*signs_and_scales(codes), query.planes, query.step, query.total, at, estimates[start:stop])
+    def _scanned(self, first: int, stop: int, progress: Progress) -> Block:
+        """A new block of the rows first … stop, with a scan."""
+        index = self.coder.index(stop - first)
+        stored(index)[:] = self.codes(first, stop)
+        lists = faiss.IndexFlatIP(SCANNED_VALUES)
+        lists.add(np.zeros((1, SCANNED_VALUES), np.float32))  # the centre of the only list
+        scan = faiss.IndexIVFRaBitQFastScan(lists, SCANNED_VALUES, 1, faiss.METRIC_INNER_PRODUCT)
+        scan.train(np.zeros((1, SCANNED_VALUES), np.float32))
+        for begin in range(0, stop - first, _DECODED):
+            # Signs say all that the scan keeps, so that no descriptor has to be read again.
+            some = min(_DECODED, stop - first - begin)
+            with in_one_thread():
+                scan.add(np.ascontiguousarray(index.reconstruct_n(begin, some)[:, :SCANNED_VALUES]))
+            progress(begin + some, stop - first)
+        heads = faiss.RemapDimensionsTransform(self.coder.width, SCANNED_VALUES, False)
+        return Block(first, stop - first, index, faiss.IndexRefine(faiss.IndexPreTransform(heads, scan), index))
 
-        together(self._tasks_at(judge, rows), executor)
-        return estimates
-
-    def _tasks_at(self, judge: Callable[[Codes, int, int, int], None], rows: Rows) -> list[Callable[[], None]]:
-        """``judge`` for the rows of each block, in parts of at most a thousand."""
-        tasks: list[Callable[[], None]] = []
-        for first, used, codes in self.blocks:
-            start, stop = np.searchsorted(rows, [first, first + used]).tolist()
-            tasks += [_task(judge, codes, begin, min(stop, begin + 1024), first) for begin in range(start, stop, 1024)]
-        return tasks
+    def with_block(self, joined: Block) -> CodeTable:
+        """With a block of :meth:`joined` in the place of those whose rows it has; they have not changed since."""
+        end = joined.first + joined.used
+        before = [block for block in self.blocks if block.first < joined.first]
+        after = [block for block in self.blocks if block.first >= end]
+        return replace(self, blocks=(*before, joined, *after))
 
 
-def _task(
-    judge: Callable[[Codes, int, int, int], None], codes: Codes, start: int, stop: int, first: int
-) -> Callable[[], None]:
-    return lambda: judge(codes, start, stop, first)
-
-
-def _room(coder: Coder) -> Codes:
-    """A block of rows to be filled; memory is taken by the system as they are."""
-    sketch, code, scales = coder.shape
-    return Codes(
-        np.empty((ROWS_PER_BLOCK, sketch), np.uint64),
-        np.empty((ROWS_PER_BLOCK, code), np.uint64),
-        np.empty((ROWS_PER_BLOCK, scales), np.float32),
-    )
+def _merged(parts: list[tuple[Array, Positions]], query: int, count: int) -> Shortlist:
+    """The best of what the blocks found for a query."""
+    if not parts:
+        return Shortlist(np.empty(0, np.int64), np.empty(0, np.float32))
+    rows = np.concatenate([rows[query] for _, rows in parts])
+    estimates = np.concatenate([estimates[query] for estimates, _ in parts])
+    order = np.lexsort((rows, -estimates))
+    order = order[rows[order] >= 0][:count]
+    return Shortlist(rows[order], estimates[order])

@@ -4,7 +4,7 @@ LOCK                              locked as long as the atlas is open
 FORMAT                            the version of this layout
 maps/<id>/map.sqlite              the map's record, its places, sequences and pictures, and which descriptor rows count
 maps/<id>/descriptors-….seg       descriptors
-maps/<id>/….index                 codes and lists by which large maps are searched
+maps/<id>/….index                 codes by which all but small maps are searched
 maps/.unlisted-<id>/…             a map that is being built; it is listed when it is complete
 """
 

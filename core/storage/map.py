@@ -236,9 +236,9 @@ class Map:
         return unopened(self._record.index, self._places) if found is None else found
 
     def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
-        """Build the codes and lists of a large map again from its descriptors; searches use the present ones meanwhile.
+        """Build the codes of a map again from its descriptors; searches use the present ones meanwhile.
 
-        A map that is searched exactly has neither, so nothing is done.
+        A map that is searched exactly has none, so nothing is done.
 
         Args:
             progress: is told how many rows of how many are done; what it raises leaves everything as it was.

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
-from core.index import Codes, CodeTable
+from core.index import CodeTable
+from core.index.flat import flat_index, vectors
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
@@ -42,9 +43,9 @@ from core.storage.files.segment_files import Layout
 from core.storage.records import MapRecord, validation_message
 from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.segment import Held, Location, Segment, flat_index, vectors
+from core.storage.search.segment import Held, Location, Segment
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.tiers import tier_for
+from core.storage.search.tiers import Tier, holds_for, tier_for
 
 log = logging.getLogger(__name__)
 
@@ -159,28 +160,13 @@ def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: 
     return Held(index, local)
 
 
-def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable | None:
-    """The codes of the first groups of segments that have good files; None if there is no coder."""
-    try:
-        coder = files.read_coder()
-    except StaleArrays:
-        return None
-    parts = []
+def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable:
+    """The codes of the first groups of segments that have good files."""
+    parts = [files.coder.nothing(0)]
     with suppress(StaleArrays):
-        group = 0
-        while of_group := files.group_entries(entries, group):
-            parts.append(files.read_codes(coder, of_group))
-            group += 1
-    if not parts:
-        return CodeTable.empty(coder)
-    return CodeTable.of(
-        coder,
-        Codes(
-            np.concatenate([part.sketches for part in parts]),
-            np.concatenate([part.bits for part in parts]),
-            np.concatenate([part.scales for part in parts]),
-        ),
-    )
+        while of_group := files.group_entries(entries, len(parts) - 1):
+            parts.append(files.read_codes(of_group))
+    return CodeTable.empty(files.coder).appended(np.concatenate(parts))
 
 
 def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:
@@ -228,9 +214,11 @@ def read_snapshot(
         getattr(whereabouts, name)[columns.rows] = column
     alive, checksums = np.zeros(total, np.bool_), np.zeros(total, np.uint32)
     alive[columns.rows], checksums[columns.rows] = True, columns.checksums
+    # What a map was searched by before is not known, but by the number of its places it may be as it was.
     table = _load_codes(files, entries)
-    tier = tier_for(record.index, len(columns.rows), "exact" if table is None else "compact")
-    holds = tier == "exact"
+    present: Tier = "compact" if len(table) else "exact"
+    tier = tier_for(record.index, len(columns.rows), present)
+    holds = holds_for(record.index, len(columns.rows), True)
     segments = []
     for segment in entries:
         first = segment.number * layout.rows_per_segment
@@ -247,18 +235,13 @@ def read_snapshot(
         segments.append(Segment(held, first, there, alive[part], checksums[part]))
     if holds:
         _check_rows(folder, connection)
-    lists = None
-    if not holds and table is not None and tier_for(record.index, len(columns.rows), "inverted") == "inverted":
-        with suppress(StaleArrays):
-            lists, _ = files.read_lists(table.coder, len(table), entries)
     return Snapshot(
         layout.dimension,
         layout.rows_per_segment,
         tuple(segments),
         layout.local_shape,
         row_reader,
-        None if holds else table,
-        lists,
+        table if tier == "compact" else None,
         holds,
         layout.precision == HALF,
     )

@@ -15,7 +15,7 @@ from core.errors import InvalidField
 from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Timestamp
 from core.storage.files.row_formats import Precision
-from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM, TierSetting
+from core.storage.search.tiers import COMPACT_FROM, TierSetting
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
@@ -43,9 +43,8 @@ class MapSettings(BaseModel):
     )
     index: TierSetting = Field(
         default="auto",
-        description="How the map is searched: every place compared (exact), by codes (compact), by lists of codes "
-        f"(inverted), or by what suits its size (auto): compact from {COMPACT_FROM} places, inverted from "
-        f"{INVERTED_FROM}.",
+        description="How the map is searched: every place compared (exact), by codes (compact; inverted, a former "
+        f"tier, is another name of it), or by what suits its size (auto): compact from {COMPACT_FROM} places.",
     )
 
 

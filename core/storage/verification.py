@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.disk.files import Damage
+from core.index.flat import vectors
 from core.storage.database import row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
@@ -23,8 +24,7 @@ from core.storage.files.segment_files import Layout
 from core.storage.opening import read_layout
 from core.storage.records import VerifyReport
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.indexing import tier_of
-from core.storage.search.segment import Segment, vectors
+from core.storage.search.segment import Segment
 from core.storage.search.snapshot import Snapshot
 
 _MOST_LISTED = 10  # damaged rows of one kind that are listed one by one; further ones are counted
@@ -127,7 +127,7 @@ def inspect(
         with findings.noting():
             _check_descriptors(folder, layout, places, segments, snapshot, findings)
         if snapshot is not None:
-            checked, stale = IndexFiles(folder, layout).check(segments, tier_of(snapshot))
+            checked, stale = IndexFiles(folder, layout).check(segments) if snapshot.table is not None else (0, [])
             findings.checked_bytes += checked
             findings.stale_caches += stale
     return findings.report()

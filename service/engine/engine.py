@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
 from core.frames.images import Limits
 from core.frames.masks import Mask
-from core.index.exact import compile_ahead
 from core.judgement.verdict import Calibration
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
@@ -117,7 +116,6 @@ class Engine:
         try:
             identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
             await self.queue.load(identity)
-            await in_thread(compile_ahead)
         except PlacerecError as error:
             self.encoder_state = str(error)
             log.error("the default encoder cannot be used: %s", error)

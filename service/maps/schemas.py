@@ -11,7 +11,7 @@ from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
 from core.places import Timestamp
 from core.storage import IndexStatus, Keep, MapSettings, Precision, StorageStatus, TierSetting
-from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM
+from core.storage.search.tiers import COMPACT_FROM
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 
 MAP_EXAMPLE: dict[str, Any] = {
@@ -140,7 +140,7 @@ class MapChanges(BaseModel):
     same_place_frames: int | None = Field(strict=True, default=None, ge=0, le=2**31)
     index: TierSetting | None = Field(
         default=None,
-        description=f"auto, exact, compact (auto from {COMPACT_FROM} places on) or inverted (from {INVERTED_FROM}).",
+        description=f"auto, exact or compact (auto from {COMPACT_FROM} places on); inverted is compact.",
     )
     calibration: CalibrationChanges | None = None
 

@@ -101,11 +101,10 @@ def reencode_map(
 
 @router.post("/rebuild", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
 def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
-    """Rebuild the search index of a map, its codes and lists, from the checksummed descriptors.
+    """Rebuild the search index of a map, its codes, from the checksummed descriptors.
 
-    Searches use the old index until the new one replaces it. This is useful if the map has changed much since its
-    codes were learnt, or if its index files come from a backup. A map that is searched exactly has no index to
-    rebuild.
+    Searches use the old index until the new one replaces it. This is useful if the index is in doubt. A map that is
+    searched exactly has no index to rebuild.
     """
     return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
 

@@ -71,9 +71,9 @@ def closed(tmp_path_factory: pytest.TempPathFactory) -> Sound:
     for name in MAPS:
         make_map(atlas, name)
     coded = atlas.get("coded")
-    coded.edit({"index": "inverted"})
+    coded.edit({"index": "compact"})
     until = time.monotonic() + 60
-    while coded.index_status().state != "ready" or coded.index_status().tier != "inverted":
+    while coded.index_status().state != "ready" or coded.index_status().tier != "compact":
         assert time.monotonic() < until
         time.sleep(0.01)
     allowed = {name: [answers(atlas.get(name))] for name in MAPS}
@@ -232,7 +232,7 @@ def check_rebuilt(copy: Path) -> None:
         until = time.monotonic() + 60
         while (coded.index_status().state != "ready" or coded.verify().stale_caches) and time.monotonic() < until:
             time.sleep(0.01)
-        assert coded.index_status().tier == "inverted"
+        assert coded.index_status().tier == "compact"
         assert coded.verify().stale_caches == []
     finally:
         atlas.close()

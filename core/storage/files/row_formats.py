@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.exact import compare
+from core.index.flat import flat_index, products, vectors
 from core.kernels.packed import packed_products
 
 Descriptor = NDArray[np.float32]
@@ -145,4 +145,6 @@ def inner_products(queries: NDArray[np.float32], kept: NDArray[Any], precision: 
         scales, uppers, lowers = _parts_of(kept, dimension)
         made = [packed_products(query, scales, uppers, lowers) for query in _whole_blocks(queries)]
         return np.array(made, np.float32).reshape(len(queries), rows)
-    return compare(queries, kept, np.arange(rows))
+    index = flat_index(rows, dimension, precision == HALF)
+    vectors(index)[:] = kept
+    return products(index, queries)

@@ -1,9 +1,9 @@
-"""Building the codes and lists of a map in the background, until the map has the tier that it should have.
+"""Building the codes of a map in the background, until the map has the tier that it should have.
 
 Each map has one thread for this, while there is work.  It reads rows and makes codes of them without holding up writes
 or searches, and publishes the codes in a new snapshot, a few hundred rows at a time; rows without a code are compared
 exactly.  Codes are written to files (:mod:`core.storage.search.index_files`), so that after a kill the work continues
-after the last complete file.
+after the last complete file.  Then the blocks of codes are joined, so that a search need not read all of them.
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ import numpy as np
 
 from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
-from core.index import Coder, CodeTable, InvertedLists
+from core.index import CodeTable
+from core.index.flat import flat_index, vectors
+from core.index.table import LOOSE_ROWS
 from core.storage.database.ledger import SegmentEntry
 from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.rebuilding import codes_of, fitted_coder, rebuilt
+from core.storage.search.rebuilding import codes_of, extended, rebuilt
 from core.storage.search.recall import measure_recall
-from core.storage.search.segment import Held, flat_index, vectors
+from core.storage.search.segment import Held
 from core.storage.search.snapshot import Snapshot, threads
-from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, tier_for
+from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, holds_for, tier_for
 
 log = logging.getLogger(__name__)
 
 _ROWS_AT_ONCE = 256
 _NICENESS = 10
 _PATIENCE_SECONDS = 0.1
-_UNLISTED_SHARE = 0.02  # lists are extended when a larger share of the rows is in none
 _GROWN = 2  # when the places have grown by this factor, the recall is measured again
 
 
@@ -63,13 +64,11 @@ class IndexedMap:
 
 def tier_of(snapshot: Snapshot) -> Tier:
     """How a snapshot is searched."""
-    if snapshot.table is None:
-        return "exact"
-    return "compact" if snapshot.lists is None else "inverted"
+    return "exact" if snapshot.table is None else "compact"
 
 
 class Indexer:
-    """Builds the codes and lists of one map.  Any thread may use it."""
+    """Builds the codes of one map.  Any thread may use it."""
 
     def __init__(self, of: IndexedMap, files: IndexFiles) -> None:
         """For an open map."""
@@ -83,9 +82,8 @@ class Indexer:
         self._again = False
         self._stopping = threading.Event()
         self._progress = 0.0
-        self._recall: tuple[Tier, Recall] | None = None
+        self._recall: Recall | None = None
         self._written: set[tuple[SegmentEntry, ...]] = set()
-        self._centred = 0  # rows when the centres of the lists were computed
 
     def wake(self) -> None:
         """Start building in the background, if there is anything to build."""
@@ -128,7 +126,7 @@ class Indexer:
             state="building" if is_building else "ready",
             progress=min(1.0, progress) if is_building else 1.0,
             rows_indexed=snapshot.coded,
-            recall=recall[1] if recall is not None and recall[0] == present else None,
+            recall=None if present == "exact" else recall,
             bytes_in_memory=snapshot.memory,
             problem=self.problem,
         )
@@ -136,17 +134,24 @@ class Indexer:
     def _wanted(self, snapshot: Snapshot) -> Tier:
         return tier_for(self._map.setting(), len(snapshot), tier_of(snapshot))
 
+    def _holds(self, snapshot: Snapshot) -> bool:
+        """Whether a map should hold its descriptors in memory."""
+        return holds_for(self._map.setting(), len(snapshot), snapshot.holds)
+
+    def _is_held_as_wanted(self, snapshot: Snapshot) -> bool:
+        holds = self._holds(snapshot)
+        there = (segment.held is not None for segment in snapshot.segments if not segment.removed)
+        return snapshot.holds == holds and all(held == holds for held in there)
+
     def needs_work(self, snapshot: Snapshot) -> bool:
         """Whether anything has to be built for a snapshot; this is cheap."""
-        wanted = self._wanted(snapshot)
-        if wanted == "exact":
-            return snapshot.table is not None or not snapshot.holds
-        if snapshot.coded < snapshot.rows or snapshot.holds or tier_of(snapshot) != wanted:
+        if tier_of(snapshot) != self._wanted(snapshot) or not self._is_held_as_wanted(snapshot):
             return True
-        if snapshot.lists is not None and snapshot.rows - snapshot.lists.rows > _UNLISTED_SHARE * snapshot.rows:
+        if snapshot.table is None:
+            return False
+        if snapshot.coded < snapshot.rows or snapshot.table.loose_rows >= LOOSE_ROWS:
             return True
-        recall = self._recall
-        return recall is None or recall[0] != wanted or recall[1].places * _GROWN < len(snapshot)
+        return self._recall is None or self._recall.places * _GROWN < len(snapshot)
 
     def _work(self) -> None:
         threads()  # started before this thread lowers its priority, which they would inherit
@@ -160,10 +165,9 @@ class Indexer:
                 self._again, self._progress = False, 0.0
             try:
                 with self._building:
-                    wanted = self._wanted(self._map.snapshot())
                     self._build()
                 self.problem = None
-                if self._wanted(self._map.snapshot()) != wanted:  # a write changed it meanwhile
+                if self.needs_work(self._map.snapshot()):  # a write changed what is wanted meanwhile
                     with self._lock:
                         self._again = True
             except (Stopped, UnknownMap, MapQuarantined):
@@ -177,16 +181,16 @@ class Indexer:
 
     def _build(self) -> None:
         snapshot = self._map.snapshot()
+        if self._holds(snapshot) and not self._is_held_as_wanted(snapshot):
+            self._hold_all()
         if self._wanted(snapshot) == "exact":
-            if snapshot.table is not None or not snapshot.holds:
-                self._hold_all()
+            if snapshot.table is not None:
+                self._drop_codes()
             return
+        self._files.remove_former()
         self._code_all()
         self._keep_codes()
-        if self._wanted(self._map.snapshot()) == "inverted":
-            self._list_all()
-        elif self._map.snapshot().lists is not None:
-            self._publish(lambda newest: replace(newest, lists=None))
+        self._join()
         self._measure()
 
     def _publish(self, change: Callable[[Snapshot], Snapshot]) -> Snapshot:
@@ -200,7 +204,7 @@ class Indexer:
         self._progress = done / max(1, total)
 
     def rebuild(self, progress: Callable[[int, int], None]) -> None:
-        """Build codes and lists again from the descriptors; the present ones are searched until they are replaced.
+        """Build codes again from the descriptors; the present ones are searched until they are replaced.
 
         Args:
             progress: is called with the rows done and all rows; what it raises leaves everything as it was.
@@ -218,17 +222,19 @@ class Indexer:
         while not self._building.acquire(timeout=_PATIENCE_SECONDS):
             report(0, self._map.snapshot().rows)
         try:
-            if (wanted := self._wanted(self._map.snapshot())) == "exact":
+            if self._wanted(self._map.snapshot()) == "exact":
                 return
-            made = rebuilt(self._map.snapshot, wanted == "inverted", report)
-            self._publish(made.put_into)
-            self._files.write_coder(made.table.coder)
+            table = rebuilt(self._map.snapshot, report)
+
+            def put(newest: Snapshot) -> Snapshot:
+                if newest.table is None:
+                    return newest  # its owner has chosen exact search meanwhile
+                return replace(newest, table=extended(table, newest, newest.rows))
+
+            self._publish(put)
             self._written.clear()
             self._recall = None
             self._keep_codes()
-            if made.lists is not None:
-                self._centred = made.lists.rows
-                self._files.write_lists(made.table.coder, made.lists, self._centred, self._map.entries())
         finally:
             self._building.release()
             self.wake()
@@ -236,31 +242,22 @@ class Indexer:
     # Codes
 
     def _code_all(self) -> None:
-        """Make codes of all rows and free the descriptors in memory."""
+        """Make codes of all rows and, in a map that should not hold them, free the descriptors in memory."""
         newest = self._map.snapshot()
-        if newest.table is None:
-            coder = self._coder(newest)
-            newest = self._publish(lambda now: replace(now, table=CodeTable.empty(coder), holds=False))
-        elif newest.holds:
-            newest = self._publish(lambda now: replace(now, holds=False))
+        holds = self._holds(newest)
+        if newest.table is None or newest.holds != holds:
+            table = CodeTable.empty(self._files.coder)
+            newest = self._publish(
+                lambda now: replace(now, table=table if now.table is None else now.table, holds=holds)
+            )
         while newest.coded < newest.rows:
-            assert newest.table is not None
-            newest = self._code_group(newest.table.coder, newest.coded)
+            newest = self._code_group(newest.coded)
             self._report(newest.coded, newest.rows)
         for number, segment in enumerate(newest.segments):
-            if segment.held is not None:
+            if segment.held is not None and not holds:
                 self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
 
-    def _coder(self, snapshot: Snapshot) -> Coder:
-        try:
-            return self._files.read_coder()
-        except StaleArrays as stale:
-            log.info("The codes of a map are built: coder.index: %s.", stale)
-        coder = fitted_coder(snapshot)
-        self._files.write_coder(coder)
-        return coder
-
-    def _code_group(self, coder: Coder, start: int) -> Snapshot:
+    def _code_group(self, start: int) -> Snapshot:
         """Add the codes of the next rows: those of a whole group from its file if that is good, else computed ones."""
         entries = self._map.entries()
         newest = self._map.snapshot()
@@ -269,15 +266,15 @@ class Indexer:
         of_group = self._files.group_entries(entries, group)
         if start == group * self._files.group_size * per_segment:
             with suppress(StaleArrays):
-                codes = self._files.read_codes(coder, of_group)
+                codes = self._files.read_codes(of_group)
                 newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
                 self._written.add(tuple(of_group))
                 return newest
         stop = min(start + _ROWS_AT_ONCE, newest.rows, (start // per_segment + 1) * per_segment)
         number = start // per_segment
-        codes = codes_of(coder, newest, start, stop)
+        codes = codes_of(self._files.coder, newest, start, stop)
         newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
-        if stop == (number + 1) * per_segment and newest.segments[number].held is not None:
+        if stop == (number + 1) * per_segment and newest.segments[number].held is not None and not newest.holds:
             newest = self._publish(lambda now: now.holding(number, None))
         if stop == sum(segment.rows for segment in entries[: (group + 1) * self._files.group_size]):
             self._keep_group(of_group)
@@ -289,7 +286,7 @@ class Indexer:
         if tuple(of_group) in self._written or snapshot.table is None:
             return
         codes = snapshot.table.codes(first, first + sum(segment.rows for segment in of_group))
-        if self._files.write_codes(snapshot.table.coder, of_group, codes):
+        if self._files.write_codes(of_group, codes):
             self._written.add(tuple(of_group))
 
     def _keep_codes(self) -> None:
@@ -307,57 +304,41 @@ class Indexer:
         if of_group and snapshot.table is not None and snapshot.coded == snapshot.rows:
             first = of_group[0].number * snapshot.rows_per_segment
             if tuple(of_group) not in self._written:
-                self._files.write_codes(snapshot.table.coder, of_group, snapshot.table.codes(first, snapshot.rows))
+                self._files.write_codes(of_group, snapshot.table.codes(first, snapshot.rows))
 
-    # Lists
-
-    def _list_all(self) -> None:
-        """Make lists of nearly all rows; the codes of the few others are all read by a search."""
-        snapshot = self._map.snapshot()
-        assert snapshot.table is not None
-        lists = snapshot.lists
-        if lists is None or not self._centred:  # the file says how many rows there were when the centres were computed
-            with suppress(StaleArrays):
-                entries = self._map.entries()
-                lists, self._centred = self._files.read_lists(snapshot.table.coder, snapshot.coded, entries)
-        # Centres are computed again when the rows have doubled.
-        if lists is None or 2 * self._centred < snapshot.coded:
-            lists, self._centred = InvertedLists.built(snapshot.table, progress=self._report), snapshot.coded
-        elif snapshot.lists is not None and snapshot.coded - lists.rows <= _UNLISTED_SHARE * snapshot.rows:
-            return
-        else:
-            lists = lists.extended(snapshot.table)
-        self._publish(lambda now: replace(now, lists=lists))
-        self._files.write_lists(snapshot.table.coder, lists, self._centred, self._map.entries())
+    def _join(self) -> None:
+        """Join blocks of codes until few rows are left in blocks of which every code is read."""
+        while (table := self._map.snapshot().table) is not None and (block := table.joined(self._report)) is not None:
+            self._publish(lambda now, block=block: now.with_block(block))  # type: ignore[misc]
 
     # Recall
 
     def _measure(self) -> None:
         snapshot = self._map.snapshot()
-        present = tier_of(snapshot)
         if snapshot.table is None:
             return
-        if self._recall is None or self._recall[0] != present:
+        if self._recall is None:
             with suppress(StaleArrays):
-                self._recall = (present, self._files.read_recall(snapshot.table.coder, present))
-        known = self._recall[1].places if self._recall is not None and self._recall[0] == present else 0
-        if known * _GROWN >= len(snapshot):
+                self._recall = self._files.read_recall()
+        if self._recall is not None and self._recall.places * _GROWN >= len(snapshot):
             return
         found = measure_recall(snapshot, self._report)
         if found is not None:
-            self._recall = (present, found)
-            self._files.write_recall(snapshot.table.coder, present, found)
+            self._recall = found
+            self._files.write_recall(found)
 
     # Back to exact search
 
     def _hold_all(self) -> None:
-        """Read all descriptors into memory and drop the codes."""
+        """Read all descriptors into memory."""
         newest = self._publish(lambda now: replace(now, holds=True))
         for number, segment in enumerate(newest.segments):
             if segment.held is None and not segment.removed:
                 self._hold(number)
             self._report(number + 1, len(newest.segments))
-        self._publish(lambda now: replace(now, table=None, lists=None))
+
+    def _drop_codes(self) -> None:
+        self._publish(lambda now: replace(now, table=None))
         with self._lock:
             self._recall = None
             self._written.clear()

@@ -11,7 +11,7 @@ import faiss
 import numpy as np
 from numpy.typing import NDArray
 
-from core.index.exact import Rows, compare
+from core.index.flat import Vectors, flat_index, products, vectors
 from core.places import NO_TIME, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 
@@ -62,29 +62,6 @@ def memory_of(whereabouts: Whereabouts) -> int:
     return sum(column.nbytes for column in columns)
 
 
-def flat_index(capacity: int, dimension: int, halves: bool = False) -> faiss.IndexFlatCodes:
-    """An inner-product index with room for ``capacity`` rows of zeros, to be filled through :func:`vectors`.
-
-    Args:
-        halves: hold the rows in half precision; their values have to be exact in it.
-    """
-    index: faiss.IndexFlatCodes = faiss.IndexFlatIP(dimension)
-    if halves:
-        index = faiss.IndexScalarQuantizer(dimension, faiss.ScalarQuantizer.QT_fp16, faiss.METRIC_INNER_PRODUCT)
-        index.is_trained = True  # this kind of index needs no training
-    index.codes.resize(capacity * index.code_size)
-    index.ntotal = capacity
-    return index
-
-
-def vectors(index: faiss.IndexFlatCodes) -> Rows:
-    """The rows of an index without a copy: float32 or float16 [capacity, D], valid as long as the index lives."""
-    size = index.ntotal * index.code_size
-    flat = faiss.rev_swig_ptr(index.codes.data(), size) if size else np.empty(0, np.uint8)
-    rows: Rows = flat.view(np.float16) if index.code_size == 2 * index.d else flat.view(np.float32)
-    return rows.reshape(index.ntotal, index.d)
-
-
 @dataclass(frozen=True, eq=False)
 class Held:
     """The descriptors of a segment in memory.
@@ -97,7 +74,7 @@ class Held:
     local: Local
 
     @cached_property
-    def rows(self) -> Rows:
+    def rows(self) -> Vectors:
         """The descriptors in the index, without a copy."""
         return vectors(self.index)
 
@@ -107,7 +84,7 @@ class Held:
         return cls(flat_index(0, dimension, halves), np.empty((0, *local_shape), np.int8))
 
     def appended(
-        self, n: int, descriptors: Sequence[Descriptor] | Rows, local: Sequence[Local] | Local, largest: int
+        self, n: int, descriptors: Sequence[Descriptor] | Vectors, local: Sequence[Local] | Local, largest: int
     ) -> Held:
         """With more rows after the first ``n``; the memory is shared if it has room for them."""
         index, cells, end = self.index, self.local, n + len(descriptors)
@@ -172,7 +149,7 @@ class Segment:
 
     def appended(
         self,
-        descriptors: Sequence[Descriptor] | Rows,
+        descriptors: Sequence[Descriptor] | Vectors,
         locations: Sequence[Location],
         local: Sequence[Local] | Local,
         checksums: Sequence[int],
@@ -215,6 +192,8 @@ class Segment:
         return replace(self, held=None, reading=Reading(), removed=True)
 
     def search(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """The inner products of ``queries`` [B, D] with some rows of the map [k] that are held: float32 [B, k]."""
-        assert self.held is not None
-        return compare(queries, self.held.rows, rows - self.first_row)
+        """The inner products of ``queries`` [B, D] with some rows of the map [k] that are held: float32 [B, k].
+
+        The rows are ascending.
+        """
+        return products(self.index, queries, rows - self.first_row)

@@ -4,10 +4,9 @@ A map's rows lie in segments of a fixed size, of which the last one still grows.
 shares descriptors and codes with the one before: rows are added after those that older snapshots see, and only the few
 bytes per row that say where a place is and whether it is alive are copied, for the segments that the write touches.
 
-A small map holds its descriptors in memory and compares every place (the tier ``exact``).  A larger map holds codes of
-its descriptors (``compact``); in the largest maps these are also sorted into lists by nearest centre (``inverted``).
-The codes choose the few places whose descriptors are read from disk and compared exactly.  Rows without a code yet are
-compared exactly, so that the whole map is always searched.
+In a map of a few places every place is compared (the tier ``exact``).  A larger map has codes of its descriptors
+(``compact``), which choose the few places that are compared exactly; their descriptors are in memory, or in the largest
+maps on disk alone.  Rows without a code yet are compared exactly, so that the whole map is always searched.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import pairwise
 from threading import Barrier
 from typing import TypeVar
 
@@ -25,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownPlace
-from core.index import Codes, CodeTable, InvertedLists
-from core.index.exact import Rows, ranked
+from core.index import Codes, CodeTable
+from core.index.flat import Vectors, ranked, vectors
+from core.index.table import Block
 from core.method.agreement import ScatteredCells
 from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
-from core.storage.search.segment import Held, Location, Segment, joined, vectors, whereabouts_of
+from core.storage.search.segment import Held, Location, Segment, joined, whereabouts_of
 from core.threads import cores, in_turns, keep_to
 
 __all__ = ["SHORTLIST", "Location", "Ranking", "Segment", "Snapshot"]
@@ -43,9 +42,8 @@ Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
 SHORTLIST = 100
 """Places of a map with codes whose descriptors are compared exactly; rankings of such a map hold only these."""
 
-_PART_BYTES = 32 << 20  # of descriptors that a thread compares at a time, in about a millisecond
-_SHARE = 2  # half of the cores use nearly all of the memory's bandwidth; the others can encode frames
 _PART_ROWS = 25  # that a thread reads from disk at a time
+_SHARED_FROM = 512  # rows in memory that one thread compares alone, in a millisecond or two
 
 Part = TypeVar("Part")
 
@@ -62,19 +60,10 @@ def threads() -> tuple[ThreadPoolExecutor, int]:
     return pool, count
 
 
-def together(run: Callable[[Part], None], parts: Sequence[Part], share: int = 1) -> None:
-    """Run every part once, on the calling thread and others, together one thread per ``share`` cores."""
-    helpers = min(len(parts), cores() // share) - 1
+def together(run: Callable[[Part], None], parts: Sequence[Part]) -> None:
+    """Run every part once, on the calling thread and others, together at most one thread per core."""
+    helpers = min(len(parts), cores()) - 1
     in_turns(run, parts, threads()[0] if helpers > 0 else None, helpers)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Rows of a segment, and their positions among all rows that are compared."""
-
-    segment: Segment
-    rows: NDArray[np.int64]
-    at: slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +73,7 @@ class Snapshot:
     dimension, rows_per_segment, local_shape: of the map; ``local_shape`` is (C, L).
     row_reader: reads the descriptors of segments that hold none in memory.
     table: codes of the first ``len(table)`` rows; None in a map that is searched exactly.
-    lists: the same rows by nearest centre; None except in the largest maps.
-    holds: whether new rows are held in memory.
+    holds: whether descriptors are held in memory, those of new rows too.
     halves: descriptors in memory are in half precision, in which they are also stored.
     guard: is entered around everything that reads from disk, to name its errors.
     """
@@ -96,7 +84,6 @@ class Snapshot:
     local_shape: tuple[int, int] = NO_LOCAL
     row_reader: RowReader | None = None
     table: CodeTable | None = None
-    lists: InvertedLists | None = None
     holds: bool = True
     halves: bool = False
     guard: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -152,29 +139,8 @@ class Snapshot:
     @property
     def memory(self) -> int:
         """Bytes of memory that the segments and the codes take."""
-        codes = 0 if self.table is None else self.table.coder.bytes_per_place * len(self.table)
-        lists = 0 if self.lists is None else sum(array.nbytes for array in self.lists.tensors().values())
-        return sum(segment.memory for segment in self.segments) + codes + lists
-
-    @cached_property
-    def _in_memory(self) -> NDArray[np.int64]:
-        """The living rows that are held in memory, ascending."""
-        return np.flatnonzero(self.alive & self._held)
-
-    @cached_property
-    def _parts(self) -> list[_Part]:
-        """The rows in memory, in parts."""
-        return self._parts_of(self._in_memory)
-
-    def _parts_of(self, rows: NDArray[np.int64]) -> list[_Part]:
-        """Rows in memory, in parts of about equal size within each segment."""
-        parts, most = [], max(1, _PART_BYTES // (self.dimension * (2 if self.halves else 4)))
-        bounds = np.searchsorted(rows, np.arange(len(self.segments) + 1) * self.rows_per_segment).tolist()
-        for segment, (first, end) in zip(self.segments, pairwise(bounds), strict=True):
-            count = -(-(end - first) // most)
-            ends = [first + (end - first) * i // count for i in range(count + 1)] if count else []
-            parts += [_Part(segment, rows[start:stop], slice(start, stop)) for start, stop in pairwise(ends)]
-        return parts
+        codes = 0 if self.table is None else self.table.memory
+        return sum(segment.memory for segment in self.segments) + codes
 
     def search(self, descriptor: Descriptor, allowed: NDArray[np.bool_] | None = None) -> Ranking:
         """Rank the places of the map by inner product, best first; equal ones by row.
@@ -199,73 +165,70 @@ class Snapshot:
             raise ValueError(f"a query is {self.dimension} finite values")
         if allowed is not None and allowed.shape != (self.rows,):
             raise ValueError(f"allowed must have {self.rows} values, one for each row")
-        rows, products = self._compare_held(queries, allowed)
-        if self.row_reader is None or self._held.all():
-            return [ranked(rows, found) for found in products]
-        with self.guard():
-            return self._with_rows_on_disk(queries, allowed, rows, products)
-
-    def _compare_held(
-        self, queries: NDArray[np.float32], allowed: NDArray[np.bool_] | None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """The allowed living rows in memory, ascending, and their inner products, float32 [B, n]."""
-        rows, parts = self._in_memory, self._parts
-        if allowed is not None:
-            parts = self._parts_of(rows := rows[allowed[rows]])
-        products = np.empty((len(queries), len(rows)), dtype=np.float32)
-
-        def compare(part: _Part) -> None:
-            products[:, part.at] = part.segment.search(queries, part.rows)
-
-        together(compare, parts, _SHARE)
-        return rows, products
-
-    def _with_rows_on_disk(
-        self,
-        queries: NDArray[np.float32],
-        allowed: NDArray[np.bool_] | None,
-        held: NDArray[np.int64],
-        products: NDArray[np.float32],
-    ) -> list[Ranking]:
-        """The rankings of the rows in memory together with those on disk."""
-        chosen = self.alive & ~self._held
-        if allowed is not None:
-            chosen &= allowed
+        if not len(queries):
+            return []
+        chosen = self.alive if allowed is None else self.alive & allowed
         by_code = chosen[: self.coded]
-        if int(np.count_nonzero(by_code)) <= SHORTLIST:
-            by_code = np.zeros(self.coded, np.bool_)  # they are so few that all are compared exactly
-        tail = np.flatnonzero(np.concatenate([chosen[: self.coded] & ~by_code, chosen[self.coded :]]))
-        exact, exact_products = np.concatenate([held, tail]), np.hstack([products, self._compared(queries, tail)])
+        if self.table is None or int(np.count_nonzero(by_code)) <= SHORTLIST:
+            rows = np.flatnonzero(chosen)  # they are so few that all are compared exactly
+            return [ranked(rows, found) for found in self._compared(queries, rows)]
+        others = self.coded + np.flatnonzero(chosen[self.coded :])
+        exact = self._compared(queries, others)
+        shortlists = self.table.shortlists(queries, SHORTLIST, None if by_code.all() else by_code, threads()[0])
         rankings = []
-        for query, found in zip(queries, exact_products, strict=True):
-            rows, found = _best(exact, found, SHORTLIST if by_code.any() else len(exact))
-            if by_code.any():
-                short = self._shortlist(query, by_code)
-                rows = np.concatenate([rows, short])
-                found = np.concatenate([found, self._compared(query[np.newaxis], short)[0]])
-            rankings.append(ranked(rows, found))
+        for query, found, (short, _) in zip(queries[:, np.newaxis], exact, shortlists, strict=True):
+            short, (later, products) = np.sort(short), _best(others, found, SHORTLIST)
+            products = np.concatenate([self._compared(query, short)[0], products])
+            rankings.append(ranked(np.concatenate([short, later]), products))
         return rankings
 
-    def _shortlist(self, query: NDArray[np.float32], allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """The rows that the codes choose among ``allowed``, bool [coded]; ascending."""
-        assert self.table is not None
-        every = None if allowed.all() else allowed
-        coded = self.table.coder.query(query)
-        found = self.table.shortlist(coded, SHORTLIST, every, self.lists, threads()[0])
-        return np.sort(found.rows)
-
     def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Inner products of queries with rows on disk, float32 [B, k]."""
-        assert self.row_reader is not None
-        row_reader, products = self.row_reader, np.empty((len(queries), len(rows)), np.float32)
-
-        def compare(part: slice) -> None:
-            products[:, part] = row_reader.inner_products(queries, rows[part], self._checksums(rows[part]))
-
-        parts = [slice(start, start + _PART_ROWS) for start in range(0, len(rows), _PART_ROWS)]
-        if parts:
-            together(compare, parts)
+        """Inner products of queries with ascending rows, wherever they are: float32 [B, k]."""
+        products = np.empty((len(queries), len(rows)), np.float32)
+        held = self._held[rows]
+        self._compare_held(queries, rows, np.flatnonzero(held), products)
+        if not held.all():
+            self._compare_on_disk(queries, rows, np.flatnonzero(~held), products)
         return products
+
+    def _compare_held(
+        self,
+        queries: NDArray[np.float32],
+        rows: NDArray[np.int64],
+        at: NDArray[np.int64],
+        products: NDArray[np.float32],
+    ) -> None:
+        """Products with the rows at some positions, which are in memory, a segment at a time."""
+        ends = np.flatnonzero(np.diff(rows[at] // self.rows_per_segment)) + 1
+        parts = [part for part in np.split(at, ends) if len(part)]
+
+        def compare(part: NDArray[np.int64]) -> None:
+            segment = self.segments[int(rows[part[0]]) // self.rows_per_segment]
+            products[:, part] = segment.search(queries, rows[part])
+
+        if len(at) < _SHARED_FROM:
+            for part in parts:
+                compare(part)
+        else:
+            together(compare, parts)
+
+    def _compare_on_disk(
+        self,
+        queries: NDArray[np.float32],
+        rows: NDArray[np.int64],
+        at: NDArray[np.int64],
+        products: NDArray[np.float32],
+    ) -> None:
+        """Products with the rows at some positions, which are read from disk."""
+        assert self.row_reader is not None
+        row_reader = self.row_reader
+
+        def compare(part: NDArray[np.int64]) -> None:
+            some = rows[part]
+            products[:, part] = row_reader.inner_products(queries, some, self._checksums(some))
+
+        with self.guard():
+            together(compare, [at[start : start + _PART_ROWS] for start in range(0, len(at), _PART_ROWS)])
 
     def _checksums(self, rows: NDArray[np.int64]) -> NDArray[np.uint32]:
         """The checksums of rows that SQLite has."""
@@ -331,7 +294,7 @@ class Snapshot:
 
     def appended(
         self,
-        descriptors: Sequence[Descriptor] | Rows,
+        descriptors: Sequence[Descriptor] | Vectors,
         locations: Sequence[Location],
         local: Sequence[Local] | Local = (),
         checksums: Sequence[int] | None = None,
@@ -387,6 +350,11 @@ class Snapshot:
         """The snapshot with the codes of further rows.  Call it only on the newest one, from one thread at a time."""
         assert self.table is not None
         return replace(self, table=self.table.appended(codes))
+
+    def with_block(self, block: Block) -> Snapshot:
+        """The snapshot with a block that :meth:`CodeTable.joined` made of some of its codes."""
+        assert self.table is not None
+        return replace(self, table=self.table.with_block(block))
 
     def holding(self, number: int, held: Held | None) -> Snapshot:
         """The snapshot with a segment's descriptors in memory, or only on disk (None); a removed segment stays."""

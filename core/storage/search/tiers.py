@@ -11,16 +11,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.storage.files.row_formats import Precision
 
-Tier = Literal["exact", "compact", "inverted"]
+Tier = Literal["exact", "compact"]
 TierSetting = Literal["auto", "exact", "compact", "inverted"]
+"""``inverted``, which settings of earlier versions may have, is another name of ``compact``."""
 
-COMPACT_FROM = 4096
-"""From so many places on codes are used; with fewer the default encoder's descriptors take at most 270 MB of memory."""
+COMPACT_FROM = 256
+"""From so many places on codes are used; with fewer all are compared in less than a millisecond."""
 
-INVERTED_FROM = 250_000
-"""From so many places on lists are used, because reading every code takes too long."""
-
-_ORDER: tuple[Tier, ...] = ("exact", "compact", "inverted")
+ON_DISK_FROM = 4096
+"""From so many places on descriptors are not held in memory, where the default encoder's take 65 KB a place."""
 
 
 def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
@@ -32,13 +31,24 @@ def tier_for(setting: TierSetting, places: int, present: Tier) -> Tier:
     Args:
         present: the tier that the map has.
     """
-    if setting != "auto":
-        return setting if places else "exact"
-    for tier, least in (("inverted", INVERTED_FROM), ("compact", COMPACT_FROM)):
-        chosen: Tier = "inverted" if tier == "inverted" else "compact"
-        if places >= (least // 2 if _ORDER.index(present) >= _ORDER.index(chosen) else least):
-            return chosen
-    return "exact"
+    if setting == "exact" or not places:
+        return "exact"
+    return "compact" if setting != "auto" or places >= _limit(COMPACT_FROM, present == "compact") else "exact"
+
+
+def holds_for(setting: TierSetting, places: int, present: bool) -> bool:
+    """Whether a map of so many places should hold its descriptors in memory.
+
+    Args:
+        present: whether it does.
+    """
+    if setting == "exact" or not places:
+        return True
+    return setting == "auto" and places < _limit(ON_DISK_FROM, not present)
+
+
+def _limit(places: int, is_over: bool) -> int:
+    return places // 2 if is_over else places
 
 
 class Recall(BaseModel):
@@ -61,7 +71,7 @@ class IndexStatus(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     setting: TierSetting = Field(description="What its owner chose.")
-    tier: Tier = Field(description="exact: every place compared; compact: codes first; inverted: lists of codes first.")
+    tier: Tier = Field(description="exact: every place compared; compact: codes first.")
     wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
     state: Literal["ready", "building", "unopened"] = Field(
         description="Searches are answered in all; unopened: not used since the start, read from disk at its next use."
@@ -98,7 +108,7 @@ class StorageStatus(BaseModel):
     precision: str = Field(description="How descriptors are kept.")
     bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
     descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
-    index: int = Field(ge=0, description="Bytes of codes and lists, which can be made again.")
+    index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
     database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata and pictures.")
 
 

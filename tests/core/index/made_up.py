@@ -29,7 +29,7 @@ def second_looks(of: Array, seed: int = 1) -> Array:
     return (of + 0.08 * noise).astype(np.float32)
 
 
-def table_of(rows: Array, coder: Coder | None = None) -> CodeTable:
+def table_of(rows: Array) -> CodeTable:
     """Their codes."""
-    chosen = Coder.fitted(rows[:500]) if coder is None else coder
-    return CodeTable.empty(chosen).appended(chosen.encode(rows))
+    coder = Coder.of(rows.shape[1])
+    return CodeTable.empty(coder).appended(coder.encode(rows))

@@ -1,158 +1,172 @@
-"""The shortlist: what going through all codes would give, among allowed rows only, however the rows were added."""
-
 from __future__ import annotations
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from core.index import CodedQuery, Coder, CodeTable, table
-from core.index.best_estimates import best_first, best_positions, together
-from core.kernels.codes import estimates_of
+from core.index import Coder, CodeTable, table
 from tests.core.index.made_up import Array, descriptors, second_looks, table_of
 
-COUNT = 5000
-ROWS = descriptors(COUNT)
-TABLE = table_of(ROWS)
-QUERIES = [TABLE.coder.query(look) for look in second_looks(ROWS[:40])]
+ROWS = descriptors(1000)
+CODER = Coder.of(1024)
 
 
-@pytest.fixture
-def few_survivors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Full codes are read of some hundred rows, so that sketches decide."""
-    monkeypatch.setattr(table, "FEWEST_SURVIVORS", 300)
-    monkeypatch.setattr(table, "SURVIVORS", 1)
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks of few rows, and scans of them, so that a few rows make all kinds of blocks."""
+    monkeypatch.setattr(table, "ROWS_PER_BLOCK", 64)
+    monkeypatch.setattr(table, "LARGEST_BLOCK", 512)
+    monkeypatch.setattr(table, "LOOSE_ROWS", 128)
+    monkeypatch.setattr(table, "SCANNED_VALUES", 512)
+    monkeypatch.setattr(table, "SHARED_FROM", 256)
 
 
-def all_estimates(of: CodeTable, query: CodedQuery) -> Array:
-    """By the full codes of all rows."""
-    codes, made = of.codes(0, len(of)), np.empty(len(of), np.float32)
-    code = query.code
-    estimates_of(codes.bits, codes.scales[:, 1], code.planes, code.step, code.total, made)
+def grown(rows: Array, step: int) -> CodeTable:
+    """A table to which so many rows were added at a time."""
+    made = CodeTable.empty(CODER)
+    for start in range(0, len(rows), step):
+        made = made.appended(CODER.encode(rows[start : start + step]))
     return made
 
 
-def by_brute_force(of: CodeTable, query: CodedQuery, count: int, allowed: NDArray[np.bool_]) -> list[int]:
-    estimates = np.where(allowed, all_estimates(of, query), -np.inf)
-    order = np.argsort(-estimates, kind="stable")
-    return order[: min(count, int(allowed.sum()))].tolist()
+def joined(of: CodeTable) -> CodeTable:
+    """With all blocks joined that should be."""
+    while (block := of.joined()) is not None:
+        of = of.with_block(block)
+    return of
 
 
-def test_a_small_table_is_ranked_by_all_full_codes() -> None:
-    small = table_of(ROWS[:1500], TABLE.coder)
-    for query in QUERIES[:10]:
-        found = small.shortlist(query, 25)
-        assert found.rows.tolist() == by_brute_force(small, query, 25, np.ones(1500, np.bool_))
-        assert np.array_equal(found.estimates, all_estimates(small, query)[found.rows])
+def best(of: CodeTable, queries: Array, count: int = 10, allowed: NDArray[np.bool_] | None = None) -> list[list[int]]:
+    return [found.rows.tolist() for found in of.shortlists(queries, count, allowed)]
+
+
+@pytest.mark.parametrize("step", [1, 7, 64, 1000])
+def test_rows_are_the_same_however_they_came(step: int) -> None:
+    made, queries = grown(ROWS[:300], step), second_looks(ROWS[:40])
+    assert len(made) == 300
+    np.testing.assert_array_equal(made.codes(0, 300), CODER.encode(ROWS[:300]))
+    np.testing.assert_array_equal(made.codes(60, 70), CODER.encode(ROWS[60:70]))
+    assert best(made, queries) == best(table_of(ROWS[:300]), queries)
+
+
+def test_an_older_table_stays_what_it_was() -> None:
+    first = grown(ROWS[:70], 70)
+    second = first.appended(CODER.encode(ROWS[70:80]))
+    assert max(best(first, ROWS[70:71], 70)[0]) == 69
+    assert best(second, ROWS[70:71], 70)[0][0] == 70
+
+
+def test_a_write_that_was_given_up_is_overwritten() -> None:
+    first = grown(ROWS[:70], 70)
+    first.appended(CODER.encode(ROWS[500:510]))
+    second = first.appended(CODER.encode(ROWS[70:80]))
+    np.testing.assert_array_equal(second.codes(70, 80), CODER.encode(ROWS[70:80]))
+
+
+def test_an_empty_table() -> None:
+    assert best(CodeTable.empty(CODER), ROWS[:2]) == [[], []]
+    assert table_of(ROWS[:10]).shortlists(ROWS[:0], 5) == []
+
+
+def test_blocks_are_joined_and_find_what_they_found() -> None:
+    loose = grown(ROWS, 50)
+    assert loose.loose_rows == 960
+    made = joined(loose)
+    assert [(block.first, block.used, block.scan is not None) for block in made.blocks] == [
+        (0, 512, True),
+        (512, 448, True),
+        (960, 40, False),
+    ]
+    assert made.loose_rows == 0
+    np.testing.assert_array_equal(made.codes(0, 1000), loose.codes(0, 1000))
+    queries = second_looks(ROWS)
+    firsts = [rows[0] for rows in best(loose, queries)]
+    assert np.mean([found == rows[0] for found, rows in zip(firsts, best(made, queries), strict=True)]) > 0.97
+    assert np.mean(np.array(firsts) == np.arange(1000)) > 0.9
+
+
+def test_a_block_is_extended_until_it_is_the_largest() -> None:
+    made, sizes = CodeTable.empty(CODER), []
+    for start in range(0, 960, 64):
+        made = joined(made.appended(CODER.encode(ROWS[start : start + 64])))
+        sizes.append([block.used for block in made.blocks if block.scan is not None])
+    assert sizes[1] == [128] and [512, 384] in sizes
+    assert [block.first for block in made.blocks] == np.cumsum([0, *(block.used for block in made.blocks)])[
+        :-1
+    ].tolist()
+
+
+def test_rows_that_come_while_blocks_are_joined_stay() -> None:
+    before = grown(ROWS[:300], 50)
+    block = before.joined()
+    assert block is not None
+    after = before.appended(CODER.encode(ROWS[300:400])).with_block(block)
+    np.testing.assert_array_equal(after.codes(0, 400), CODER.encode(ROWS[:400]))
+    assert best(after, second_looks(ROWS[350:351]))[0][0] == 350
+
+
+def test_joining_is_told_and_may_be_stopped() -> None:
+    told = []
+
+    def stop(done: int, total: int) -> None:
+        told.append((done, total))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        grown(ROWS, 100).joined(stop)
+    assert told == [(256, 500)]
+
+
+def test_codes_of_few_values_are_all_compared() -> None:
+    made = table_of(descriptors(600, 256))
+    assert made.loose_rows == 0 and made.joined() is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.6, 1.0])
+@pytest.mark.parametrize("scanned", [False, True])
+def test_only_allowed_rows_are_found(share: float, scanned: bool) -> None:
+    made = joined(grown(ROWS, 50)) if scanned else grown(ROWS, 50)
+    allowed = np.random.default_rng(0).random(1000) < share
+    for found in made.shortlists(second_looks(ROWS[:9]), 20, allowed):
+        assert allowed[found.rows].all()
+        assert len(found.rows) == len(set(found.rows.tolist())) == min(20, np.count_nonzero(allowed))
         assert (np.diff(found.estimates) <= 0).all()
 
 
-@pytest.mark.usefixtures("few_survivors")
-def test_sketches_pass_on_what_full_codes_rank_first() -> None:
-    everything = np.ones(COUNT, np.bool_)
-    for row, query in enumerate(QUERIES):
-        found = TABLE.shortlist(query, 50)
-        assert found.rows[0] == row  # its second look
-        assert set(found.rows[:3]) & set(by_brute_force(TABLE, query, 3, everything))
-        assert np.array_equal(found.estimates, all_estimates(TABLE, query)[found.rows])
+@pytest.mark.parametrize("queries", [1, 2, 5])
+def test_threads_and_company_change_nothing(queries: int) -> None:
+    made, asked = joined(grown(ROWS, 50)), second_looks(ROWS[:5])
+    alone = [made.shortlists(asked[i : i + 1], 20)[0].rows.tolist() for i in range(queries)]
+    with ThreadPoolExecutor(3) as executor:
+        together = made.shortlists(asked[:queries], 20, executor=executor)
+    assert [found.rows.tolist() for found in together] == alone
 
 
-@pytest.mark.usefixtures("few_survivors")
-@settings(max_examples=30, deadline=None)
-@given(st.floats(0, 1), st.integers(0, 2**20), st.sampled_from([1, 10, 400]))
-def test_only_allowed_rows_are_returned_and_as_many_as_there_are(share: float, seed: int, count: int) -> None:
-    allowed = np.random.default_rng(seed).random(COUNT) < share
-    found = TABLE.shortlist(QUERIES[seed % 40], count, allowed)
-    assert allowed[found.rows].all()
-    assert len(set(found.rows.tolist())) == len(found.rows) == min(count, int(allowed.sum()))
+def test_what_is_allowed_is_said_of_all_rows() -> None:
+    with pytest.raises(ValueError, match="of all 1000"):
+        table_of(ROWS).shortlists(ROWS[:1], 5, np.ones(999, np.bool_))
 
 
-@pytest.mark.usefixtures("few_survivors")
-def test_few_allowed_rows_are_all_ranked_by_their_full_codes() -> None:
-    allowed = np.random.default_rng(0).random(COUNT) < 0.05
-    for query in QUERIES[:10]:
-        assert TABLE.shortlist(query, 20, allowed).rows.tolist() == by_brute_force(TABLE, query, 20, allowed)
+def test_searches_while_rows_are_added_and_joined() -> None:
+    newest, done, faults = [grown(ROWS[:64], 64)], threading.Event(), []
 
+    def search() -> None:
+        while not done.is_set():
+            made = newest[0]
+            last = len(made) - 1
+            found = made.shortlists(ROWS[[0, last]], 5)
+            if [found[0].rows[0], found[1].rows[0]] != [0, last]:
+                faults.append(last)
 
-@pytest.mark.usefixtures("few_survivors")
-def test_a_filter_that_takes_most_rows_away_reads_sketches_of_the_others_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*arguments: object) -> None:
-        raise AssertionError("all rows were read")
-
-    monkeypatch.setattr(CodeTable, "sketched", refuse)
-    allowed = np.arange(COUNT) % 10 == 0
-    assert TABLE.shortlist(QUERIES[20], 5, allowed).rows[0] == 20
-
-
-def test_rows_added_one_by_one_are_those_added_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "ROWS_PER_BLOCK", 64)
-    codes = TABLE.codes(0, 200)
-    grown = CodeTable.empty(TABLE.coder)
-    states = []
-    for start, stop in [(0, 1), (1, 63), (63, 65), (65, 65), (65, 200)]:
-        grown = grown.appended(TABLE.codes(start, stop))
-        states.append((grown, stop))
-    for state, length in states:  # older values of the table still see their own rows
-        assert len(state) == length
-        assert np.array_equal(state.codes(0, length).bits, codes.bits[:length])
-        assert np.array_equal(state.codes(length // 2, length).scales, codes.scales[length // 2 : length])
-        assert state.shortlist(QUERIES[0], 500).rows.max() == length - 1
-    assert [block.used for block in grown.blocks] == [64, 64, 64, 8]
-    assert np.array_equal(grown.sketches_at(np.array([199, 3, 64])).sketches, codes.sketches[[199, 3, 64]])
-
-
-def test_codes_are_taken_as_they_are_and_more_may_follow() -> None:
-    codes = TABLE.codes(0, 3000)
-    taken = CodeTable.of(TABLE.coder, codes)
-    assert np.shares_memory(taken.codes(0, 3000).bits, codes.bits)
-    grown = taken.appended(TABLE.codes(3000, COUNT))
-    for query in QUERIES[:5]:
-        assert grown.shortlist(query, 30).rows.tolist() == TABLE.shortlist(query, 30).rows.tolist()
-
-
-def test_threads_change_nothing(few_survivors: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "_ROWS_PER_TASK", 700)
-    allowed = np.arange(COUNT) % 3 > 0
-    with ThreadPoolExecutor(2) as executor:
-        for query in QUERIES[:10]:
-            for mask in (None, allowed):
-                alone, shared = (TABLE.shortlist(query, 40, mask, executor=one) for one in (None, executor))
-                assert np.array_equal(alone.rows, shared.rows)
-                assert np.array_equal(alone.estimates, shared.estimates)
-
-
-def test_nothing_is_found_where_nothing_is() -> None:
-    empty = CodeTable.empty(TABLE.coder)
-    assert len(empty) == len(empty.shortlist(QUERIES[0], 10).rows) == len(empty.codes(0, 10)) == 0
-    assert len(TABLE.shortlist(QUERIES[0], 10, np.zeros(COUNT, np.bool_)).rows) == 0
-    assert len(TABLE.shortlist(QUERIES[0], 0).rows) == 0
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(ValueError, match="allowed is said of all 5000"):
-        TABLE.shortlist(QUERIES[0], 10, np.ones(10, np.bool_))
-    with pytest.raises(ValueError, match="another shape"):
-        CodeTable.of(Coder.fitted(descriptors(5, 512)), TABLE.codes(0, 10))
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.integers(1, 20_000), st.integers(0, 5000), st.integers(1, 50), st.integers(0, 2**20))
-def test_the_best_are_never_missed(size: int, count: int, levels: int, seed: int) -> None:
-    """With many equal values too, where no limit parts the best from the rest."""
-    values = np.random.default_rng(seed).integers(0, levels, size).astype(np.float32)
-    best = np.argsort(-values, kind="stable")[:count]
-    assert best_first(values, count).tolist() == best.tolist()
-    assert best_positions(values, count).tolist() == np.sort(best).tolist()
-
-
-def test_what_a_task_raises_is_raised() -> None:
-    def fail() -> None:
-        raise KeyError("this one")
-
-    done: list[int] = []
-    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyError):
-        together([fail, lambda: done.append(1), fail], executor)
+    threads = [threading.Thread(target=search) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for start in range(64, 1000, 8):
+        newest[0] = joined(newest[0].appended(CODER.encode(ROWS[start : start + 8])))
+    done.set()
+    for thread in threads:
+        thread.join()
+    assert faults == []

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from core.errors import MapQuarantined
+from core.index.flat import vectors
 from core.storage import Atlas, Map, MapSettings
 from core.storage.files.segment_files import HEADER_BYTES
-from core.storage.search.segment import vectors
 from tests.core.storage.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
 

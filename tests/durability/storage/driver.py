@@ -24,7 +24,6 @@ import numpy as np
 
 from core.errors import PlacerecError
 from core.frames.masks import Mask
-from core.index import Coder, CodeTable, InvertedLists
 from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, History, MapSettings, opening
 from core.storage.database import connections as database
@@ -204,10 +203,6 @@ def _run_until_killed(directory: Path, address: str, workers: int) -> None:
 def _warm_up() -> None:
     """Load compiled code before the forks, by work that starts no thread."""
     vectors = np.random.default_rng(0).standard_normal((32, DIMENSION), dtype=np.float32)
-    coder = Coder.fitted(vectors)
-    table = CodeTable.of(coder, coder.encode(vectors))
-    for lists in (None, InvertedLists.built(table)):
-        table.shortlist(coder.query(vectors[0]), 4, None, lists)
     kept = pack_descriptors(vectors, "compressed")
     inner_products(vectors[:1], kept, "compressed")
 

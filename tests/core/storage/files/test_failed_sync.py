@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.index.flat import vectors
 from core.storage import Atlas
-from core.storage.search.segment import vectors
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, local_of, stored_of
 from tests.syscalls import strace
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from core.index import Coder, Codes
 from core.storage import Atlas, MapSettings
-from core.storage.search.index_files import IndexFiles
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 
@@ -24,14 +26,14 @@ def test_a_map_emptied_while_its_first_codes_are_made_is_searched_exactly(
 ) -> None:
     """The write finds nothing built that would have to go; what builds has to look again at the end."""
     lab = atlas.create("lab", ENCODER, DIMENSION, MapSettings(index="compact"), LOCAL_SHAPE)
-    kept = IndexFiles.write_coder
+    encode = Coder.encode
 
-    def emptied(files: IndexFiles, coder: object) -> bool:
+    def emptied(self: Coder, descriptors: NDArray[np.float32]) -> Codes:
         for place in lab.places(None, 10)[0]:
             lab.forget(place.id)
-        return kept(files, coder)  # type: ignore[arg-type]
+        return encode(self, descriptors)
 
-    monkeypatch.setattr(IndexFiles, "write_coder", emptied)
+    monkeypatch.setattr(Coder, "encode", emptied)
     lab.enrol([frame("a"), frame("b")])
     wait_for(lambda: lab.index_status().state == "ready")
     status = lab.index_status()

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, UnknownMap
-from core.index import Coder, InvertedLists
+from core.index import Coder, Codes, table
 from core.storage import Atlas, IndexStatus, Map, MapSettings
 from core.storage.files import array_files
 from core.storage.files.segment_files import HEADER_BYTES
@@ -79,6 +79,10 @@ def nothing_held(found: Snapshot) -> bool:
     return all(segment.held is None for segment in found.segments)
 
 
+def everything_held(found: Snapshot) -> bool:
+    return all(segment.held is not None or segment.removed for segment in found.segments)
+
+
 def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> None:
     lab = make(atlas)
     queries = np.array([descriptor_of(f"query {i}", DIMENSION) for i in range(10)])
@@ -95,7 +99,8 @@ def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> No
     assert status.recall.at_1 > 0.9
     assert nothing_held(lab.snapshot())
     held = DIMENSION * 2 + LOCAL_SHAPE[0] * LOCAL_SHAPE[1]
-    assert status.bytes_in_memory <= before.bytes_in_memory - PLACES * held + PLACES * (DIMENSION // 8 + 128)
+    room = table.ROWS_PER_BLOCK * (DIMENSION // 8 + 8)
+    assert status.bytes_in_memory <= before.bytes_in_memory - PLACES * held + room
     for (rows, products), (all_rows, all_products) in zip(lab.snapshot().search_batch(queries), exact, strict=True):
         assert len(rows) == SHORTLIST
         np.testing.assert_allclose(products, all_products[np.argsort(all_rows)][rows], atol=1e-6)
@@ -110,23 +115,49 @@ def test_a_map_becomes_compact_and_exact_again(atlas: Atlas, folder: Path) -> No
     assert lab.verify().ok
 
 
-@pytest.mark.parametrize("setting", ["compact", "inverted"])
-def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch, setting: str) -> None:
-    monkeypatch.setattr(tiers, "COMPACT_FROM", 100)
-    monkeypatch.setattr(tiers, "INVERTED_FROM", 120 if setting == "inverted" else 10_000)
-    lab = make(atlas, 99)
+def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
+    monkeypatch.setattr(tiers, "ON_DISK_FROM", 120)
+    lab = make(atlas, 59)
     assert settled(lab).tier == "exact"
+    lab.enrol([frame(f"o{i}", dimension=DIMENSION) for i in range(40)])
+    assert settled(lab).tier == "compact"
+    assert everything_held(lab.snapshot())
     lab.enrol([frame(f"q{i}", dimension=DIMENSION) for i in range(51)])
-    assert settled(lab).tier == setting
-    assert all(finds(lab, name) for name in ("p0", "p98", "q0", "q50"))
-    for i in range(99):
-        lab.forget(f"p{i}")
+    assert settled(lab).tier == "compact"
+    assert nothing_held(lab.snapshot())
+    assert all(finds(lab, name) for name in ("p0", "p58", "o0", "q0", "q50"))
+    lab.transfer.forget({f"o{i}": lab.digest(f"o{i}") or b"" for i in range(40)})
+    lab.transfer.forget({f"p{i}": lab.digest(f"p{i}") or b"" for i in range(59)})
     lab.enrol([frame("last", dimension=DIMENSION)])
     assert settled(lab).tier == "compact"
+    assert everything_held(lab.snapshot())
     assert finds(lab, "last")
-    lab.transfer.forget({f"q{i}": lab.digest(f"q{i}") or b"" for i in range(10)})
+    lab.transfer.forget({f"q{i}": lab.digest(f"q{i}") or b"" for i in range(30)})
     assert settled(lab).tier == "exact"
     assert finds(lab, "q40")
+    assert lab.verify().ok
+
+
+def test_an_older_name_of_a_tier(atlas: Atlas) -> None:
+    lab = make(atlas, index="inverted")
+    status = settled(lab)
+    assert (status.setting, status.tier, status.wanted) == ("inverted", "compact", "compact")
+
+
+def test_places_in_memory_are_ranked_by_their_codes_too(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
+    lab = make(atlas)
+    queries = np.array([descriptor_of(f"query {i}", DIMENSION) for i in range(10)])
+    assert settled(lab).tier == "compact"
+    held = lab.snapshot().search_batch(queries)
+    assert everything_held(lab.snapshot())
+    lab.edit({"index": "compact"})
+    settled(lab)
+    assert nothing_held(lab.snapshot())
+    for (rows, products), (same, alike) in zip(held, lab.snapshot().search_batch(queries), strict=True):
+        assert rows.tolist() == same.tolist()
+        np.testing.assert_allclose(products, alike, atol=1e-6)
 
 
 def test_writes_are_seen_at_once(atlas: Atlas) -> None:
@@ -158,10 +189,9 @@ def test_an_older_snapshot_stays_what_it_was(atlas: Atlas) -> None:
     assert lab.snapshot().search(query)[0].tolist() != first[0].tolist()
 
 
-@pytest.mark.parametrize("setting", ["compact", "inverted"])
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
-def test_only_allowed_places_are_found(atlas: Atlas, setting: str, share: float) -> None:
-    lab = make(atlas, index=setting)
+def test_only_allowed_places_are_found(atlas: Atlas, share: float) -> None:
+    lab = make(atlas, index="compact")
     settled(lab)
     found = lab.snapshot()
     allowed = np.random.default_rng(0).random(found.rows) < share
@@ -178,7 +208,7 @@ def test_searches_and_writes_go_on_while_codes_are_made(atlas: Atlas, monkeypatc
     lab = make(atlas, 60)
     waiting, step, encode = threading.Semaphore(0), threading.Semaphore(0), Coder.encode
 
-    def by_step(self: Coder, descriptors: NDArray[np.float32]) -> object:
+    def by_step(self: Coder, descriptors: NDArray[np.float32]) -> Codes:
         if threading.current_thread().name == "index":
             waiting.release()
             assert step.acquire(timeout=SECONDS)
@@ -208,25 +238,23 @@ def test_searches_and_writes_go_on_while_codes_are_made(atlas: Atlas, monkeypatc
 def test_a_start_reads_codes_and_makes_none(
     atlas: Atlas, directory: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    make(atlas, index="inverted")
+    make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
     before = {path.name: path.read_bytes() for path in folder.glob("*.index")}
     codes = [f"codes-00000{i}.index" for i in range(1, 6)]
-    assert sorted(before) == ["coder.index", *codes, "lists.index", "recall.index"]
+    assert sorted(before) == [*codes, "recall.index"]
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError
 
     monkeypatch.setattr(Coder, "encode", refuse)
-    monkeypatch.setattr(Coder, "fitted", refuse)
-    monkeypatch.setattr(InvertedLists, "built", refuse)
     again = Atlas(directory)
     lab = again.get("lab")
     assert lab.snapshot().coded == PLACES  # from the first query on
     assert all(finds(lab, f"p{i}") for i in (0, 31, 32, PLACES - 1))
     status = settled(lab)
-    assert (status.tier, status.recall is not None) == ("inverted", True)
+    assert (status.tier, status.recall is not None) == ("compact", True)
     again.close()
     assert {path.name: path.read_bytes() for path in folder.glob("*.index")} == before
 
@@ -242,16 +270,13 @@ def of_another_group(path: Path) -> None:
         ("codes-000001.index", of_another_group),
         ("codes-000002.index", cut),
         ("codes-000004.index", remove),
-        ("coder.index", flip_middle),
-        ("coder.index", remove),
-        ("lists.index", garbage),
-        ("lists.index", cut),
+        ("codes-000003.index", garbage),
     ],
 )
 def test_a_file_that_is_no_good_is_told_and_made_again(
     atlas: Atlas, directory: Path, folder: Path, name: str, spoil: Callable[[Path], None]
 ) -> None:
-    make(atlas, index="inverted")
+    make(atlas, index="compact")
     settled(atlas.get("lab"))
     atlas.close()
     good = (folder / name).read_bytes()
@@ -334,11 +359,11 @@ def test_a_deleted_map_says_so_to_those_that_still_search_it(atlas: Atlas) -> No
 
 def test_a_map_is_closed_while_it_is_built(atlas: Atlas, directory: Path) -> None:
     make(atlas, 60)
-    atlas.get("lab").edit({"index": "inverted"})
+    atlas.get("lab").edit({"index": "compact"})
     atlas.close()
     again = Atlas(directory)
     assert finds(again.get("lab"), "p59")
-    assert settled(again.get("lab")).tier == "inverted"
+    assert settled(again.get("lab")).tier == "compact"
     assert again.get("lab").verify().ok
     again.close()
 

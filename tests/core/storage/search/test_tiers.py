@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from core.storage import Atlas, Map
-from core.storage.search.tiers import COMPACT_FROM, INVERTED_FROM, Tier, TierSetting, tier_for
+from core.storage.search.tiers import COMPACT_FROM, ON_DISK_FROM, Tier, TierSetting, holds_for, tier_for
 from tests.core.storage.frames import ENCODER, frame
 
 
@@ -17,19 +17,35 @@ from tests.core.storage.frames import ENCODER, frame
         ("auto", COMPACT_FROM, "exact", "compact"),
         ("auto", COMPACT_FROM // 2, "compact", "compact"),
         ("auto", COMPACT_FROM // 2 - 1, "compact", "exact"),
-        ("auto", INVERTED_FROM - 1, "compact", "compact"),
-        ("auto", INVERTED_FROM, "exact", "inverted"),
-        ("auto", INVERTED_FROM // 2, "inverted", "inverted"),
-        ("auto", INVERTED_FROM // 2 - 1, "inverted", "compact"),
-        ("auto", 10, "inverted", "exact"),
+        ("auto", 10**7, "exact", "compact"),
         ("compact", 1, "exact", "compact"),
         ("compact", 0, "compact", "exact"),
-        ("inverted", 5, "exact", "inverted"),
-        ("exact", 10**7, "inverted", "exact"),
+        ("inverted", 5, "exact", "compact"),
+        ("exact", 10**7, "compact", "exact"),
     ],
 )
 def test_the_tier_follows_setting_and_size(setting: TierSetting, places: int, present: Tier, wanted: Tier) -> None:
     assert tier_for(setting, places, present) == wanted
+
+
+@pytest.mark.parametrize(
+    ("setting", "places", "present", "wanted"),
+    [
+        ("auto", 0, False, True),
+        ("auto", ON_DISK_FROM - 1, True, True),
+        ("auto", ON_DISK_FROM, True, False),
+        ("auto", ON_DISK_FROM // 2, False, False),
+        ("auto", ON_DISK_FROM // 2 - 1, False, True),
+        ("exact", 10**7, False, True),
+        ("compact", 5, True, False),
+        ("compact", 0, False, True),
+        ("inverted", 5, True, False),
+    ],
+)
+def test_what_is_in_memory_follows_setting_and_size(
+    setting: TierSetting, places: int, present: bool, wanted: bool
+) -> None:
+    assert holds_for(setting, places, present) == wanted
 
 
 def test_what_a_map_takes_on_disk(lab: Map, directory: Path) -> None:
