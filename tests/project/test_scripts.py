@@ -76,38 +76,39 @@ def checkout(tmp_path: Path) -> Checkout:
 
 
 def test_nothing_is_installed_twice(checkout: Checkout) -> None:
-    assert checkout.prepare("service") == ["venv", "service", "."]
+    assert checkout.prepare("service") == ["venv", "service", "cpu", "."]
     assert checkout.prepare("service") == []
 
 
 def test_development_serves_too(checkout: Checkout) -> None:
-    assert checkout.prepare("development") == ["venv", "development", "."]
+    assert checkout.prepare("development") == ["venv", "development", "cpu", "."]
     assert checkout.prepare("service") == []
 
 
 def test_a_changed_lock_installs_again_into_the_same_venv(checkout: Checkout) -> None:
     checkout.prepare("service")
     (checkout.folder / "requirements/service.lock").write_text("newer\n")
-    assert checkout.prepare("service") == ["service", "."]
+    assert checkout.prepare("service") == ["service", "cpu", "."]
 
 
 def test_another_build_of_torch_gets_a_new_venv(checkout: Checkout) -> None:
     checkout.prepare("service")
     assert checkout.prepare("service", backend="auto") == ["venv", "service", "auto", "."]
-    assert checkout.prepare("service", backend="auto") == []
+    assert checkout.prepare("service") == [], "the choice stays"
+    assert checkout.prepare("service", backend="cpu") == ["venv", "service", "cpu", "."]
 
 
 def test_a_venv_of_an_earlier_version_is_made_anew(checkout: Checkout) -> None:
     checkout.prepare("service")
     (checkout.folder / ".venv/torch-backend").unlink()
     (checkout.folder / ".venv/installed-service").write_text("earlier\n")
-    assert checkout.prepare("service") == ["venv", "service", "."]
+    assert checkout.prepare("service") == ["venv", "service", "cpu", "."]
 
 
 def test_two_runs_at_once_install_once(checkout: Checkout) -> None:
     runs = [checkout.start("development") for _ in range(3)]
     assert [run.communicate(timeout=30)[0] for run in runs] == ["ready\n"] * 3
-    assert checkout.log.read_text().split() == ["venv", "development", "."]
+    assert checkout.log.read_text().split() == ["venv", "development", "cpu", "."]
 
 
 def test_an_interrupted_installation_is_repeated(checkout: Checkout) -> None:

@@ -21,6 +21,7 @@ def where(kinds: list[int], x: list[float], sequences: list[int] | None = None) 
     return Whereabouts(np.array(kinds, np.int8), position, codes, ordinal)
 
 
+@settings(deadline=None)  # the first example imports SciPy
 @given(
     st.lists(
         st.tuples(st.sampled_from([NO_POSE, METRIC, GEOGRAPHIC]), st.integers(0, 40), st.integers(-1, 1)), max_size=25
