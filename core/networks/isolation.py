@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -50,7 +51,11 @@ class Contents(Mapping[str, Any]):
     def __init__(self, path: Path, framework: Literal["pt", "numpy"]) -> None:
         self._file = cast(Any, safe_open(path, framework))
         self._names = tuple(self._file.keys())
-        self.tree: Tree = json.loads((self._file.metadata() or {}).get("tree", "null"))
+
+    @property
+    def tree(self) -> Tree:
+        """What a child process wrote beside the arrays."""
+        return json.loads(self._file.metadata()["tree"])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)
@@ -89,14 +94,13 @@ def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             raise InvalidModel(f"{path.name} cannot be used: reading it takes too long.") from None
+        if not done.returncode:
+            with suppress(OSError, SafetensorError):
+                return Contents(target, framework)
+        said = "it is damaged, or reading it takes too much memory or too long."
         if done.returncode == _REFUSED:
-            raise InvalidModel(f"{path.name} cannot be used: {done.stderr.decode(errors='replace').splitlines()[-1]}")
-        try:
-            return Contents(target, framework)
-        except (OSError, SafetensorError):
-            raise InvalidModel(
-                f"{path.name} cannot be used: it is damaged, or reading it takes too much memory or too long."
-            ) from None
+            said = done.stderr.decode(errors="replace").splitlines()[-1]
+        raise InvalidModel(f"{path.name} cannot be used: {said}")
 
 
 def first_bytes(path: Path, count: int) -> bytes:
@@ -122,9 +126,9 @@ def serve(read: Callable[..., tuple[Tree, Mapping[str, Any]]], save: Callable[..
         save: safetensors' ``save_file`` for the arrays.
     """
     source, target, memory, *arguments = sys.argv[1:]
-    _limit(resource.RLIMIT_AS, _address_space() + int(memory))
-    _limit(resource.RLIMIT_CPU, SECONDS)
-    _limit(resource.RLIMIT_CORE, 0)
+    limit(resource.RLIMIT_AS, address_space() + int(memory))
+    limit(resource.RLIMIT_CPU, SECONDS)
+    limit(resource.RLIMIT_CORE, 0)
     try:
         convert(read, save, Path(source), Path(target), *arguments)
     except InvalidModel as error:
@@ -155,15 +159,16 @@ def convert(
         raise InvalidModel(" ".join(text.split())[:500]) from error
 
 
-def _limit(kind: int, most: int) -> None:
+def limit(kind: int, most: int) -> None:
+    """Set a limit of this process for good, unless a lower one holds already."""
     _, hard = resource.getrlimit(kind)
     most = most if hard == resource.RLIM_INFINITY else min(most, hard)
     resource.setrlimit(kind, (most, most))
 
 
-def _address_space() -> int:
-    """Bytes that the process has mapped; 0 where the system does not say."""
+def address_space() -> int:
+    """Bytes of memory that this process has mapped; 1 TiB, which limits nothing, where the system does not say."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
-        return 0
+        return 2**40

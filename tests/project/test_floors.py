@@ -15,7 +15,7 @@ FLOORS = dict(re.findall(r"^\| ([a-z0-9-]+) \| ([0-9.]+) \| ", (ROOT / "SECURITY
 
 READS_INPUT = {
     *("opencv-python-headless", "starlette", "fastapi", "python-multipart", "uvicorn", "h11", "httptools"),
-    *("websockets", "pydantic", "torch", "numpy", "pillow"),
+    *("websockets", "pydantic", "torch", "numpy", "pillow", "simplejpeg", "protobuf"),
 }
 """Packages that parse bytes from users; each must have a floor."""
 

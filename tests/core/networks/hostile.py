@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import InvalidModel
-from core.networks.isolation import _address_space, _limit, convert
+from core.networks.isolation import address_space, convert, limit
 
 KEPT = 2
 """Files of each kind of bad end."""
@@ -52,7 +52,7 @@ def ending(reader: Any, path: Path, target: Path, arguments: list[str]) -> str:
     """How a fork that reads the file ends: "read", "refused", "memory" or "killed"."""
     process = os.fork()
     if not process:
-        _limit(resource.RLIMIT_AS, _address_space() + SPARE)
+        limit(resource.RLIMIT_AS, address_space() + SPARE)
         signal.alarm(20)
         status = 0
         try:

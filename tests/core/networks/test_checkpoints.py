@@ -106,7 +106,7 @@ def test_what_pytorch_writes_is_read_to_the_bit(state: dict[str, object], tmp_pa
 def test_a_state_dict_alone_and_its_safetensors_sibling(tmp_path: Path) -> None:
     tensors = {"encoder.0.weight": torch.rand(2, 3), "pool.centroids": torch.rand(4)}
     torch.save(tensors, tmp_path / "plain.pth")
-    save_file(tensors, tmp_path / "plain.safetensors")
+    save_file(tensors, tmp_path / "plain.safetensors", {"tree": "of another kind"})
     for name in ("plain.pth", "plain.safetensors"):
         found = read_checkpoint(tmp_path / name)
         assert sorted(found) == sorted(tensors) and len(found) == 2
