@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from statistics import median
 
+import httpx
 import pytest
 import torch
 
@@ -198,7 +199,8 @@ def test_a_busy_server_is_alive_and_keeps_deadlines(server: Server) -> None:
             assert server.client.post("/v1/encode", content=large, headers=HEADERS).status_code == 200
             durations.append(time.monotonic() - start)
 
-    alive, refused = [], []
+    alive: list[float] = []
+    refused: list[httpx.Response] = []
     with ThreadPoolExecutor(4) as pool:
         callers = [pool.submit(encode_large_frames) for _ in range(4)]
         try:
