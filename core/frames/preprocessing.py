@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.frames.masks import Mask
-from core.kernels.pixels import largest_deviation, normalize
 
 Pixels = NDArray[np.uint8]
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -56,7 +55,9 @@ def prepare(pixels: Pixels, definition: InputDefinition, out: NDArray[np.float32
     if out is None:
         out = np.empty((height, width, 3), np.float32)
     mean, scale = _of_a_row(definition.mean, width), _of_a_row(definition.scale, width)
-    normalize(np.ascontiguousarray(pixels), mean, scale, out.reshape(height, -1))
+    rows = out.reshape(height, -1)
+    np.subtract(pixels.reshape(height, -1), mean, out=rows)
+    np.multiply(rows, scale, out=rows)
     return out
 
 
@@ -75,8 +76,8 @@ def contrast(pixels: Pixels, mask: Mask | None = None) -> float:
     """
     stride = max(1, min(pixels.shape[:2]) // 64)
     sampled = np.ascontiguousarray(pixels[::stride, ::stride])
-    counted = sampled.reshape(-1, 3) if mask is None else sampled[~mask.covered(*sampled.shape[:2])]
-    return float(largest_deviation(counted)) if len(counted) else 0.0
+    counted = None if mask is None else (~mask.covered(*sampled.shape[:2])).view(np.uint8)
+    return float(cv2.meanStdDev(sampled, mask=counted)[1].max())
 
 
 def second_look(pixels: Pixels) -> Pixels:

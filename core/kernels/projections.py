@@ -41,11 +41,3 @@ def finish_rows(products, features, shift, projected):  # type: ignore[no-untype
     """The same for each row: float32 [n, d], [n, K] and [d] to float32 [n, values]."""
     for i in range(len(features)):
         finish_row(products[i], squared_length(features[i]), shift, projected[i])
-
-
-@numba.njit(cache=True, nogil=True)
-def quantize(values, factor, made):  # type: ignore[no-untyped-def]
-    """Put values times a factor, rounded and cut off at ±127, into ``made``; float32 [C, n] to int8 [C, n]."""
-    for c in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            made[c, i] = np.int8(min(127.0, max(-127.0, np.rint(values[c, i] * factor))))

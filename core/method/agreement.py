@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.kernels.correspondence import squared_sums
-from core.kernels.projections import quantize
 
 Array = NDArray[np.float32]
 Cells = NDArray[np.int8]
@@ -77,7 +76,8 @@ def local_descriptors(layers: list[Array], definition: AgreementDefinition) -> C
     start = 0
     for weight, layer in zip(definition.weights, layers, strict=True):
         stop = start + layer.shape[1]
-        quantize(layer, RESOLUTION * np.sqrt(weight), made[:, start:stop])
+        steps = np.rint(layer * np.float32(RESOLUTION * np.sqrt(weight)))
+        made[:, start:stop] = np.clip(steps, -127, 127)
         start = stop
     return made
 

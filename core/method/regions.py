@@ -2,12 +2,11 @@
 
 A region is an 8-connected group of cells of one feature map whose activations have the same quantised level
 ``floor(activation / step)``; level 0 and below is background.  ``equations.py`` states this in plain NumPy; here the
-compiled loops of ``core.kernels.regions`` and ``core.kernels.regions`` compute it.
+compiled loops of ``core.kernels.regions`` compute it.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,12 +14,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.regions import DOUBLES, INTEGERS, SINGLES, bits_shape, projected_within, strongest, sums_within
+from core.kernels.regions import projected_within, strongest, sums_within
 
 Activations = NDArray[np.float32]
-
-SHAPES = 8
-"""A thread keeps a workspace for layers of at most this many shapes."""
 
 
 @dataclass(frozen=True)
@@ -49,72 +45,17 @@ class Regions:
         return [slice(start, stop) for start, stop in pairwise(ends)]
 
 
-@dataclass(frozen=True)
-class _Room:
-    """The arrays that a pass over a layer works in; allocating them anew would cost as much time as the pass itself."""
-
-    cells: NDArray[np.int32]
-    singles: NDArray[np.float32]
-    doubles: NDArray[np.float64]
-    bits: NDArray[np.uint64]
-    firsts: NDArray[np.int32]
-    table: NDArray[np.float64]
-
-
-class _Workspace(threading.local):
-    """The working arrays of one thread, by the shape of the layer."""
-
-    def __init__(self) -> None:
-        self._rooms: dict[tuple[int, ...], _Room] = {}
-
-    def room(self, shape: tuple[int, ...]) -> _Room:
-        """The working arrays for activations of this shape."""
-        found = self._rooms.get(shape)
-        if found is None:
-            if len(self._rooms) >= SHAPES:
-                self._rooms.clear()
-            height, width, channels = shape
-            values = height * width * channels
-            found = _Room(
-                cells=np.empty((INTEGERS, values), np.int32),
-                singles=np.empty((SINGLES, values), np.float32),
-                doubles=np.empty((DOUBLES, values), np.float64),
-                bits=np.zeros(bits_shape(height, width, channels), np.uint64),
-                firsts=np.zeros(bits_shape(height, width, channels), np.int32),
-                table=np.zeros((height + 1, width + 1, channels), np.float64),
-            )
-            self._rooms[shape] = found
-        return found
-
-
-_workspace = _Workspace()
-
-
 def find_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
     """Find the regions as :func:`extract_regions` does, but without their features: those are float32 [T, 0]."""
     if count < 1 or not all(step > 0 for step in steps) or not all(layer.ndim == 3 for layer in layers):
         raise ValueError(f"steps {tuple(steps)} and count {count} must be positive, activations 3-D")
-    room = count * len(layers)
-    boxes, energies = np.empty((room, 4), np.int32), np.empty(room, np.float32)
-    channels, owners = np.empty(room, np.int32), np.empty(room, np.int32)
-    end = 0
-    for index, (layer, step) in enumerate(zip(layers, steps, strict=True)):
-        work = _workspace.room(layer.shape)
-        start, stop = end, end + count
-        end += strongest(
-            np.ascontiguousarray(layer, np.float32),
-            np.float32(step),
-            work.cells,
-            work.singles,
-            work.doubles,
-            work.bits,
-            work.firsts,
-            boxes[start:stop],
-            energies[start:stop],
-            channels[start:stop],
-        )
-        owners[start:end] = index
-    return Regions(boxes[:end], energies[:end], channels[:end], owners[:end], np.empty((end, 0), np.float32))
+    found = [
+        strongest(np.ascontiguousarray(layer, np.float32), np.float32(step), count)
+        for layer, step in zip(layers, steps, strict=True)
+    ]
+    boxes, energies, channels = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    owners = np.repeat(np.arange(len(layers), dtype=np.int32), [len(part) for part, _, _ in found])
+    return Regions(boxes, energies, channels, owners, np.empty((len(boxes), 0), np.float32))
 
 
 def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count: int) -> Regions:
@@ -137,25 +78,23 @@ def extract_regions(layers: Sequence[Activations], steps: Sequence[float], count
         raise ValueError("the layers that are fused have the same number of channels")
     features = np.empty((len(found), layers[0].shape[2]), np.float32)
     for layer, part in zip(layers, found.parts(len(layers)), strict=True):
-        box_sums(layer, found.boxes[part], features[part])
+        features[part] = box_sums(layer, found.boxes[part])
     return Regions(found.boxes, found.energies, found.channels, found.layers, features)
 
 
-def box_sums(grid: Activations, boxes: NDArray[np.int32], out: Activations | None = None) -> NDArray[np.float32]:
+def box_sums(grid: Activations, boxes: NDArray[np.int32]) -> NDArray[np.float32]:
     """The regional features (equation 3.4): the sum of a layer's local descriptors in each box.
 
     Args:
         grid: the layer's activations, float32 [X, Y, K].
         boxes: int32 [T, 4], top, left, bottom, right, half-open.
-        out: where to put the sums, float32 [T, K]; None: a new array.
 
     Returns:
         float32 [T, K].
     """
-    if out is None:
-        out = np.empty((len(boxes), grid.shape[2]), np.float32)
-    sums_within(np.ascontiguousarray(grid, np.float32), boxes, _workspace.room(grid.shape).table, out)
-    return out
+    sums = np.empty((len(boxes), grid.shape[2]), np.float32)
+    sums_within(np.ascontiguousarray(grid, np.float32), boxes, sums)
+    return sums
 
 
 def projected_box_sums(
@@ -172,5 +111,4 @@ def projected_box_sums(
         shift: the projection's mean times its matrix, float32 [d].
         out: float32 [T, values], values <= d.
     """
-    tables = _workspace.room(layer.shape).table, _workspace.room(products.shape).table
-    projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, *tables, shift, out)
+    projected_within(np.ascontiguousarray(layer, np.float32), products, boxes, shift, out)

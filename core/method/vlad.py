@@ -9,8 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from core.kernels.vlad import aggregated
-from core.method.equations import Normalization
+from core.method.equations import Normalization, assign, normalize, power
 
 Array = NDArray[np.float32]
 
@@ -26,11 +25,11 @@ def aggregate(features: Array, centers: Array, gamma: float, normalization: Norm
     Returns:
         float32 [V·K].
     """
-    centers = np.ascontiguousarray(centers, np.float32)
-    # f·o - ‖o‖²/2: the highest value of a row is the nearest word's.
-    closeness = features @ centers.T - np.float32(0.5) * np.einsum("vk,vk->v", centers, centers)
-    vectors = aggregated(features, centers, closeness, np.float32(gamma), normalization == "intra")
-    return np.asarray(vectors, np.float32).reshape(-1)
+    nearest = assign(features, centers)
+    chosen = np.zeros((len(centers), len(features)), np.float32)
+    chosen[nearest, np.arange(len(features))] = 1
+    residuals = chosen @ features - chosen.sum(axis=1, keepdims=True) * centers  # Σ f - n o, equation 4.8
+    return np.asarray(normalize(power(residuals, gamma), normalization), np.float32).reshape(-1)
 
 
 def scores(inner_products: Array, words: int, normalization: Normalization) -> Array:
