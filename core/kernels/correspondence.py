@@ -55,7 +55,7 @@ def squared_sums(query, references, columns, rows_apart, columns_apart, cosine):
             for y in range(max(0, row - rows_apart), min(rows, row + rows_apart + 1)):
                 start = y * columns + left
                 for j in range(right - left):
-                    products[j] = _product(wide[start + j], cell_values)
+                    products[j] = _product(wide[np.uint64(start + j)], cell_values)  # unsigned: never from the end
                 for j in range(right - left):
                     key = products[j] << NUMBER_BITS
                     highest = max(highest, key | (LAST - start - j))

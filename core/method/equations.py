@@ -171,7 +171,7 @@ def residuals(features: Array, centers: Array) -> Array:
 
 def power(vectors: Array, gamma: float) -> Array:
     """v := sign(v)·|v|^γ, element by element (equations 3.9 and 4.9)."""
-    return np.sign(vectors) * np.abs(vectors) ** gamma
+    return np.copysign(np.abs(vectors) ** gamma, vectors)
 
 
 def unit_length(vectors: Array) -> Array:
