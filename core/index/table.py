@@ -182,11 +182,10 @@ class CodeTable:
         ]
 
     @cached_property
-    def loose_rows(self) -> int:
-        """Rows of full blocks that are not scanned but would be if they were joined."""
-        if self.coder.width < 2 * SCANNED_VALUES:
-            return 0
-        return sum(block.used for block in self.blocks if block.scan is None and block.is_full)
+    def is_loose(self) -> bool:
+        """Whether so many rows are in full blocks without a scan that :meth:`joined` makes a larger one of them."""
+        loose = sum(block.used for block in self.blocks if block.scan is None and block.is_full)
+        return loose >= LOOSE_ROWS and self.coder.width >= 2 * SCANNED_VALUES
 
     def joined(self, progress: Progress = _untold) -> Block | None:
         """A block that can take the place of some that are not scanned; None while these have few rows.
@@ -194,7 +193,7 @@ class CodeTable:
         Args:
             progress: is called with the rows done and all rows; what it raises ends the work.
         """
-        if self.loose_rows < LOOSE_ROWS:
+        if not self.is_loose:
             return None
         start = next(number for number, block in enumerate(self.blocks) if block.scan is None)
         if start and self.blocks[start - 1].used + self.blocks[start].used <= LARGEST_BLOCK:
@@ -217,8 +216,9 @@ class CodeTable:
         for begin in range(0, stop - first, _DECODED):
             # Signs say all that the scan keeps, so that no descriptor has to be read again.
             some = min(_DECODED, stop - first - begin)
+            signs = self.coder.decoded(stored(index)[begin : begin + some], SCANNED_VALUES)
             with in_one_thread():
-                scan.add(np.ascontiguousarray(index.reconstruct_n(begin, some)[:, :SCANNED_VALUES]))
+                scan.add(signs)
             progress(begin + some, stop - first)
         heads = faiss.RemapDimensionsTransform(self.coder.width, SCANNED_VALUES, False)
         return Block(first, stop - first, index, faiss.IndexRefine(faiss.IndexPreTransform(heads, scan), index))
