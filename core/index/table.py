@@ -29,8 +29,9 @@ LOOSE_ROWS = 8192
 """Blocks that are not scanned are joined when they have so many rows: then reading every code takes too long."""
 SCANNED_VALUES = 2048
 """The fast scan judges rows by so many of their rotated values; of fewer than twice as many all codes are compared."""
-CANDIDATES = 8
-"""For each row of the shortlist a scan leaves so many rows of a block, whose whole codes are compared."""
+CANDIDATES, FEWEST_CANDIDATES = 8.0, 3.0
+"""For each row of the shortlist a scan leaves so many rows, whose whole codes are compared; divided by the root of the
+number of blocks, down to the fewest, since only one block has the row that is looked for."""
 SHARED_FROM = 16_384
 """A search of so many rows is shared among threads."""
 _DECODED = 256
@@ -67,12 +68,15 @@ class Block:
         scanned = 0 if self.scan is None else self.used * (SCANNED_VALUES // 8 + 16)  # factors and ids beside the bits
         return int(self.codes.ntotal * self.codes.code_size + scanned)
 
-    def best(self, queries: Array, count: int, allowed: Flags | None) -> tuple[Array, Positions]:
+    def best(
+        self, queries: Array, count: int, allowed: Flags | None, candidates: float = CANDIDATES
+    ) -> tuple[Array, Positions]:
         """Estimates and rows of the table, float32 and int64 [B, count], -1 where there are fewer.
 
         Args:
             queries: rotated, float32 [B, D'].
             allowed: bool [used], which rows may be returned; None: all.
+            candidates: rows that a scan leaves for each that is returned.
         """
         if allowed is None and not self.is_full:
             allowed = np.ones(self.used, np.bool_)
@@ -82,13 +86,13 @@ class Block:
             flags[: self.used] = allowed
             chosen = selector(flags)
         found = self.used if allowed is None else int(np.count_nonzero(allowed))
-        if self.scan is None or found <= CANDIDATES * count:
+        if self.scan is None or found <= candidates * count:
             index = self.codes
             parameters = faiss.SearchParameters(sel=chosen)
         else:
             index = self.scan
             base = faiss.SearchParametersPreTransform(index_params=faiss.SearchParametersIVF(sel=chosen, nprobe=1))
-            parameters = faiss.IndexRefineSearchParameters(k_factor=CANDIDATES, base_index_params=base)
+            parameters = faiss.IndexRefineSearchParameters(k_factor=candidates, base_index_params=base)
         with in_one_thread():
             estimates, rows = index.search(queries, min(count, self.used), params=parameters)
         return estimates, np.where(rows < 0, -1, rows + self.first)
@@ -165,6 +169,8 @@ class CodeTable:
         turned = self.coder.rotated(queries)
         helpers = cores() - 1 if executor is not None and len(self) >= SHARED_FROM else 0
         # A thread takes a block; where there are fewer blocks than threads, some of the queries.
+        scans = sum(block.scan is not None for block in self.blocks)
+        candidates = max(FEWEST_CANDIDATES, CANDIDATES / max(1, scans) ** 0.5)
         portions = min(len(turned), -(-(1 + helpers) // max(1, len(self.blocks))))
         found: dict[tuple[int, int], tuple[Array, Positions]] = {}
 
@@ -172,7 +178,7 @@ class CodeTable:
             number, portion = part
             block, some = self.blocks[number], turned[portion::portions]
             of_block = None if allowed is None else allowed[block.first : block.first + block.used]
-            found[part] = block.best(some, count, of_block)
+            found[part] = block.best(some, count, of_block, candidates)
 
         parts = [(number, portion) for number in range(len(self.blocks)) for portion in range(portions)]
         in_turns(search, parts, executor, min(helpers, len(parts) - 1))
@@ -182,11 +188,10 @@ class CodeTable:
         ]
 
     @cached_property
-    def loose_rows(self) -> int:
-        """Rows of full blocks that are not scanned but would be if they were joined."""
-        if self.coder.width < 2 * SCANNED_VALUES:
-            return 0
-        return sum(block.used for block in self.blocks if block.scan is None and block.is_full)
+    def is_loose(self) -> bool:
+        """Whether so many rows are in full blocks without a scan that :meth:`joined` makes a larger one of them."""
+        loose = sum(block.used for block in self.blocks if block.scan is None and block.is_full)
+        return loose >= LOOSE_ROWS and self.coder.width >= 2 * SCANNED_VALUES
 
     def joined(self, progress: Progress = _untold) -> Block | None:
         """A block that can take the place of some that are not scanned; None while these have few rows.
@@ -194,7 +199,7 @@ class CodeTable:
         Args:
             progress: is called with the rows done and all rows; what it raises ends the work.
         """
-        if self.loose_rows < LOOSE_ROWS:
+        if not self.is_loose:
             return None
         start = next(number for number, block in enumerate(self.blocks) if block.scan is None)
         if start and self.blocks[start - 1].used + self.blocks[start].used <= LARGEST_BLOCK:
@@ -217,8 +222,9 @@ class CodeTable:
         for begin in range(0, stop - first, _DECODED):
             # Signs say all that the scan keeps, so that no descriptor has to be read again.
             some = min(_DECODED, stop - first - begin)
+            signs = self.coder.decoded(stored(index)[begin : begin + some], SCANNED_VALUES)
             with in_one_thread():
-                scan.add(np.ascontiguousarray(index.reconstruct_n(begin, some)[:, :SCANNED_VALUES]))
+                scan.add(signs)
             progress(begin + some, stop - first)
         heads = faiss.RemapDimensionsTransform(self.coder.width, SCANNED_VALUES, False)
         return Block(first, stop - first, index, faiss.IndexRefine(faiss.IndexPreTransform(heads, scan), index))

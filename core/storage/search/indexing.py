@@ -21,7 +21,6 @@ from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
-from core.index.table import LOOSE_ROWS
 from core.storage.database.ledger import SegmentEntry
 from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
@@ -149,7 +148,7 @@ class Indexer:
             return True
         if snapshot.table is None:
             return False
-        if snapshot.coded < snapshot.rows or snapshot.table.loose_rows >= LOOSE_ROWS:
+        if snapshot.coded < snapshot.rows or snapshot.table.is_loose:
             return True
         return self._recall is None or self._recall.places * _GROWN < len(snapshot)
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from core.index import Coder
+from core.index.flat import stored
 from tests.core.index.made_up import descriptors, second_looks, table_of
 
 
@@ -33,6 +34,17 @@ def test_estimates_are_near_inner_products_and_without_bias() -> None:
     spread = np.linalg.norm(rows, axis=1).mean() * np.linalg.norm(queries, axis=1).mean() / np.sqrt(1024)
     assert np.std(errors) < spread
     assert abs(np.mean(errors)) < 0.1 * spread
+
+
+@pytest.mark.parametrize("count", [8, 512, 1024])
+def test_the_first_values_are_decoded_as_faiss_decodes_all(count: int) -> None:
+    coder, rows = Coder.of(1024), descriptors(20)
+    codes = coder.encode(rows)
+    index = coder.index(20)
+    stored(index)[:] = codes
+    found = coder.decoded(codes, count)
+    assert (str(found.dtype), found.shape) == ("float32", (20, count))
+    np.testing.assert_allclose(found, index.reconstruct_n(0, 20)[:, :count], rtol=1e-5)
 
 
 def test_a_digest_is_of_the_codes_of_one_length() -> None:

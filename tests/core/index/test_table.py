@@ -73,14 +73,14 @@ def test_an_empty_table() -> None:
 
 def test_blocks_are_joined_and_find_what_they_found() -> None:
     loose = grown(ROWS, 50)
-    assert loose.loose_rows == 960
+    assert loose.is_loose
     made = joined(loose)
     assert [(block.first, block.used, block.scan is not None) for block in made.blocks] == [
         (0, 512, True),
         (512, 448, True),
         (960, 40, False),
     ]
-    assert made.loose_rows == 0
+    assert not made.is_loose
     np.testing.assert_array_equal(made.codes(0, 1000), loose.codes(0, 1000))
     queries = second_looks(ROWS)
     firsts = [rows[0] for rows in best(loose, queries)]
@@ -122,7 +122,7 @@ def test_joining_is_told_and_may_be_stopped() -> None:
 
 def test_codes_of_few_values_are_all_compared() -> None:
     made = table_of(descriptors(600, 256))
-    assert made.loose_rows == 0 and made.joined() is None
+    assert not made.is_loose and made.joined() is None
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.6, 1.0])

@@ -139,6 +139,32 @@ def test_a_map_grows_into_its_tier(atlas: Atlas, monkeypatch: pytest.MonkeyPatch
     assert lab.verify().ok
 
 
+def test_codes_are_joined_while_the_map_grows(atlas: Atlas, directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"ROWS_PER_BLOCK": 16, "LOOSE_ROWS": 32, "LARGEST_BLOCK": 96, "SCANNED_VALUES": 128}.items():
+        monkeypatch.setattr(table, name, value)
+
+    def scanned(lab: Map) -> int:
+        settled(lab)
+        codes = lab.snapshot().table
+        return 0 if codes is None else sum(block.used for block in codes.blocks if block.scan is not None)
+
+    lab = make(atlas, 70, index="compact")
+    assert 32 <= scanned(lab) <= 70
+    for start in range(0, 80, 20):
+        lab.enrol([frame(f"q{start + i}", dimension=DIMENSION) for i in range(20)])
+        assert finds(lab, f"q{start}")
+    assert 100 <= scanned(lab) <= 150
+    lab.forget("p3")
+    assert not finds(lab, "p3")
+    names = [*(f"p{i}" for i in range(70) if i != 3), *(f"q{i}" for i in range(80))]
+    assert np.mean([finds(lab, name) for name in names]) > 0.95
+    atlas.close()
+    again = Atlas(directory)
+    assert scanned(again.get("lab")) >= 100
+    assert finds(again.get("lab"), "q79")
+    again.close()
+
+
 def test_an_older_name_of_a_tier(atlas: Atlas) -> None:
     lab = make(atlas, index="inverted")
     status = settled(lab)
