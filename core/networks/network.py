@@ -158,7 +158,8 @@ class LocalResponseNormalization(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         layer = self.layer
-        return nn.functional.local_response_norm(x, layer.size, layer.alpha, layer.beta, layer.k)
+        wide = x.float() if x.dtype == torch.bfloat16 else x  # which torch's pooling of channels lacks
+        return nn.functional.local_response_norm(wide, layer.size, layer.alpha, layer.beta, layer.k).to(x.dtype)
 
 
 def build_layer(layer: Layer, channels: int) -> nn.Module:

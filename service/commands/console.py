@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -54,23 +53,6 @@ class Commands(TyperGroup):
         except (Failure, PlacerecError, Fault) as error:
             complain(str(error))
             raise typer.Exit(1) from error
-
-
-EXTRAS = {"report": ("matplotlib", "PIL")}
-"""The modules that each extra of the package brings."""
-
-
-def need_extra(extra: str) -> None:
-    """Check that what an extra brings is installed, before the work that would need it at its end.
-
-    Raises:
-        Failure: it is not; the text says how to install it.
-    """
-    if missing := [module for module in EXTRAS[extra] if find_spec(module) is None]:
-        raise Failure(
-            f"This needs {' and '.join(missing)}, which a service does not: pip install 'placerec[{extra}]', or in a"
-            f" checkout .venv/bin/pip install --editable '.[{extra}]'."
-        )
 
 
 def complain(sentence: str) -> None:

@@ -34,7 +34,10 @@ def check_installed() -> None:
     """
     if missing := [name for name in ("Jinja2", "Matplotlib") if find_spec(name.lower()) is None]:
         names = " and ".join(missing)
-        raise MissingExtra(f"A report is drawn with {names}: install the extra report (pip install '.[report]').")
+        raise MissingExtra(
+            f"A report is drawn with {names}, which a service does not need: pip install 'placerec[report]', or in a"
+            " checkout .venv/bin/pip install --editable '.[report]'."
+        )
 
 
 def write_report(folder: Path, comparison: Comparison) -> None:

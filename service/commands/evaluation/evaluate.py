@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import Progress, TaskID
 
 from core.evaluation import Comparison
-from service.commands.console import need_extra, progress, remark
+from service.commands.console import progress, remark
 from service.commands.evaluation.output import (
     comparison_json,
     remark_notes,
@@ -237,8 +237,6 @@ def evaluate(
         check_installed()  # before what may take hours
     options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed)
     options.check()
-    if report is not None:
-        need_extra("report")
     files = parse_weights(weights or [])
 
     # Imported here because they take a second.

@@ -37,11 +37,10 @@ def test_lines_are_logged_cut_and_told_apart() -> None:
     assert told[3:] == [("warning", "after it"), ("warning", "without an end")]
 
 
-def test_a_broken_picture_leaves_no_line_that_is_not_json(strict: Server) -> None:
-    whole = bytearray(encoded(scene(4)))
-    middle = len(whole) // 2
-    whole[middle : middle + 40] = b"\xff\xd9" + b"\xaa" * 38
-    strict.client.post("/v1/encode", content=bytes(whole), headers={"Content-Type": "image/jpeg"})
+def test_an_odd_picture_leaves_no_line_that_is_not_json(strict: Server) -> None:
+    whole = encoded(scene(4))
+    padded = whole[:-2] + bytes(3) + whole[-2:]  # a decoder remarks on this
+    assert strict.client.post("/v1/encode", content=padded, headers={"Content-Type": "image/jpeg"}).status_code == 200
     assert eventually(lambda: bool(strict.lines(logger="placerec.native", level="debug")))
     for line in strict.log_file.read_text().splitlines():
         assert {"time", "level", "logger", "message"} <= set(json.loads(line))

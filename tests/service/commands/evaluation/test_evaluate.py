@@ -252,5 +252,5 @@ def test_a_report_without_what_draws_it_is_refused_before_the_work(
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     both = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--report", tmp_path / "report")
     said = placerec("evaluate", *both, status=1).stderr
-    assert "This needs matplotlib" in said and "pip install 'placerec[report]'" in said
+    assert "drawn with Matplotlib" in said and "pip install 'placerec[report]'" in said
     assert not (tmp_path / "report").exists() and not (tmp_path / "cache").exists()
