@@ -205,15 +205,6 @@ def test_growing_traverses_and_disturbed_queries(
         assert curve["auc_pr"][0] == pytest.approx(figures["auc_pr"])
 
 
-def test_a_report_that_cannot_be_drawn_is_refused_before_anything_is_measured(
-    placerec: Placerec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("core.evaluation.report.page.find_spec", lambda name: None)
-    words = ("--reference", tmp_path / "absent", "--query", tmp_path / "absent", "--tolerance", 0)
-    refused = placerec("evaluate", *words, "--report", tmp_path / "report", status=1)
-    assert "extra report" in refused.stderr and not (tmp_path / "report").exists()
-
-
 def test_the_report_is_written(placerec: Placerec, traverses: tuple[Path, Path], tmp_path: Path) -> None:
     words = ("--reference", traverses[0], "--query", traverses[1], "--tolerance", 0, "--encoder", "hog")
     placerec("evaluate", *words, "--report", tmp_path / "report")
