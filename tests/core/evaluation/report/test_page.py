@@ -298,7 +298,7 @@ def test_style_and_script_are_whole(written: Written) -> None:
 
 def test_without_its_packages_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtra, match=r"Jinja2 and Matplotlib.*extra report"):
+    with pytest.raises(MissingExtra, match=r"Jinja2 and Matplotlib.*placerec\[report\]"):
         write_report(tmp_path / "report", make_comparison(tmp_path, systems=1))
     assert not (tmp_path / "report").exists()
 
