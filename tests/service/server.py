@@ -10,15 +10,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import httpx
 
 ROOT = Path(__file__).parents[2]
 START_SECONDS = 120.0
-T = TypeVar("T")
 
 
 def free_port() -> int:
@@ -147,14 +146,6 @@ def typed(data: bytes) -> dict[str, str]:
     if data.startswith(b"\x89PNG"):
         return {"Content-Type": "image/png"}
     return {"Content-Type": "image/webp" if data[8:12] == b"WEBP" else "image/jpeg"}
-
-
-def settled(condition: Callable[[], T], every: float = 0.05) -> T:
-    """What ``condition`` gives once that is true, or after a minute; the machine may be busy with something else."""
-    until = time.monotonic() + 60
-    while not (found := condition()) and time.monotonic() < until:
-        time.sleep(every)
-    return found
 
 
 def assert_problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:

@@ -74,11 +74,11 @@ def ended(server: Server, reason: str) -> float:
     return float(found[0].rsplit(" ", 1)[1]) if found else 0.0
 
 
-def eventually(truth: Callable[[], bool], seconds: float = 30) -> bool:
+def eventually(truth: Callable[[], bool], seconds: float = 30, every: float = 0.05) -> bool:
     """Whether it comes true."""
     until = time.monotonic() + seconds
     while not truth():
         if time.monotonic() > until:
             return False
-        time.sleep(0.05)
+        time.sleep(every)
     return True

@@ -26,7 +26,8 @@ from service.commands.connection.client import Target, open_service
 from service.settings import Settings
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import jpeg
-from tests.service.server import Server, assert_problem, settled
+from tests.service.server import Server, assert_problem
+from tests.service.wire import eventually
 
 PARTS = {"map": "lab", "place": "p", "sequence": "s", "camera": "c", "session": "s-0", "job": "j", "explanation": "e"}
 
@@ -267,7 +268,7 @@ def test_a_key_of_some_maps_sees_no_other(keyed: Keyed) -> None:
 def known(client: httpx.Client) -> bool:
     """Whether its key, which was made beside the service, comes to be known; until then it is one of the wrong keys, of
     which an address may send one a second."""
-    return settled(lambda: client.get("/v1/maps").status_code == 200, every=1)
+    return eventually(lambda: client.get("/v1/maps").status_code == 200, every=1)
 
 
 def test_a_map_is_made_only_under_an_id_of_the_key(keyed: Keyed) -> None:
@@ -324,7 +325,7 @@ def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
         connection.send(jpeg(1))
         assert json.loads(connection.recv(timeout=30))["frames"] == 1
         keyed.store.revoke(key.id)
-        assert settled(lambda: alike.get("/v1/maps").status_code == 401)
+        assert eventually(lambda: alike.get("/v1/maps").status_code == 401)
         alike.close()
         connection.send(jpeg(1))
         assert json.loads(connection.recv(timeout=30))["problem"]["type"].endswith("key-refused")
@@ -345,7 +346,7 @@ def test_a_key_counts_and_ends_beside_a_running_service(keyed: Keyed) -> None:
             answers.append(passing.get("/v1/maps"))
             return answers[-1].status_code == 401
 
-        assert settled(is_refused)
+        assert eventually(is_refused)
         assert_problem(answers[-1], 401, "key-refused")
 
 

@@ -14,7 +14,8 @@ import pytest
 from service.errors.faults import InvalidRequest, MalformedBody
 from service.http.bodies import json_size, parse_json
 from tests.service.scenes import encoded, jpeg, scene
-from tests.service.server import Server, assert_problem, settled
+from tests.service.server import Server, assert_problem
+from tests.service.wire import eventually
 
 JPEG = {"Content-Type": "image/jpeg"}
 
@@ -119,7 +120,7 @@ def test_uploads_share_a_bounded_memory(tight_server: Server, tight_map: str) ->
         picture = encoded(scene(1), quality=60)
         # Asked about before it is sent, it takes no room from those that are still arriving.
         asked = head("/v1/encode", f"Content-Length: {len(picture)}", "Expect: 100-continue")
-        assert settled(lambda: exchange(tight_server, asked)[0].startswith(b"HTTP/1.1 503")), "all have been read"
+        assert eventually(lambda: exchange(tight_server, asked)[0].startswith(b"HTTP/1.1 503")), "all have been read"
         response = tight_server.client.post("/v1/encode", content=picture, headers=JPEG)
         assert_problem(response, 503, "memory-full")
         assert 1 <= int(response.headers["retry-after"]) <= 3
@@ -130,7 +131,7 @@ def test_uploads_share_a_bounded_memory(tight_server: Server, tight_map: str) ->
     def is_answered() -> bool:
         return tight_server.client.post("/v1/encode", content=picture, headers=JPEG).status_code == 200
 
-    assert settled(is_answered), "given back"
+    assert eventually(is_answered), "given back"
 
 
 def test_a_caller_that_hangs_up_harms_nobody(server: Server) -> None:
