@@ -114,41 +114,12 @@ def correspondences(query: Cells, reference: Cells, columns: int, reach: tuple[i
     return Correspondences(cells[mutual], there[mutual], (best[mutual] / RESOLUTION**2).astype(np.float32))
 
 
-@dataclass(frozen=True)
-class ScatteredCells:
-    """The cells of k frames where they lie in memory, C cells of L values each.
-
-    blocks: int8 [n, C, L] each; at least one.
-    block: int64 [k], the block that holds a frame's cells.
-    row: int64 [k], the frame's position in that block.
-    """
-
-    blocks: tuple[Cells, ...]
-    block: NDArray[np.int64]
-    row: NDArray[np.int64]
-
-    def __len__(self) -> int:
-        return len(self.row)
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """k, C and L."""
-        return len(self), *self.blocks[0].shape[1:]
-
-    def together(self) -> Cells:
-        """A copy in one array: int8 [k, C, L]."""
-        found = np.empty(self.shape, np.int8)
-        for position, (block, row) in enumerate(zip(self.block.tolist(), self.row.tolist(), strict=True)):
-            found[position] = self.blocks[block][row]
-        return found
-
-
-def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, definition: AgreementDefinition) -> Array:
+def agreement(query: Cells, candidates: Cells, columns: int, definition: AgreementDefinition) -> Array:
     """What each candidate's score gains: ``share`` times the mean over all cells of the squared cosines.
 
     Args:
         query: int8 [C, L].
-        candidates: int8 [k, C, L], in one array or where they lie.
+        candidates: int8 [k, C, L].
         columns: of the grid; C is a multiple of it.
 
     Returns:
@@ -160,8 +131,6 @@ def agreement(query: Cells, candidates: Cells | ScatteredCells, columns: int, de
     if query.shape != candidates.shape[1:] or len(query) % columns:
         shapes = f"{list(query.shape)} and {list(candidates.shape[1:])}"
         raise ValueError(f"cells of {shapes} in {columns} columns cannot be compared")
-    if isinstance(candidates, ScatteredCells):
-        candidates = candidates.together()
     # numba would compile the loop again for arrays that are read-only or not contiguous.
     asked, shown = (np.require(cells, np.int8, ["C", "W"]) for cells in (query, candidates))
     sums: Array = squared_sums(asked, shown, columns, *definition.reach, np.float32(1 / RESOLUTION**2))

@@ -16,7 +16,7 @@ from core.errors import GoldenMismatch, InvalidModel, WrongVocabulary
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.judgement.verdict import Calibration
-from core.method.agreement import AgreementDefinition, Cells, ScatteredCells, agreement, local_descriptors
+from core.method.agreement import AgreementDefinition, Cells, agreement, local_descriptors
 from core.method.equations import Normalization
 from core.method.features import FeatureDefinition, FeatureExtractor, content_of
 from core.method.regions import Regions
@@ -138,7 +138,7 @@ class Encoder:
         stage = self.definition.agreement
         return 0 if stage is None else stage.candidates
 
-    def agreement(self, query: Cells, candidates: Cells | ScatteredCells) -> Array:
+    def agreement(self, query: Cells, candidates: Cells) -> Array:
         """What the second stage adds to the candidates' scores; int8 [C, L] and [k, C, L] to float32 [k]."""
         stage = self.definition.agreement
         if stage is None:

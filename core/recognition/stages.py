@@ -155,7 +155,7 @@ def agree(
         rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]
 
     def gains(positions: Positions) -> Array:
-        return encoder.agreement(local, snapshot.locals_in_place(rows[positions]))
+        return encoder.agreement(local, snapshot.locals_at(rows[positions]))
 
     for length in (HEAD, len(rows)):
         places = snapshot.whereabouts_at(rows[:length])

@@ -26,7 +26,6 @@ from core.errors import UnknownPlace
 from core.index import Codes, CodeTable
 from core.index.flat import Vectors, ranked, vectors
 from core.index.table import Block
-from core.method.agreement import ScatteredCells
 from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import RowReader
@@ -249,28 +248,18 @@ class Snapshot:
             IndexError: there is no such row.
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
-        return self.locals_in_place(rows).together()
-
-    def locals_in_place(self, rows: NDArray[np.int64]) -> ScatteredCells:
-        """The local descriptors of rows without copying those in memory; they must not be changed."""
         self._check_rows(rows)
-        numbers, offsets = np.divmod(rows, self.rows_per_segment)
-        used = sorted(set(numbers.tolist()))
-        held = [number for number in used if self.segments[number].held is not None]
-        blocks = [self.segments[number].local for number in held]
-        block = np.searchsorted(held, numbers)
-        if len(held) < len(used) or not used:
-            on_disk = np.flatnonzero(~np.isin(numbers, held))
-            blocks.append(self._locals_on_disk(rows[on_disk]))
-            block[on_disk], offsets[on_disk] = len(held), np.arange(len(on_disk))
-        return ScatteredCells(tuple(blocks), block, offsets)
-
-    def _locals_on_disk(self, rows: NDArray[np.int64]) -> Local:
-        if not len(rows):
-            return np.empty((0, *self.local_shape), np.int8)
-        assert self.row_reader is not None
-        with self.guard():
-            return self.row_reader.locals(rows, self._checksums(rows))
+        found = np.empty((len(rows), *self.local_shape), np.int8)
+        held = self._held[rows]
+        for position in np.flatnonzero(held).tolist():
+            number, offset = divmod(int(rows[position]), self.rows_per_segment)
+            found[position] = self.segments[number].local[offset]
+        if not held.all():
+            assert self.row_reader is not None
+            wanted = rows[~held]
+            with self.guard():
+                found[~held] = self.row_reader.locals(wanted, self._checksums(wanted))
+        return found
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """A copy of the descriptors of rows: float32 [k, D].

@@ -1,4 +1,4 @@
-"""The second stage on grids where the answer is known, and the cells that it compares where they lie in memory."""
+"""The second stage on grids where the answer is known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pydantic import ValidationError
 from core.method.agreement import (
     RESOLUTION,
     AgreementDefinition,
-    ScatteredCells,
     agreement,
     correspondences,
     local_descriptors,
@@ -96,33 +95,20 @@ def test_a_definition_that_makes_no_sense_is_refused(wrong: dict[str, object]) -
         AgreementDefinition.model_validate({**right, **wrong})
 
 
-def scattered(values: int) -> ScatteredCells:
-    random = np.random.default_rng(1)
-    blocks = tuple(random.integers(-90, 91, (n, ROWS * COLUMNS, values)).astype(np.int8) for n in (3, 1, 5))
-    return ScatteredCells(blocks, np.array([2, 0, 1, 2, 2]), np.array([4, 0, 0, 1, 4]))
-
-
-def test_together_they_stand_in_order() -> None:
-    lying = scattered(8)
-    assert lying.shape == (5, ROWS * COLUMNS, 8)
-    expected = [lying.blocks[block][row] for block, row in ((2, 4), (0, 0), (1, 0), (2, 1), (2, 4))]
-    np.testing.assert_array_equal(lying.together(), expected)
-    lying.together()[:] = 0
-    assert lying.blocks[2][4].any()
+def candidates(values: int) -> NDArray[np.int8]:
+    return np.random.default_rng(1).integers(-90, 91, (5, ROWS * COLUMNS, values)).astype(np.int8)
 
 
 @pytest.mark.parametrize("values", [8, 3])
-def test_they_agree_with_a_frame_as_copies_do(values: int) -> None:
-    lying = scattered(values)
-    stage = definition(values=values)
-    query = lying.blocks[1][0]
-    gains = agreement(query, lying, COLUMNS, stage)
-    assert gains[2] > gains[0] > 0
-    np.testing.assert_allclose(gains, agreement(query, lying.together(), COLUMNS, stage), rtol=1e-6)
-    backwards = lying.together()[::-1]
-    np.testing.assert_allclose(gains[::-1], agreement(query, backwards, COLUMNS, stage), rtol=1e-6)
-    query.flags.writeable = False
-    np.testing.assert_allclose(gains, agreement(query, lying, COLUMNS, stage), rtol=1e-6)
+def test_candidates_are_scored_each_for_itself(values: int) -> None:
+    """The compiled loop takes arrays in any order of memory, and such that must not be written to."""
+    shown, stage = candidates(values), definition(values=values)
+    query = shown[2].copy()
+    gains = agreement(query, shown, COLUMNS, stage)
+    assert gains[2] > gains[[0, 1, 3, 4]].max() > 0
+    np.testing.assert_allclose(gains[::-1], agreement(query, shown[::-1], COLUMNS, stage), rtol=1e-6)
+    query.flags.writeable = shown.flags.writeable = False
+    np.testing.assert_allclose(gains, agreement(query, shown, COLUMNS, stage), rtol=1e-6)
 
 
 def test_grids_that_are_not_alike_are_refused() -> None:
@@ -133,4 +119,4 @@ def test_grids_that_are_not_alike_are_refused() -> None:
         (np.zeros((24, 8), np.int8), 5),
     ):
         with pytest.raises(ValueError, match="cannot be compared"):
-            agreement(query, scattered(8), columns, stage)
+            agreement(query, candidates(8), columns, stage)

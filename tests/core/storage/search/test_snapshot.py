@@ -151,13 +151,6 @@ def test_local_descriptors_come_in_the_order_of_the_rows_and_are_a_copy() -> Non
     assert snapshot.locals_at(np.empty(0, np.int64)).shape == (0, *SHAPE)
 
 
-def test_local_descriptors_in_memory_are_not_copied_to_be_looked_at() -> None:
-    snapshot, rows = snapshot_of(11), np.array([10, 0, 4, 0])
-    lying = snapshot.locals_in_place(rows)
-    np.testing.assert_array_equal(lying.together(), snapshot.locals_at(rows))
-    assert all(any(block is segment.local for segment in snapshot.segments) for block in lying.blocks)
-
-
 @pytest.mark.parametrize("row", [-1, 6, 7, 8])
 def test_room_that_later_snapshots_use_is_nobodys(row: int) -> None:
     """Row 6 and 7 are there already, in memory that is shared with the later snapshot."""
