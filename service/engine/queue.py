@@ -18,7 +18,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.threads import cores, share_cores
 from service.engine.encoder_threads import AfterEncoding, Encoded, EncoderThreads, QueuedFrame, deadline_exceeded
-from service.errors.faults import ClientGone, QueueFull
+from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
 
 __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadline"]
@@ -52,7 +52,8 @@ class EncoderQueue:
         catalogue: the installed encoders.
         limits: the largest frame that is decoded.
         queue_length: the most requests that may have a place at one time.
-        threads: the number of threads of a forward pass; 0 leaves it to torch.
+        threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0 leaves the
+            number to torch.
     """
 
     def __init__(
@@ -128,10 +129,17 @@ class EncoderQueue:
             raise deadline_exceeded()
         if identity in self._loaded:
             return self._loaded[identity]
+        loading = asyncio.ensure_future(self.load(identity))
+        gone = asyncio.ensure_future(deadline.hung_up())
+        waited: set[asyncio.Future[Any]] = {loading, gone}
         try:
-            return await asyncio.wait_for(self.load(identity), deadline.seconds_left())
-        except TimeoutError:
-            raise deadline_exceeded() from None
+            await asyncio.wait(waited, timeout=deadline.seconds_left(), return_when=asyncio.FIRST_COMPLETED)
+            if loading.done():
+                return loading.result()
+            raise _gone() if gone.done() else deadline_exceeded()
+        finally:
+            loading.cancel()
+            gone.cancel()
 
     async def encode(
         self,
@@ -225,7 +233,9 @@ class EncoderQueue:
                     await asyncio.wait(open_)
                     continue
                 for future, _, _ in done:
-                    if future.exception() is None:
+                    if isinstance(error := future.exception(), DeadlineExceeded):  # in its turn, but too late
+                        raise error
+                    if error is None:
                         self._metrics.observe_stages(future.result().milliseconds)
                 yield [(i, _outcome(future)) for future, i, _ in done]
         finally:

@@ -66,7 +66,8 @@ class Exports:
         self._max_exports, self._seconds = settings.max_exports, settings.export_seconds
         self._exports: dict[tuple[str, str], Export] = {}
         """By the id of the map and the tag of the export file."""
-        self._under_way: dict[Map, asyncio.Task[Export]] = {}
+        self._under_way: dict[Map, tuple[object, asyncio.Task[Export]]] = {}
+        """Of the maps that are being written, with their state before it began; None if it was not known."""
         self._tags: weakref.WeakKeyDictionary[Map, tuple[object, str]] = weakref.WeakKeyDictionary()
         """The state of each map when it was last exported, and the tag of that export, whether it is kept or not."""
         self._creating = CapacityLimiter(1)  # each reads and writes a whole map
@@ -94,16 +95,26 @@ class Exports:
             UnknownMap, MapQuarantined: it was deleted meanwhile, or is damaged.
             StorageFull, StorageFailure.
         """
-        state = map_.exporter.state()
-        for export in self._exports.values():
-            if export.map is map_ and export.state is state and state is not None:
+        while True:
+            state = map_.exporter.state()
+            for export in self._exports.values():
+                if export.map is map_ and export.state is state and state is not None:
+                    return export
+            begun_with, task = self._under_way.get(map_, (None, None))
+            if task is None:
+                self._make_room()
+                task = asyncio.create_task(self._create(map_))
+                self._under_way[map_] = state, task
+                task.add_done_callback(lambda done: self._created(map_, done))
+            elif state is None or begun_with is not state:  # it may lack what was written since
+                await asyncio.wait([task])
+                continue
+            export = await asyncio.shield(task)  # other requests may wait for it, too
+            if self._keeps(export):  # and may have removed it since
                 return export
-        task = self._under_way.get(map_)
-        if task is None:
-            self._make_room()
-            task = self._under_way[map_] = asyncio.create_task(self._create(map_))
-            task.add_done_callback(lambda done: self._created(map_, done))
-        return await asyncio.shield(task)  # other requests may wait for it, too
+
+    def _keeps(self, export: Export) -> bool:
+        return self._exports.get((export.file.manifest.map.id, export.file.tag)) is export
 
     def _created(self, map_: Map, task: asyncio.Task[Export]) -> None:
         del self._under_way[map_]
@@ -111,7 +122,7 @@ class Exports:
             log.warning("the map %s could not be exported: %s", map_.record.id, error)
 
     def _make_room(self) -> None:
-        """Remove the export that was not read for the longest time if as many are kept as may be."""
+        """Remove the exports that were not read for the longest time until one more may be kept."""
         self._check_open()
         idle = sorted((export for export in self._exports.values() if not export.readers), key=lambda one: one.used)
         while len(self._exports) + len(self._under_way) >= self._max_exports:
@@ -128,6 +139,7 @@ class Exports:
         began = time.perf_counter()
 
         def work() -> tuple[object, Exported]:
+            self._check_open()
             map_.open()
             state = map_.exporter.state()  # read first, so that a change meanwhile is noticed
             self._folder.mkdir(exist_ok=True)
@@ -144,10 +156,11 @@ class Exports:
         export = self._exports.get((map_id, file.tag))
         if export is not None:  # the map is what it was before
             export.map, export.state = map_, state
+            self._renew(export)
             await to_thread.run_sync(_delete, file)
         else:
             export = self._exports[map_id, file.tag] = Export(map_, state, file)
-        self._renew(export)
+            self._renew(export)
         return export
 
     async def _make_space(self, size: int) -> None:
@@ -155,11 +168,12 @@ class Exports:
         and for what enrolments need.
 
         Raises:
-            StorageFull: it has not.
+            StorageFull: there would not be room without all of them; none was removed then.
         """
-        while shutil.disk_usage(self._folder).free < size + RESERVE:
+        self._check_open()
+        while (free := shutil.disk_usage(self._folder).free) < size + RESERVE:
             idle = [export for export in self._exports.values() if not export.readers]
-            if not idle:
+            if not idle or free + sum(export.file.size for export in idle) < size + RESERVE:
                 raise StorageFull(f"The disk has no room for the map as a file of {size} bytes beside the maps.")
             await self._remove(min(idle, key=lambda one: one.used))
 
@@ -199,13 +213,14 @@ class Exports:
         """Forget an export now; its file is gone when the returned future is done."""
         if export.expiry is not None:
             export.expiry.cancel()
-        self._exports.pop((export.file.manifest.map.id, export.file.tag), None)
+        if self._keeps(export):
+            del self._exports[export.file.manifest.map.id, export.file.tag]
         return asyncio.get_running_loop().run_in_executor(None, _delete, export.file)
 
     async def close(self) -> None:
         """Stop the exports that are being made, and remove all."""
         self._closing = True
-        for task in [*self._under_way.values()]:
+        for _, task in [*self._under_way.values()]:
             with suppress(Exception):
                 await task
         for export in [*self._exports.values()]:
@@ -227,7 +242,8 @@ class _MalformedRange(Exception):
 class ExportResponse(FileResponse):
     """An export file or the ranges of it that the request asks for; the export is kept until the response ends.
 
-    A range that cannot be read is passed over (RFC 9110, section 14.2).
+    A range that cannot be read is passed over (RFC 9110, section 14.2), and so is one with an If-Range other than the
+    tag of the file: a date says too little, as a map may change within a second.
 
     Raises:
         RangeNotSatisfiable: on sending, if a range begins after the end.
@@ -259,6 +275,9 @@ class ExportResponse(FileResponse):
             ended = reaches_end and message["type"] == "http.response.body" and not message.get("more_body")
 
         method = scope["state"]["method"]
+        unless = Headers(scope=scope).get("if-range")
+        if unless is not None and unless != self.headers["etag"]:
+            scope = _without_range(scope)
         if method == "HEAD":  # for which Range has no meaning
             scope = {**_without_range(scope), "method": method}
         try:

@@ -118,12 +118,13 @@ class Exporter:
                 manifest = self._planned(connection, ArchivedRecord.model_validate(record.model_dump()), layout)
                 tape = TarLayout(manifest, len(written(manifest)))
                 expect(tape.size)
-                with path.open("xb") as file:
-                    try:
+                file = path.open("xb")
+                try:
+                    with file:
                         return self._write(file, path, connection, manifest, tape, layout, advance)
-                    except BaseException:
-                        path.unlink(missing_ok=True)
-                        raise
+                except BaseException:
+                    path.unlink(missing_ok=True)
+                    raise
             finally:
                 if connection.in_transaction:  # SQLite may have ended it itself; that error is the one to report
                     connection.execute("ROLLBACK")
