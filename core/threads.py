@@ -1,4 +1,4 @@
-"""How the threads of torch, FAISS, OpenCV and NumPy share the cores.
+"""How the threads of torch, ONNX Runtime, FAISS, OpenCV and NumPy share the cores.
 
 The forward pass of a single frame uses all cores; everything else that is done for a frame takes so little time that
 a second thread would cost more than it saves.  Of several frames, each core takes whole ones (:func:`each`).
@@ -27,8 +27,8 @@ SPINS = "1000"
 def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
     """Let OpenMP's threads sleep soon after a parallel section; call this before torch or FAISS is imported.
 
-    By default they spin for a millisecond and more, and take cores from the search that follows a forward pass and
-    from other processes.  An ``OMP_WAIT_POLICY`` or ``GOMP_SPINCOUNT`` that the user has set stays.
+    By default they spin for a millisecond and more, and take cores from what follows and from other processes.  An
+    ``OMP_WAIT_POLICY`` or ``GOMP_SPINCOUNT`` that the user has set stays.
     """
     if "OMP_WAIT_POLICY" not in environment:
         environment.setdefault("GOMP_SPINCOUNT", SPINS)
@@ -53,7 +53,7 @@ def keep_numpy_single_threaded() -> None:
 
 
 def share_cores(threads: int) -> None:
-    """Let torch and FAISS use this many threads each, and OpenCV one, in this process.
+    """Let torch and FAISS use this many threads each, and OpenCV one, in this process; ONNX Runtime follows torch.
 
     Encoding and searching take turns, so each may use all of the cores.  OpenCV would only divide work that takes a
     tenth of a millisecond.

@@ -2,7 +2,7 @@
 
     coder = Coder.of(dimension)                                          # nothing is learnt from the map
     table = CodeTable.empty(coder).appended(coder.encode(descriptors))   # in memory, row by row
-    rows = table.shortlist(queries, count=100, allowed=mask)             # those worth an exact comparison
+    shortlists = table.shortlists(queries, count=100, allowed=mask)      # the rows worth an exact comparison
 
 Nothing here knows where descriptors or codes are kept.
 

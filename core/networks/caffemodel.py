@@ -123,7 +123,7 @@ def read_caffemodel(path: Path) -> CaffeNetwork:
     """Read the description of a network; its weights are read when they are needed.
 
     Raises:
-        InvalidModel: the file cannot be read or is damaged; or protobuf is not installed.
+        InvalidModel: the file cannot be read or is damaged.
     """
     contents = read_in_child(__name__, path, "network", framework="numpy")
     net: Part = contents.tree

@@ -36,7 +36,7 @@ def read_mat(path: Path) -> dict[str, Value]:
     array of the sides that MATLAB sees, at least two.
 
     Raises:
-        InvalidModel: it is of MATLAB's 7.3 format, no ``.mat`` file, or damaged; or SciPy is not installed.
+        InvalidModel: it is of MATLAB's 7.3 format, no ``.mat`` file, or damaged.
     """
     header = first_bytes(path, 128)
     if header.startswith((b"MATLAB 7.3", _HDF5)):

@@ -1,4 +1,4 @@
-"""Files of arrays that can be made again from the descriptors: codes, their coder, lists.
+"""Files of arrays that can be made again from the descriptors: codes, and their recall.
 
 A file is little-endian: magic, length of a description (uint32), the description as JSON, the arrays one after the
 other, CRC-32 of all before it.  The description names the kind of file, the descriptors from which it was made, and the

@@ -163,7 +163,11 @@ def evaluate(
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Write an HTML page with curves and images.", rich_help_panel=OUTPUT),
+        typer.Option(
+            metavar="DIR",
+            help="Write an HTML page with curves and images; needs the extra 'report'.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     scalability: Annotated[
         bool,
