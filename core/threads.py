@@ -36,7 +36,7 @@ def wait_briefly(environment: MutableMapping[str, str] = os.environ) -> None:
 
 def cores() -> int:
     """How many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    return len(os.sched_getaffinity(os.getpid())) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 @cache
@@ -75,8 +75,9 @@ def keep_to(number: int | None) -> None:
     """Let this thread run on one of the process's cores, or on any of them; only Linux offers this.
 
     Args:
-        number: of the core, from 0, modulo the number of cores.  None: any core, even if this thread was started by
-            one that is bound to a core, which it would otherwise share.
+        number: of the core, from 0, modulo the number of cores, if each of several threads is to have one of its own:
+            the system may leave two threads on one core for milliseconds while another is idle.  None: any core, even
+            if this thread was started by one that is bound to a core, which it would otherwise share.
     """
     if sys.platform == "linux":
         with suppress(OSError):
@@ -103,14 +104,9 @@ def use_threads(threads: int) -> None:
         library.set_num_threads(threads)  # OpenMP keeps this number for each thread
 
 
-def compute_alone(number: int | None = None) -> None:
-    """Let this thread compute without the help of others, which use the other cores.
-
-    Args:
-        number: of this thread, from 0, if each of several threads is to have a core of its own.  Otherwise the system
-            may leave two threads on one core for milliseconds while another core is idle.
-    """
-    keep_to(number)
+def compute_alone() -> None:
+    """Let this thread compute on any core, without the help of others."""
+    keep_to(None)
     use_threads(1)
 
 

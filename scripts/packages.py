@@ -27,7 +27,6 @@ SETTINGS = {
     "index-url": ("UV_DEFAULT_INDEX", " "),
     "extra-index-url": ("UV_INDEX", " "),
     "find-links": ("UV_FIND_LINKS", ","),
-    "no-index": ("UV_NO_INDEX", " "),
     "trusted-host": ("UV_INSECURE_HOST", " "),
     "cert": ("SSL_CERT_FILE", " "),
     "proxy": ("ALL_PROXY", " "),
@@ -57,26 +56,44 @@ def uv_settings(listing: str) -> dict[str, str]:
     return {"UV_INDEX_STRATEGY": "unsafe-best-match"} | {name: value for name, (_, value) in found.items()}
 
 
+def without_index(listing: str) -> bool:
+    """Whether pip is told to ask no index, by what ``pip config list`` has printed; uv has no variable for it."""
+    told = {name: ast.literal_eval(value) for name, _, value in (line.partition("=") for line in listing.splitlines())}
+    last = next((told[f"{section}.no-index"] for section in reversed(SECTIONS) if f"{section}.no-index" in told), "")
+    return str(last).lower() in ("1", "true", "yes", "on", "y", "t")
+
+
+class UnknownBackend(Exception):
+    """TORCH_BACKEND names no build of torch."""
+
+
 def install_by_uv(lock: Path, folder: Path) -> None:
     """Install torch and the lock's packages by a uv that is put into ``folder``.
 
     Raises:
+        UnknownBackend: uv knows no such build of torch.
         subprocess.CalledProcessError, OSError: uv cannot be had, or fails.
     """
     tool = ("--requirement", REQUIREMENTS / "installer.lock")
     subprocess.run([*PIP, "--target", folder, "--no-deps", "--require-hashes", *tool], check=True)
-    environment = {**uv_settings(pip_settings()), **os.environ}
+    listing = pip_settings()
+    environment = {**uv_settings(listing), **os.environ}
+    indexes = ("--no-index",) if without_index(listing) else ()
     torch = ("--requirement", REQUIREMENTS / "torch.lock")
     backend: tuple[str, ...] = ("--torch-backend", os.environ.get("TORCH_BACKEND", "cpu"))
 
     def uv(*arguments: str | Path, quiet: bool = False) -> subprocess.CompletedProcess[bytes]:
-        command = [folder / "bin" / "uv", "pip", "install", "--quiet", "--python", sys.executable, *arguments]
+        command = [folder / "bin" / "uv", "pip", "install", "--quiet", *indexes, "--python", sys.executable, *arguments]
         return subprocess.run(command, env=environment, check=not quiet, capture_output=quiet)
 
-    if uv("--no-deps", *backend, *torch, quiet=True).returncode:
+    first = uv("--no-deps", *backend, *torch, quiet=True)
+    if first.returncode:
+        why = first.stderr.decode(errors="replace").strip()
+        if "invalid value" in why:
+            raise UnknownBackend(why)
         print(
             f"The {backend[1]} build of torch cannot be had from PyTorch's own index. torch is the build that pip's"
-            " indexes have; if that is the CUDA build, it takes several GB.",
+            f" indexes have; if that is the CUDA build, it takes several GB. uv says: {' '.join(why.split())[:500]}",
             file=sys.stderr,
         )
         backend = ()
@@ -110,6 +127,9 @@ def main(profile: str) -> int:
         except (subprocess.CalledProcessError, OSError):
             print("uv could not install the packages; pip does it, which takes minutes.", file=sys.stderr)
             install_by_pip(lock)
+    except UnknownBackend as error:
+        print(f"TORCH_BACKEND names no build of torch. {error}", file=sys.stderr)
+        return 1
     except subprocess.CalledProcessError as error:
         print(f"The packages could not be installed: pip ended with status {error.returncode}.", file=sys.stderr)
         return 1

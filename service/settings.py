@@ -64,7 +64,12 @@ class Settings(BaseSettings):
         min_length=1,
         description="Encoder that is loaded at the start and used where no other is named.",
     )
-    threads: int = Field(default=0, ge=0, le=1024, description="Threads of one forward pass; 0 uses every core.")
+    threads: int = Field(
+        default=0,
+        ge=0,
+        le=1024,
+        description="How many frames are encoded at a time, each in a thread; 0 is one for each core.",
+    )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         default="auto",
         description="Precision of the forward pass. auto: a lower precision only if the descriptors stay the same, as "

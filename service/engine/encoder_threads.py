@@ -1,7 +1,7 @@
-"""The encoder's threads: one for each core, and each takes one waiting frame after the other.
+"""The encoder's threads, usually one for each core: each takes one waiting frame after the other.
 
 No frame waits for others.  A frame that finds nothing else to do has all cores in its forward pass; of several frames,
-each core takes whole ones, which wait for no other core.
+each thread takes whole ones, which wait for no other thread.
 """
 
 from __future__ import annotations
@@ -133,6 +133,8 @@ class EncoderThreads:
         """Add frames to the queue; bulk frames keep their order, and so do the others."""
         with self._changed:
             for frame in frames:
+                if frame.pixels > self._limits.max_pixels:  # its header may lie; decoding refuses it at once
+                    frame.pixels = 0
                 if self._closed:
                     frame.result.cancel()
                 else:
@@ -140,19 +142,20 @@ class EncoderThreads:
                     self._changed.notify()
 
     def _run(self, number: int) -> None:
-        keep_to(number if self._count == cores() else None)
+        one_each = self._count == cores()
         threads = 0
         while (taken := self._next()) is not None:
             frame, alone = taken
             wanted = self._count if alone else 1
-            if wanted != threads:
+            if wanted != threads:  # a thread that begins others has all cores, for they inherit its own
+                keep_to(number if one_each and wanted == 1 else None)
                 use_threads(threads := wanted)
             self._encode(frame)
             with self._changed:
                 self._at_work -= 1
                 self._pixels -= frame.pixels
                 if self._robots or self._bulk:  # which may have waited for these pixels
-                    self._changed.notify()
+                    self._changed.notify_all()
 
     def _next(self) -> tuple[QueuedFrame, bool] | None:
         """The next frame, and whether it has all cores; waits for one; None after ``close``."""

@@ -134,7 +134,7 @@ class Searches:
         self._waiting.setdefault(key, deque()).extend(parts)
         if self._running[key] < self._at_once:
             self._running[key] += 1
-            # Starting a little later lets the other frames of the same batch join the search.
+            # Starting a little later lets frames that were encoded at the same time join the search.
             # The search serves several requests, so it must not log under the id of this one.
             loop.call_soon(self._start, key, context=Context())
         if len(parts) == 1:

@@ -208,7 +208,7 @@ def encode_after_requests(
 ) -> list[Encoded | Exception]:
     """Encode the frames of a job after the requests that wait; blocks the job's thread.
 
-    The frames need no place in the queue, which is for requests, and share forward passes like bulk frames.
+    The frames need no place in the queue, which is for requests, and wait like bulk frames.
 
     Args:
         identity: the identity of the encoder.

@@ -14,7 +14,7 @@ import pytest
 import torch
 from threadpoolctl import ThreadpoolController
 
-from core.threads import SPINS, compute_alone, cores, each, share_cores, wait_briefly
+from core.threads import SPINS, compute_alone, cores, each, keep_to, share_cores, wait_briefly
 
 
 @pytest.mark.parametrize(
@@ -91,17 +91,17 @@ def test_threads_are_shared_out() -> None:
 def test_a_thread_keeps_to_its_core_and_what_it_begins_does_not() -> None:
     every = sorted(os.sched_getaffinity(0))
 
-    def begins(number: int | None) -> tuple[set[int], int, set[int]]:
-        with ThreadPoolExecutor(1, initializer=compute_alone, initargs=(number,)) as outer:
-            own = outer.submit(lambda: (os.sched_getaffinity(0), torch.get_num_threads())).result()
+    def begins(number: int | None) -> tuple[set[int], int, set[int], int]:
+        with ThreadPoolExecutor(1, initializer=keep_to, initargs=(number,)) as outer:
+            own = outer.submit(lambda: (os.sched_getaffinity(0), cores())).result()
 
-            def begin() -> set[int]:
+            def begin() -> tuple[set[int], int]:
                 with ThreadPoolExecutor(1, initializer=compute_alone) as inner:
-                    return inner.submit(os.sched_getaffinity, 0).result()
+                    return inner.submit(lambda: (os.sched_getaffinity(0), torch.get_num_threads())).result()
 
-            return *own, outer.submit(begin).result()
+            return *own, *outer.submit(begin).result()
 
     for number in range(len(every) + 1):
-        assert begins(number) == ({every[number % len(every)]}, 1, set(every))
-    assert begins(None) == (set(every), 1, set(every))
+        assert begins(number) == ({every[number % len(every)]}, len(every), set(every), 1)
+    assert begins(None) == (set(every), len(every), set(every), 1)
     assert os.sched_getaffinity(0) == set(every)

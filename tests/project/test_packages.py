@@ -17,31 +17,41 @@ ROOT = Path(__file__).parents[2]
 # Replaces Python, and the uv that it installs: each installation is a line in a log; the rest is real.
 STUB = """#!/bin/bash
 case "$*" in
-    *config*) echo "global.find-links='/wheels /more'" ;;
+    "-m pip config "*) echo "global.find-links='/wheels /more'"; [ ! -e "$LOG.pip" ] || cat "$LOG.pip" ;;
     *--target*)
-        [ ! -e "$LOG.no-uv" ] || exit 1
+        [ ! -e "$LOG.no_uv" ] || exit 1
         while [ "$1" != --target ]; do shift; done
         mkdir "$2/bin" && cp "$0" "$2/bin/uv" && echo "pip installer.lock" >>"$LOG" ;;
     *)
         tool=uv; [ "$1" != -m ] || tool=pip
-        case "$*" in *--torch-backend*) [ ! -e "$LOG.no-index" ] || exit 1; more=" $TORCH_BACKEND" ;; esac
+        case "$*" in *--torch-backend*)
+            [ ! -e "$LOG.$TORCH_BACKEND" ] || { cat "$LOG.$TORCH_BACKEND" >&2; exit 1; }
+            more=" $TORCH_BACKEND" ;;
+        esac
         [ "$tool" = pip ] || [ "$UV_FIND_LINKS" = /wheels,/more ] || exit 1
         [ ! -e "$LOG.full" ] || exit 1
+        case "$*" in *--no-index*) more="${more:-} without an index" ;; esac
         echo "$tool ${@: -1:1}${more:-}" | sed "s|/.*/||" >>"$LOG" ;;
 esac
 """
 
 
-def installed(folder: Path, *missing: str) -> tuple[list[str], str, int]:
-    """What ``packages.py service`` installs, what it says, and its status; ``missing`` is what it does not find."""
+def installed(folder: Path, **given: str) -> tuple[list[str], str, int]:
+    """What ``packages.py service`` installs, what it says, and its status.
+
+    Args:
+        given: ``no_uv``: uv cannot be had; ``full``: nothing can be installed; ``cpu``: why uv does not find that build
+            of torch; ``pip``: more of pip's configuration.
+    """
     stub, log = folder / "python", folder / "log"
     stub.write_text(STUB)
     stub.chmod(0o755)
     log.touch()
-    for what in missing:
-        Path(f"{log}.{what}").touch()
+    for what, text in given.items():
+        Path(f"{log}.{what}").write_text(text)
     code = f"import sys; sys.executable = {str(stub)!r}; from scripts.packages import main; sys.exit(main('service'))"
-    environment = {**os.environ, "LOG": str(log), "TORCH_BACKEND": "cpu", "PYTHONPATH": str(ROOT)}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("UV_", "PIP_"))}
+    environment |= {"LOG": str(log), "TORCH_BACKEND": "cpu", "PYTHONPATH": str(ROOT)}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     return log.read_text().splitlines(), run.stderr, run.returncode
 
@@ -53,19 +63,39 @@ def test_uv_installs_the_cpu_build_of_torch_first(tmp_path: Path) -> None:
 
 
 def test_without_the_index_of_pytorch_torch_is_what_pip_would_find(tmp_path: Path) -> None:
-    lines, said, status = installed(tmp_path, "no-index")
+    lines, said, status = installed(tmp_path, cpu="error: no address\n  known")
     assert lines == ["pip installer.lock", "uv torch.lock", "uv service.lock", "uv torch.lock"]
-    assert "The cpu build of torch cannot be had" in said and status == 0
+    assert "The cpu build of torch cannot be had" in said and "uv says: error: no address known" in said
+    assert status == 0
+
+
+def test_a_build_of_torch_that_there_is_not_is_refused(tmp_path: Path) -> None:
+    lines, said, status = installed(tmp_path, cpu="error: invalid value 'cpu' for '--torch-backend'")
+    assert lines == ["pip installer.lock"]
+    assert "TORCH_BACKEND names no build of torch" in said and status == 1
+
+
+@pytest.mark.parametrize(
+    ("configured", "more"),
+    [
+        ("global.no-index='true'", " without an index"),
+        ("global.no-index='true'\n:env:.no-index='0'", ""),
+        ("download.no-index='true'", ""),
+    ],
+)
+def test_uv_asks_no_index_if_pip_is_to_ask_none(tmp_path: Path, configured: str, more: str) -> None:
+    lines, _, status = installed(tmp_path, pip=configured)
+    assert lines[2] == f"uv service.lock{more}" and status == 0
 
 
 def test_without_uv_pip_installs(tmp_path: Path) -> None:
-    lines, said, status = installed(tmp_path, "no-uv")
+    lines, said, status = installed(tmp_path, no_uv="")
     assert lines == ["pip torch.lock", "pip service.lock", "pip torch.lock"]
     assert "uv could not install" in said and status == 0
 
 
 def test_a_failure_is_told(tmp_path: Path) -> None:
-    lines, said, status = installed(tmp_path, "full")
+    lines, said, status = installed(tmp_path, full="")
     assert lines == ["pip installer.lock"]
     assert "could not be installed" in said and status == 1
 

@@ -7,6 +7,8 @@ import json
 import subprocess
 import sys
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +54,15 @@ def check(server: Server, expected: dict[str, Any], pictures: Path) -> None:
         assert server.client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"
 
 
+@contextmanager
+def stopped_at_the_end(server: Server) -> Iterator[Server]:
+    try:
+        yield server
+    finally:
+        if server.process.poll() is None:
+            server.kill()
+
+
 def test_it_is_used_as_it_is(tmp_path: Path) -> None:
     expected = unpacked(tmp_path)
     subprocess.run([sys.executable, ROOT / "examples" / "make_pictures.py", tmp_path / "pictures"], check=True)
@@ -62,17 +73,19 @@ def test_it_is_used_as_it_is(tmp_path: Path) -> None:
     assert from_bytes(session.state).frames == expected["session"]["frames"]
     store.close()
 
-    server = Server(tmp_path, key=expected["key"]).wait()
-    counted = server.client.get("/v1/maps/lab/health").json()["answers"]
-    assert counted["queries"] == expected["queries"]
-    check(server, expected, pictures)
-    assert server.client.get("/v1/maps/lab/places/yard/thumbnail").content.startswith(b"\xff\xd8")
-    assert server.enrol("packed", "street", (pictures / "camera" / "4-street.jpg").read_bytes()).status_code == 201
-    server.kill()
+    with stopped_at_the_end(Server(tmp_path, key=expected["key"])) as server:
+        server.wait()
+        counted = server.client.get("/v1/maps/lab/health").json()["answers"]
+        assert counted["queries"] == expected["queries"]
+        check(server, expected, pictures)
+        assert server.client.get("/v1/maps/lab/places/yard/thumbnail").content.startswith(b"\xff\xd8")
+        assert server.enrol("packed", "street", (pictures / "camera" / "4-street.jpg").read_bytes()).status_code == 201
+        server.kill()
 
-    server = Server(tmp_path, key=expected["key"]).wait()
-    assert list(server.places("packed")) == [place["id"] for place in expected["places"]["packed"]] + ["street"]
-    for map_id in expected["maps"]:
-        report = server.client.post(f"/v1/maps/{map_id}/verify").json()
-        assert (report["ok"], report["problems"]) == (True, [])
-    assert server.stop() == 0
+    with stopped_at_the_end(Server(tmp_path, key=expected["key"])) as server:
+        server.wait()
+        assert list(server.places("packed")) == [place["id"] for place in expected["places"]["packed"]] + ["street"]
+        for map_id in expected["maps"]:
+            report = server.client.post(f"/v1/maps/{map_id}/verify").json()
+            assert (report["ok"], report["problems"]) == (True, [])
+        assert server.stop() == 0

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from core.errors import NotAnImage, TruncatedImage
+from core.errors import InvalidImage, NotAnImage, TruncatedImage
 from core.frames.images import Limits, decode
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
@@ -24,13 +24,14 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.threads import cores
 from service.engine import encoder_threads
-from service.engine.encoder_threads import BULK_SHARE, Encoded, EncoderThreads, QueuedFrame
+from service.engine.encoder_threads import BULK_SHARE, MOST_PIXELS, Encoded, EncoderThreads, QueuedFrame
 from service.engine.queue import AHEAD, EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server
+from tests.service.wire import eventually
 
 UPPER_HALF = Mask(polygons=(((0, 0), (1, 0), (1, 0.5), (0, 0.5)),))
 
@@ -85,9 +86,7 @@ class Watched:
 
     def wait_until_idle(self) -> None:
         """Wait until the thread that has answered is free again."""
-        until = time.monotonic() + 30
-        while self.threads._at_work and time.monotonic() < until:
-            time.sleep(0.001)
+        assert eventually(lambda: not self.threads._at_work, every=0.001)
 
     def put_together(self, frames: Sequence[QueuedFrame]) -> None:
         """Let the frames wait until all of them do."""
@@ -216,39 +215,57 @@ def test_robots_come_first_and_bulk_keeps_a_share(watched: Watched) -> None:
 
 
 def test_the_pixels_decoded_at_one_time_are_bounded(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    if torch.get_num_threads() == 1:
+        pytest.skip("one thread never has two frames")
     lock, at_once, most = threading.Lock(), 0, 0
+    encode = watched.threads._encode
 
-    def counted(decode: Callable[..., Pixels]) -> Callable[..., Pixels]:
-        def work(data: bytes, limits: Limits) -> Pixels:
-            nonlocal at_once, most
-            with lock:
-                at_once += 1
-                most = max(most, at_once)
-            made = decode(data, limits)
-            with lock:
-                at_once -= 1
-            return made
-
-        return work
+    def counted(frame: QueuedFrame) -> None:
+        nonlocal at_once, most
+        with lock:
+            at_once += 1
+            most = max(most, at_once)
+        encode(frame)
+        with lock:
+            at_once -= 1
 
     frames = [watched.frame(seed) for seed in range(7)]
     frames.append(watched.frame(9, data=encoded(scene(9, 1280, 960))))  # by itself over the limit
     go = watched.hold()
     monkeypatch.setattr(encoder_threads, "MOST_PIXELS", 2 * 320 * 240 - 1)
-    monkeypatch.setattr(encoder_threads, "decode", counted(decode))
+    monkeypatch.setattr(watched.threads, "_encode", counted)
     watched.threads.put(frames)
     go()
     answers(frames)
     assert most == 1
+    monkeypatch.setattr(encoder_threads, "MOST_PIXELS", MOST_PIXELS)
+    watched.put_together(more := [watched.frame(seed) for seed in range(7)])
+    answers(more)
+    assert most > 1
+
+
+def test_a_header_that_promises_too_many_pixels_holds_nobody_up(watched: Watched) -> None:
+    lies = bytearray(jpeg(0))
+    size = lies.index(b"\xff\xc0") + 5
+    lies[size : size + 4] = b"\xff" * 4
+    frame = watched.frame(0, data=bytes(lies))
+    assert frame.pixels == 65535 * 65535
+    watched.threads.put([frame])
+    assert isinstance(frame.result.exception(timeout=60), InvalidImage)
+    assert frame.pixels == 0
 
 
 def test_waiting_frames_are_cancelled_at_the_end(catalogue: EncoderCatalogue) -> None:
     watched = Watched(catalogue)
     go = watched.hold()
     watched.threads.put([frame := watched.frame(0)])
-    threading.Timer(0.2, go).start()
-    watched.threads.close()
-    assert frame.result.cancelled()
+    closing = threading.Thread(target=watched.threads.close)
+    closing.start()
+    assert eventually(frame.result.cancelled)
+    assert closing.is_alive(), "it waits for the frames that have begun"
+    go()
+    closing.join(60)
+    assert not closing.is_alive()
     watched.threads.put([after := watched.frame(0)])
     assert after.result.cancelled()
 
@@ -312,9 +329,46 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
         deadline = RequestDeadline(deadline.at, stays)
     with pytest.raises(fault):
         await collected(queue, [jpeg(0)] * (AHEAD + 5), deadline)
-    assert not queue._threads._robots and all(frame.result.cancelled() for frame in queue._threads._bulk)
+    assert not queue._threads._robots and queue._threads._bulk
+    assert all(frame.result.cancelled() for frame in queue._threads._bulk)
     free.set()
     await queue.encode(encoder.identity, jpeg(1), RequestDeadline(time.monotonic() + 60, stays))
+
+
+@pytest.mark.anyio
+async def test_a_frame_that_is_too_late_ends_its_request(queue: EncoderQueue) -> None:
+    """The deadline passes while the caller is busy with earlier frames; the last ones find it over in their turn."""
+    await queue.load(identity := EncoderCatalogue().resolve(DEFAULT_ENCODER))
+    at = time.monotonic() + 1
+    with pytest.raises(DeadlineExceeded):
+        async for _ in queue.encode_many(identity, [jpeg(0)] * (AHEAD + 2), RequestDeadline(at, stays)):
+            await asyncio.sleep(max(0.0, at - time.monotonic()))
+            while queue._threads._bulk:
+                await asyncio.sleep(0.01)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(("seconds", "fault"), [(60, ClientGone), (0.1, DeadlineExceeded)])
+async def test_nobody_waits_for_an_encoder_in_vain(
+    queue: EncoderQueue, monkeypatch: pytest.MonkeyPatch, seconds: float, fault: type[Exception]
+) -> None:
+    free = threading.Event()
+    load = queue._load
+
+    def slow(identity: str) -> Encoder:
+        free.wait(60)
+        return load(identity)
+
+    async def leaves() -> None:
+        if fault is not ClientGone:
+            await stays()
+
+    monkeypatch.setattr(queue, "_load", slow)
+    identity = EncoderCatalogue().resolve(DEFAULT_ENCODER)
+    with pytest.raises(fault):
+        await queue.encode(identity, jpeg(0), RequestDeadline(time.monotonic() + seconds, leaves))
+    free.set()
+    await queue.encode(identity, jpeg(0), RequestDeadline(time.monotonic() + 60, stays))
 
 
 # Over HTTP

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import threading
 from collections import namedtuple
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass
@@ -15,8 +16,10 @@ from starlette.types import Message
 
 from core.errors import StorageFull
 from core.storage import Atlas, Map, MapSettings
+from core.storage.archives.exporter import Advance, Expect, Exported
 from service.errors.faults import RangeNotSatisfiable, TooManyExports
 from service.maps.exports import FOLDER, Export, ExportResponse, Exports
+from service.places.staging import RESERVE
 from service.settings import Settings
 from tests.service.engines import ENCODER, enrolments
 
@@ -116,6 +119,7 @@ def test_a_range(run: Run, header: str, start: int, stop: int | None) -> None:
         ("HEAD", {"range": "bytes=5-"}),
         ("HEAD", {"range": "bytes=99999999-"}),
         ("GET", {"range": "bytes=5-", "if_range": '"another"'}),
+        ("GET", {"range": "bytes=5-", "if_range": "its date"}),
         *(("GET", {"range": given}) for given in ("", "bytes=", "bytes=-", "bytes=5-4", "lines=1-2", "bytes=a-b", "x")),
         ("GET", {"range": "bytes=" + "9" * 5000 + "-"}),
     ],
@@ -126,6 +130,8 @@ def test_what_names_no_range_of_this_file_is_answered_with_all_of_it(
     async def work(place: Place) -> None:
         export = await place.exports.create(place.maps["a"])
         whole = export.file.path.read_bytes()
+        if headers.get("if_range") == "its date":  # a map may change twice within its second
+            headers["if_range"] = (await place.sent(export))[1]["last-modified"]
         status, answered, body = await place.sent(export, method, **headers)
         assert (status, body) == (200, whole if method == "GET" else b"")
         assert answered["content-length"] == str(len(whole)) and answered["accept-ranges"] == "bytes"
@@ -177,6 +183,54 @@ def test_a_map_that_has_not_changed_is_written_once(run: Run) -> None:
     run(work)
 
 
+def test_what_was_acknowledged_before_a_download_began_is_in_it(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another download of the same map is being written then, and does not have it."""
+
+    async def work(place: Place) -> None:
+        a, begun, free = place.maps["a"], threading.Event(), threading.Event()
+        write = a.exporter.write
+
+        def slow(path: Path, advance: Advance, expect: Expect) -> Exported:
+            def waiting(written: int) -> None:
+                begun.set()
+                assert free.wait(30)
+                advance(written)
+
+            return write(path, waiting, expect)
+
+        monkeypatch.setattr(a.exporter, "write", slow)
+        first = asyncio.create_task(place.exports.create(a))
+        assert await asyncio.to_thread(begun.wait, 30)
+        a.enrol(enrolments(7, 1, "later", "monday"))
+        others = [asyncio.create_task(place.exports.create(a)) for _ in range(2)]
+        await asyncio.sleep(0)
+        free.set()
+        assert (await first).file.manifest.places == 3
+        later, same = await asyncio.gather(*others)
+        assert later is same and later.file.manifest.places == 4
+
+    run(work)
+
+
+def test_one_that_was_removed_before_it_was_read_is_written_again(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work(place: Place) -> None:
+        create, made = place.exports._create, list[Export]()
+
+        async def removed_at_once(map_: Map) -> Export:
+            made.append(export := await create(map_))
+            if len(made) == 1:
+                await place.exports._remove(export)
+            return export
+
+        monkeypatch.setattr(place.exports, "_create", removed_at_once)
+        export = await place.exports.create(place.maps["a"])
+        assert export is made[1] and export.file.path.exists()
+        place.exports._expire(made[0])  # whose id and tag are those of the second
+        assert place.exports.find("a", [export.file.tag]) is export
+
+    run(work)
+
+
 def test_the_one_that_was_not_read_for_longest_makes_room(run: Run) -> None:
     async def work(place: Place) -> None:
         made = [await place.exports.create(place.maps[name]) for name in ("a", "b", "c")]
@@ -195,7 +249,7 @@ def test_the_one_that_was_not_read_for_longest_makes_room(run: Run) -> None:
 
 def test_a_full_disk_costs_idle_exports_first(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(place: Place) -> None:
-        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 41, 0, 0 if place.files else 1 << 40))
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 41, 0, RESERVE + 1 if place.files else 1 << 40))
         first = await place.exports.create(place.maps["a"])
         release = place.exports.hold(first)
         with pytest.raises(StorageFull, match="no room for the map as a file"):
@@ -208,14 +262,25 @@ def test_a_full_disk_costs_idle_exports_first(run: Run, monkeypatch: pytest.Monk
     run(work)
 
 
+def test_exports_that_cannot_make_enough_room_stay(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work(place: Place) -> None:
+        first = await place.exports.create(place.maps["a"])
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(1 << 41, 0, RESERVE - 1))
+        place.maps["b"].enrol(enrolments(7, 40, "more", "monday"))
+        with pytest.raises(StorageFull, match="no room for the map as a file"):
+            await place.exports.create(place.maps["b"])
+        assert place.files == {first.file.path}
+
+    run(work)
+
+
 def test_it_goes_when_it_was_not_used_for_its_time(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     async def work(place: Place) -> None:
-        monkeypatch.setattr(place.exports, "_seconds", 0.01)
         export = await place.exports.create(place.maps["a"])
-        release, timer = place.exports.hold(export), export.expiry
-        while export.expiry is timer:  # until the time is over
-            await asyncio.sleep(0.01)
-        assert export.file.path.exists(), "it is being read"
+        release = place.exports.hold(export)
+        monkeypatch.setattr(place.exports, "_seconds", 0.01)
+        place.exports._expire(export)
+        assert place.exports.find("a", [export.file.tag]) is export, "it is being read"
         release(False)
         await place.settled(set())
 
