@@ -73,7 +73,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Structure:
-    """What a walk through a whole file found.
+    """What a walk through a file found; of a JPEG file, through what is before its first scan.
 
     exif: the EXIF block (a TIFF file of its own), or None.
     coded: of a JPEG file, where the data of its first scan begins.
@@ -147,11 +147,6 @@ def read_structure(data: bytes, header: Header) -> Structure:
             return Structure(_bare(_check_webp(data)))
 
 
-def check_structure(data: bytes, header: Header) -> bytes | None:
-    """The EXIF block of a file, or None without one; errors as for :func:`read_structure`."""
-    return read_structure(data, header).exif
-
-
 def _bare(exif: bytes | None) -> bytes | None:
     return exif.removeprefix(EXIF_PREFIX) if exif is not None else None
 
@@ -159,7 +154,7 @@ def _bare(exif: bytes | None) -> bytes | None:
 def find_exif(data: bytes) -> bytes | None:
     """The EXIF block of an image file; None if it has none or its parts are damaged."""
     try:
-        return check_structure(data, read_header(data))
+        return read_structure(data, read_header(data)).exif
     except InvalidImage:
         return None
 
@@ -217,16 +212,18 @@ def _read_jpeg_header(data: bytes) -> Header:
 
 
 def _check_jpeg(data: bytes) -> Structure:
-    exif, scans, segment = None, 0, None
+    exif, segment, colours, progressive = None, None, 0, False
     for segment in _walk_jpeg(data):
         if segment.marker == _APP1 and exif is None and data.startswith(EXIF_PREFIX, segment.start, segment.end):
             exif = data[segment.start : segment.end]
-        elif segment.marker in _PROGRESSIVE_FRAMES:
-            scans = data.count(bytes([0xFF, _SOS]), segment.end)
-    if scans > MAX_JPEG_SCANS:
-        raise NotAnImage(f"The JPEG file has more than {MAX_JPEG_SCANS} scans.")
-    if segment is None or segment.marker != _SOS:
+        elif segment.marker in _FRAMES and segment.end - segment.start >= 6:
+            colours, progressive = data[segment.start + 5], segment.marker in _PROGRESSIVE_FRAMES
+    if segment is None or segment.marker != _SOS or segment.start == segment.end:
         raise NotAnImage("The JPEG file is damaged: it has no image data.")
+    # Unless the first scan has all colours at once, decoders read on to the last scan, and each takes them a pass.
+    reads_on = progressive or data[segment.start] < colours
+    if reads_on and data.count(bytes([0xFF, _SOS]), segment.start) >= MAX_JPEG_SCANS:
+        raise NotAnImage(f"The JPEG file has more than {MAX_JPEG_SCANS} scans.")
     return Structure(_bare(exif), segment.end)
 
 

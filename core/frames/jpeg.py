@@ -35,6 +35,8 @@ _STRETCH_END = re.compile(rb"(?=\xff[\x01-\xcf\xd8-\xfe])")
 """Before a marker that ends a stretch of coded data: of all but restarts."""
 
 _RESTART = re.compile(rb"\xff([\xd0-\xd7])")
+_MOST_STRETCHES, _MOST_RESTARTS = 1024, 65_536
+"""Of a file that is decoded twice; noise behind each takes memory."""
 
 
 def decode_jpeg(data: bytes, shape: tuple[int, int], coded: int, tolerant: Callable[[bytes], Pixels | None]) -> Pixels:
@@ -70,12 +72,17 @@ def decode_jpeg(data: bytes, shape: tuple[int, int], coded: int, tolerant: Calla
 
 
 def _with_other_endings(data: bytes, start: int) -> bytes | None:
-    """The file with noise behind each stretch of coded data; None without an end or with a gap between restarts."""
+    """The file with noise behind each stretch of coded data; None without an end, with a gap between restarts, or with
+    more stretches or restarts than a camera writes.
+    """
     end = data.find(_EOI, start)
-    if end < 0:
+    if end < 0 or sum(data.count(bytes([0xFF, 0xD0 + number]), start, end) for number in range(8)) > _MOST_RESTARTS:
         return None
     parts = [data[:start]]
-    for stretch in _STRETCH_END.split(data[start:end]):
+    stretches = _STRETCH_END.split(data[start:end], maxsplit=_MOST_STRETCHES)
+    if len(stretches) > _MOST_STRETCHES:
+        return None
+    for stretch in stretches:
         restarts = [marker[0] - 0xD0 for marker in _RESTART.findall(stretch)]
         if any(number != place % 8 for place, number in enumerate(restarts)):
             return None

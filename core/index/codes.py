@@ -78,15 +78,15 @@ class Coder:
         Raises:
             ValueError: they have another number of values.
         """
-        parts = [self.nothing(0)]
+        parts = [self.blank(0)]
         for start in range(0, max(1, len(descriptors)), _AT_ONCE):
             if len(turned := self.rotated(descriptors[start : start + _AT_ONCE])):
                 with in_one_thread():
                     parts.append(self._empty.sa_encode(turned))
         return np.concatenate(parts)
 
-    def nothing(self, n: int) -> Codes:
-        """Of ``n`` rows that have no descriptor any more, and are never asked for."""
+    def blank(self, n: int) -> Codes:
+        """Codes for ``n`` rows that have no descriptor any more and are never asked for; with 0 an empty array."""
         return np.zeros((n, self.bytes_per_place), np.uint8)
 
     def decoded(self, codes: Codes, count: int) -> Array:

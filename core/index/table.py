@@ -145,7 +145,7 @@ class CodeTable:
 
     def codes(self, start: int, stop: int) -> Codes:
         """A copy of the codes of rows start … stop."""
-        parts = [self.coder.nothing(0)]
+        parts = [self.coder.blank(0)]
         for block in self.blocks:
             rows = slice(max(0, start - block.first), max(0, min(block.used, stop - block.first)))
             parts.append(stored(block.codes)[rows])
@@ -189,19 +189,26 @@ class CodeTable:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Whether so many rows are in full blocks without a scan that :meth:`joined` makes a larger one of them."""
-        loose = sum(block.used for block in self.blocks if block.scan is None and block.is_full)
-        return loose >= LOOSE_ROWS and self.coder.width >= 2 * SCANNED_VALUES
+        """Whether so many rows are in blocks that :meth:`joined` makes a larger one of them."""
+        return sum(block.used for block in self.blocks if block.is_full and self._is_small(block)) >= LOOSE_ROWS
+
+    @property
+    def _can_scan(self) -> bool:
+        return self.coder.width >= 2 * SCANNED_VALUES
+
+    def _is_small(self, block: Block) -> bool:
+        """Whether a block would better be part of a larger one: it has no scan, or too few rows where none has."""
+        return block.scan is None if self._can_scan else block.used < LOOSE_ROWS
 
     def joined(self, progress: Progress = _untold) -> Block | None:
-        """A block that can take the place of some that are not scanned; None while these have few rows.
+        """A block that can take the place of some smaller ones; None while these have few rows.
 
         Args:
             progress: is called with the rows done and all rows; what it raises ends the work.
         """
         if not self.is_loose:
             return None
-        start = next(number for number, block in enumerate(self.blocks) if block.scan is None)
+        start = next(number for number, block in enumerate(self.blocks) if self._is_small(block))
         if start and self.blocks[start - 1].used + self.blocks[start].used <= LARGEST_BLOCK:
             start -= 1
         first, stop = self.blocks[start].first, self.blocks[start].first
@@ -209,12 +216,14 @@ class CodeTable:
             if not block.is_full or block.first + block.used - first > LARGEST_BLOCK:
                 break
             stop = block.first + block.used
-        return self._scanned(first, stop, progress)
+        return self._larger(first, stop, progress)
 
-    def _scanned(self, first: int, stop: int, progress: Progress) -> Block:
-        """A new block of the rows first … stop, with a scan."""
+    def _larger(self, first: int, stop: int, progress: Progress) -> Block:
+        """A new block of the rows first … stop, with a scan if descriptors are long enough for one."""
         index = self.coder.index(stop - first)
         stored(index)[:] = self.codes(first, stop)
+        if not self._can_scan:
+            return Block(first, stop - first, index)
         lists = faiss.IndexFlatIP(SCANNED_VALUES)
         lists.add(np.zeros((1, SCANNED_VALUES), np.float32))  # the centre of the only list
         scan = faiss.IndexIVFRaBitQFastScan(lists, SCANNED_VALUES, 1, faiss.METRIC_INNER_PRODUCT)

@@ -1,7 +1,8 @@
 """The equations of the thesis as plain NumPy, in the order in which they turn a layer's activations into a match.
 
-This module says what is computed; it is written to be read and to try things out in a notebook.  The encoder computes
-the same values with compiled loops (``core.kernels``), which the tests hold equal to these functions.  Numbers 3.x are
+This module says what is computed; it is written to be read and to try things out in a notebook.  The encoder calls
+most of these functions; regions and what is summed over them come from compiled loops (``core.kernels``), which the
+tests hold equal to the functions here.  Numbers 3.x are
 of chapter 3 (Region-VLAD, one layer), numbers 4.x of chapter 4 (M-Region-VLAD, several layers).  The vocabulary of
 equations 3.6 and 4.6 is trained in ``vocabulary.py``; equation 4.15 is a sum of times.
 

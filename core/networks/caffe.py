@@ -200,7 +200,7 @@ def _translate_convolution(layer: CaffeLayer) -> Convolution:
 def _translate_pooling(layer: CaffeLayer) -> Pooling:
     part = layer.part("pooling")
     method, rounding = part.get("method", 0), part.get("rounding", 0)
-    if method > 1 or rounding > 1:
+    if method not in (0, 1) or rounding not in (0, 1):
         raise InvalidModel(f"The network's {layer} pools in a way that cannot be imported.")
     pooling = Pooling(
         name=layer.name,

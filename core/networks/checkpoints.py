@@ -87,8 +87,10 @@ def _read(path: Path) -> tuple[None, dict[str, Tensor]]:
     """The tensors of a checkpoint by their joined names."""
     try:
         with torch.serialization.safe_globals(_NUMPY):
-            found = torch.load(path, map_location="cpu", weights_only=True)  # noqa: TID251 runs no code
-    except MemoryError:
+            tensors = _flatten(torch.load(path, map_location="cpu", weights_only=True))  # noqa: TID251 runs no code
+        plain = torch.contiguous_format
+        return None, {name: tensor.detach().clone(memory_format=plain) for name, tensor in tensors.items()}
+    except (MemoryError, InvalidModel):
         raise
     except Exception as error:  # of damaged files, torch raises whatever its parsers do
         if "allocate" in str(error):
@@ -99,8 +101,6 @@ def _read(path: Path) -> tuple[None, dict[str, Tensor]]:
         raise InvalidModel(
             f"The checkpoint holds {holds}; save the network's state_dict by torch.save and give that file."
         ) from error
-    plain = torch.contiguous_format
-    return None, {name: tensor.detach().clone(memory_format=plain) for name, tensor in _flatten(found).items()}
 
 
 def _flatten(root: Any) -> dict[str, Tensor]:

@@ -11,23 +11,24 @@ from core.networks.network import Convolution, Layer, Normalization, Pooling, Re
 OPSET, IR_VERSION = 17, 8
 """Versions of the operators and of the format: old enough for every ONNX Runtime that the project allows."""
 
-IMAGES = "images"
+IMAGES, CHANNELS_FIRST = "the images", "the images, channels first"
+"""Names that no layer has, for layers' names are without spaces."""
 
 
 def onnx_graph(network: ShallowNetwork) -> ModelProto:
     """The layers and weights of a network.
 
-    The graph's input ``images`` is float32 [B, H, W, 3].  It has one output for each of the network's, in that order:
+    The graph's input ``IMAGES`` is float32 [B, H, W, 3].  It has one output for each of the network's, in that order:
     float32 [B, X, Y, K], rectified as :meth:`ShallowNetwork.forward` gives it.
     """
-    nodes = [helper.make_node("Transpose", [IMAGES], ["nchw"], perm=[0, 3, 1, 2])]
-    values, convolution, found = "nchw", "", {}
+    nodes = [helper.make_node("Transpose", [IMAGES], [CHANNELS_FIRST], perm=[0, 3, 1, 2])]
+    values, rectified, found = CHANNELS_FIRST, "", {}
     for layer in network.definition.layers:
         nodes.append(_node(layer, values))
         values = layer.name
         if not isinstance(layer, Relu):
-            convolution = layer.name if isinstance(layer, Convolution) else ""
-        found[convolution or layer.name] = values  # a rectifier after a convolution replaces it
+            rectified = layer.name
+        found[rectified] = values  # a rectifier replaces what is before it
     outputs = [f"output {index}" for index in range(len(network.outputs))]
     for name, output in zip(network.outputs, outputs, strict=True):
         nodes.append(helper.make_node("Transpose", [found[name]], [output], perm=[0, 2, 3, 1]))

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -82,8 +82,8 @@ def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["
     size = len(first_bytes(path, 1)) and path.stat().st_size
     if not 0 < size <= MAX_FILE:
         raise InvalidModel(f"{path.name} has {size} bytes; from 1 to {MAX_FILE} are read.")
-    with tempfile.TemporaryDirectory(prefix="placerec-import-") as folder:
-        target = Path(folder) / "contents.safetensors"
+    with _temporary_folder() as folder:
+        target = folder / "contents.safetensors"
         memory = str(SPARE_MEMORY + 4 * size)
         command = [sys.executable, "-P", "-m", module, str(path.absolute()), str(target), memory, *arguments]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
@@ -101,6 +101,18 @@ def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["
         if done.returncode == _REFUSED:
             said = done.stderr.decode(errors="replace").splitlines()[-1]
         raise InvalidModel(f"{path.name} cannot be used: {said}")
+
+
+@contextmanager
+def _temporary_folder() -> Iterator[Path]:
+    with ExitStack() as stack:
+        try:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="placerec-import-"))
+        except OSError as error:
+            raise InvalidModel(
+                f"There is no room for temporary files ({error}); TMPDIR names another folder."
+            ) from error
+        yield Path(folder)
 
 
 def first_bytes(path: Path, count: int) -> bytes:
@@ -151,11 +163,16 @@ def convert(
     """
     try:
         tree, arrays = read(source, *arguments)
-        save(dict(arrays), target, {"tree": json.dumps(tree)})
+        described = json.dumps(tree)
     except MemoryError:
         raise
     except Exception as error:  # of damaged files the libraries raise whatever their parsers do
         text = str(error) if isinstance(error, InvalidModel) else f"it is damaged: {type(error).__name__}: {error}"
+        raise InvalidModel(" ".join(text.split())[:500]) from error
+    try:
+        save(dict(arrays), target, {"tree": described})
+    except (OSError, SafetensorError) as error:
+        text = f"what it holds cannot be written to a temporary folder ({error}); TMPDIR names another one."
         raise InvalidModel(" ".join(text.split())[:500]) from error
 
 

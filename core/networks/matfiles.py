@@ -21,6 +21,9 @@ Value = Any  # str, NDArray, list (a cell), dict (a structure), or Unreadable
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
+MAX_DEPTH = 32
+"""Structures and cells within each other; networks have about four."""
+
 
 @dataclass(frozen=True)
 class Unreadable:
@@ -106,18 +109,22 @@ def _read(path: Path) -> tuple[Tree, dict[str, NDArray[Any]]]:
     return tree, arrays
 
 
-def _described(value: Any, arrays: dict[str, NDArray[Any]]) -> tuple[str, Any]:
+def _described(value: Any, arrays: dict[str, NDArray[Any]], depth: int = 0) -> tuple[str, Any]:
+    if depth > MAX_DEPTH:
+        raise InvalidModel("its structures are too deep.")
     from scipy.io.matlab import MatlabFunction, MatlabObject, MatlabOpaque, mat_struct
 
     match value:
         case mat_struct():
-            return "structure", {name: _described(getattr(value, name), arrays) for name in value._fieldnames}
+            return "structure", {
+                name: _described(getattr(value, name), arrays, depth + 1) for name in value._fieldnames
+            }
         case MatlabObject():
             return "unreadable", value.classname
         case MatlabOpaque():
             return "unreadable", str(value[0]["s2"].tobytes().decode("latin-1"))
         case np.ndarray(dtype=np.dtype(kind="O")) if not isinstance(value, MatlabFunction):
-            items = [_described(item, arrays) for item in value.ravel(order="F")]
+            items = [_described(item, arrays, depth + 1) for item in value.ravel(order="F")]
             return items[0] if len(items) == 1 and isinstance(value.flat[0], mat_struct) else ("cell", items)
         case np.ndarray(dtype=np.dtype(kind="U")):
             return "text", "\n".join(value.ravel().tolist())

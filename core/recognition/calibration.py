@@ -22,6 +22,7 @@ from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE, Neighborhood
+from core.recognition.selection import SearchScope
 from core.recognition.stages import agree, neighborhood_of
 from core.storage import Map, Ranking, Snapshot
 
@@ -191,12 +192,17 @@ def run_trials(
     number = 0
     while batch := list(islice(queries.made, TOGETHER)):
         descriptors = np.stack([query.descriptor for query in batch])
+        living = snapshot.alive if queries.allowed is None else snapshot.alive & queries.allowed
+        places = int(np.count_nonzero(living))
         for query, ranking in zip(batch, snapshot.search_batch(descriptors, queries.allowed), strict=True):
             there = query.true & snapshot.alive & ~query.absent
             cases = [query.absent] if not there.any() else [query.absent, query.absent | query.around]
             for left_out in cases:
+                if len(ranking[0]) < places and left_out[ranking[0]].any():  # a shortlist, others take their places
+                    ranking = snapshot.search(query.descriptor, living & ~left_out)
                 known = bool((there & ~left_out).any())
-                found += _trial(map_, encoder, snapshot, query, ranking, left_out, base, known, number)
+                scope = SearchScope(living & ~left_out)
+                found += _trial(map_, encoder, snapshot, query, ranking, scope, base, known, number)
             number += 1
             advance(number, queries.count)
     return gathered(found)
@@ -260,17 +266,18 @@ def _trial(
     snapshot: Snapshot,
     query: LabelledQuery,
     ranking: Ranking,
-    left_out: Flags,
+    scope: SearchScope,
     base: Calibration,
     known: bool,
     number: int,
 ) -> list[Trial]:
-    """The answer to one query in the map without the rows ``left_out``; empty if no place is left."""
-    kept = ~left_out[ranking[0]]
+    """The answer to one query in the map of the places that ``scope`` allows; empty if there is none."""
+    assert scope.allowed is not None
+    kept = scope.allowed[ranking[0]]
     remaining: Ranking = ranking[0][kept], ranking[1][kept]
     if not len(remaining[0]):
         return []
-    candidates = agree(map_, encoder, snapshot, query.local, remaining)
+    candidates = agree(map_, encoder, snapshot, query.descriptor, query.local, remaining, scope)
     judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
     return [Trial(judgement, known, known and bool(query.true[candidates.rows[0]]), number)]
 

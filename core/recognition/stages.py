@@ -96,7 +96,7 @@ def rank_places(
     scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
     rankings = search(snapshot, np.stack([encoding.descriptor for encoding in encodings]), scope)
     return [
-        agree(map_, encoder, snapshot, encoding.local, ranking, scope)
+        agree(map_, encoder, snapshot, encoding.descriptor, encoding.local, ranking, scope)
         for encoding, ranking in zip(encodings, rankings, strict=True)
     ]
 
@@ -130,11 +130,21 @@ def _merged(a: Ranking, b: Ranking) -> Ranking:
 
 
 def agree(
-    map_: Map, encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking, scope: SearchScope = WHOLE_MAP
+    map_: Map,
+    encoder: Encoder,
+    snapshot: Snapshot,
+    descriptor: Array,
+    local: Cells,
+    ranking: Ranking,
+    scope: SearchScope = WHOLE_MAP,
 ) -> Candidates:
     """The second stage: apply the prior, then compare the best places of a ranking with the query cell by cell.
 
+    The best place's own neighbours may fill the shortlist of a map with codes.  Then the map is searched once more,
+    without them, for the other places that a verdict needs.
+
     Args:
+        descriptor: the query's, float32 [D].
         local: the query's local descriptors, int8 [C, L].
         ranking: the result of :func:`search`, rows int64 [n] and inner products float32 [n].
         scope: the scope of that search.
@@ -145,6 +155,24 @@ def agree(
     Raises:
         StorageFailure: local descriptors cannot be read from disk.
     """
+    neighborhood = neighborhood_of(map_)
+    candidates = _examined(map_, encoder, snapshot, local, ranking, scope)
+    if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
+        return candidates
+    elsewhere = snapshot.alive & ~snapshot.whereabouts.near(int(candidates.rows[0]), neighborhood)
+    elsewhere[ranking[0]] = False
+    if scope.allowed is not None:
+        elsewhere &= scope.allowed
+    if not elsewhere.any():  # the ranking has all places
+        return candidates
+    more = snapshot.search(descriptor, elsewhere)
+    return _examined(map_, encoder, snapshot, local, _merged(ranking, more), scope)
+
+
+def _examined(
+    map_: Map, encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking, scope: SearchScope
+) -> Candidates:
+    """The second stage over one ranking, see :func:`agree`."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     scores = encoder.scores_from_inner_products(ranking[1])
     rows, ordered, weights = ranking[0], scores, None

@@ -342,7 +342,10 @@ class Map:
             return []
         with self._writing() as write:
             write.expect(len(new))
-            return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
+            found = [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
+        if self.indexer is not None:
+            self.indexer.keep_up()
+        return found
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
         """Replace all fields of a place; its frame stays.

@@ -21,6 +21,7 @@ from core.disk.files import TEMPORARY, Damage, primary_code, sync_file, sync_fol
 from core.disk.sqlite_file import transaction
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
+from core.index.table import LARGEST_BLOCK
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
@@ -162,11 +163,15 @@ def _load_segment(folder: Path, layout: Layout, entry: SegmentEntry, checksums: 
 
 def _load_codes(files: IndexFiles, entries: Sequence[SegmentEntry]) -> CodeTable:
     """The codes of the first groups of segments that have good files."""
-    parts = [files.coder.nothing(0)]
+    table, group = CodeTable.empty(files.coder), 0
+    read = [files.coder.blank(0)]  # for one block, so that not all codes are in memory twice
     with suppress(StaleArrays):
-        while of_group := files.group_entries(entries, len(parts) - 1):
-            parts.append(files.read_codes(of_group))
-    return CodeTable.empty(files.coder).appended(np.concatenate(parts))
+        while of_group := files.group_entries(entries, group):
+            read.append(files.read_codes(of_group))
+            group += 1
+            if sum(len(codes) for codes in read) >= LARGEST_BLOCK:
+                table, read = table.appended(np.concatenate(read)), read[:1]
+    return table.appended(np.concatenate(read))
 
 
 def _check_rows(folder: Path, connection: sqlite3.Connection) -> None:

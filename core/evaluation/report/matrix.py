@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.evaluation.report.charts import house_style, make_figure, png_of
-from core.evaluation.report.text import counted
 from core.evaluation.report.theme import rgb
 from core.frames.traverses import Truth
 
@@ -126,14 +125,6 @@ def heat_file(drawn: Layers) -> tuple[bytes, str]:
     done, encoded = cv2.imencode(".jpg", drawn.heat, [cv2.IMWRITE_JPEG_QUALITY, 82])
     assert done, "any uint8 drawing of this size can be written as JPEG"
     return encoded.tobytes(), "image/jpeg"
-
-
-def describe_matrix(system: str, shape: tuple[int, int]) -> str:
-    """What the drawing shows, for who cannot see it."""
-    return (
-        f"Similarity matrix of {system}, {counted(shape[0], 'query')} by {counted(shape[1], 'reference')}, "
-        "with the true references outlined and the best matches as squares."
-    )
 
 
 def matrix_file(system: str, drawn: Layers, shape: tuple[int, int]) -> bytes:

@@ -39,7 +39,7 @@ TEXT_BYTES = 2 << 20
 """Bytes of lines that are committed together; parsed, they take many times as much memory."""
 
 MOST_PLACE_BYTES = 1 << 30
-"""Most bytes of one descriptor with its local descriptors, in full precision."""
+"""Most bytes of one descriptor with its local descriptors, as float32."""
 
 LINES_BETWEEN = 1024
 """After so many lines of sequences ``advance`` is called, which may end the work."""

@@ -63,7 +63,7 @@ class IndexFiles:
     def read_codes(self, entries: Sequence[SegmentEntry]) -> Codes:
         """Read the codes of the rows of a group, whose segments are ``entries``."""
         path = self._folder / codes_name(entries[0].number // self.group_size)
-        codes = read_arrays(path, "codes", self._group_of(entries)).get("codes", self.coder.nothing(0))
+        codes = read_arrays(path, "codes", self._group_of(entries)).get("codes", self.coder.blank(0))
         wanted = (sum(segment.rows for segment in entries), self.coder.bytes_per_place)
         if codes.shape != wanted or codes.dtype != np.uint8:
             raise StaleArrays("it holds other codes than expected")

@@ -33,6 +33,8 @@ from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, ho
 log = logging.getLogger(__name__)
 
 _ROWS_AT_ONCE = 256
+MOST_BEHIND = 4096
+"""Rows that may wait for their codes; a writer that is faster makes codes itself."""
 _NICENESS = 10
 _PATIENCE_SECONDS = 0.1
 _GROWN = 2  # when the places have grown by this factor, the recall is measured again
@@ -250,10 +252,10 @@ class Indexer:
                 lambda now: replace(now, table=table if now.table is None else now.table, holds=holds)
             )
         while newest.coded < newest.rows:
-            newest = self._code_group(newest.coded)
+            newest = self._let_go(self._code_group(newest.coded))
             self._report(newest.coded, newest.rows)
         for number, segment in enumerate(newest.segments):
-            if segment.held is not None and not holds:
+            if segment.held is not None and not newest.holds:
                 self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
 
     def _code_group(self, start: int) -> Snapshot:
@@ -269,22 +271,53 @@ class Indexer:
                 newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
                 self._written.add(tuple(of_group))
                 return newest
-        stop = min(start + _ROWS_AT_ONCE, newest.rows, (start // per_segment + 1) * per_segment)
+        newest, stop = self._code_rows(newest, start)
+        if stop == sum(segment.rows for segment in entries[: (group + 1) * self._files.group_size]):
+            self._keep_group(of_group)
+        return newest
+
+    def _code_rows(self, newest: Snapshot, start: int) -> tuple[Snapshot, int]:
+        """Add the codes of the next rows of a segment; the newest snapshot, and the row after them."""
+        per_segment = newest.rows_per_segment
         number = start // per_segment
+        stop = min(start + _ROWS_AT_ONCE, newest.rows, (number + 1) * per_segment)
         codes = codes_of(self._files.coder, newest, start, stop)
         newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None and not newest.holds:
             newest = self._publish(lambda now: now.holding(number, None))
-        if stop == sum(segment.rows for segment in entries[: (group + 1) * self._files.group_size]):
-            self._keep_group(of_group)
+        return newest, stop
+
+    def _let_go(self, newest: Snapshot) -> Snapshot:
+        """Free what has codes if the map has grown too large to hold its descriptors since its codes were begun."""
+        if newest.holds and not self._holds(newest):
+            newest = self._publish(lambda now: replace(now, holds=False))
+            for number in range(newest.coded // newest.rows_per_segment):
+                if newest.segments[number].held is not None:
+                    newest = self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
         return newest
+
+    def keep_up(self) -> None:
+        """Make codes in the calling thread until at most ``MOST_BEHIND`` rows wait for theirs.
+
+        The building thread leaves the cores to others.  A writer that leaves it none would fill the memory with
+        descriptors, and searches would compare ever more rows one by one.
+        """
+        with suppress(Stopped, UnknownMap, MapQuarantined, Damage, OSError):  # the building thread meets the same
+            if (newest := self._map.snapshot()).table is None:
+                return
+            newest = self._let_go(newest)
+            while newest.rows - newest.coded > MOST_BEHIND:
+                newest, _ = self._code_rows(newest, newest.coded)
 
     def _keep_group(self, of_group: Sequence[SegmentEntry]) -> None:
         snapshot = self._map.snapshot()
         first = of_group[0].number * snapshot.rows_per_segment
         if tuple(of_group) in self._written or snapshot.table is None:
             return
-        codes = snapshot.table.codes(first, first + sum(segment.rows for segment in of_group))
+        rows = sum(segment.rows for segment in of_group)
+        codes = snapshot.table.codes(first, first + rows)
+        if len(codes) < rows:  # a write has committed rows that no snapshot has yet
+            return
         if self._files.write_codes(of_group, codes):
             self._written.add(tuple(of_group))
 

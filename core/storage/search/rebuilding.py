@@ -40,5 +40,5 @@ def extended(table: CodeTable, snapshot: Snapshot, stop: int) -> CodeTable:
 def codes_of(coder: Coder, snapshot: Snapshot, start: int, stop: int) -> Codes:
     """The codes of rows of one segment."""
     if snapshot.segments[start // snapshot.rows_per_segment].removed:
-        return coder.nothing(stop - start)
+        return coder.blank(stop - start)
     return coder.encode(snapshot.descriptors_at(np.arange(start, stop)))

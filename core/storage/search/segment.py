@@ -1,4 +1,4 @@
-"""A segment of a map in memory: where the places of its rows are and, if the map is searched exactly, descriptors."""
+"""A segment of a map in memory: where the places of its rows are and, where the map holds them, descriptors."""
 
 from __future__ import annotations
 

@@ -157,7 +157,7 @@ class Snapshot:
     def search_batch(self, descriptors: NDArray[np.float32], allowed: NDArray[np.bool_] | None = None) -> list[Ranking]:
         """Rank the places for each of ``descriptors``, float32 [B, D], as :meth:`search` does.
 
-        Descriptors in memory are read once for all queries.
+        In a map without codes, descriptors in memory are read once for all queries.
         """
         queries = np.ascontiguousarray(descriptors, dtype=np.float32)
         if queries.ndim != 2 or queries.shape[1] != self.dimension or not np.isfinite(queries).all():
@@ -169,7 +169,7 @@ class Snapshot:
         chosen = self.alive if allowed is None else self.alive & allowed
         by_code = chosen[: self.coded]
         if self.table is None or int(np.count_nonzero(by_code)) <= SHORTLIST:
-            rows = np.flatnonzero(chosen)  # they are so few that all are compared exactly
+            rows = np.flatnonzero(chosen)  # there are no codes, or so few places that all are compared
             return [ranked(rows, found) for found in self._compared(queries, rows)]
         others = self.coded + np.flatnonzero(chosen[self.coded :])
         exact = self._compared(queries, others)

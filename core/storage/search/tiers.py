@@ -79,7 +79,7 @@ class IndexStatus(BaseModel):
     progress: float = Field(ge=0, le=1, description="Of what is being built; 1 when ready.")
     rows_indexed: int = Field(ge=0, description="Rows with a code; the others are compared exactly.")
     recall: Recall | None = Field(description="Against exact search; null in the tier exact and until it is measured.")
-    bytes_in_memory: int = Field(ge=0, description="Descriptors or codes, and where the places are.")
+    bytes_in_memory: int = Field(ge=0, description="Descriptors that are held, codes, and where the places are.")
     problem: str | None = Field(
         default=None, description="Why the last attempt to build came to no end; it is tried again with the next write."
     )

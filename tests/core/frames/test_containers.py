@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from core.errors import EmptyImage, InvalidImage, NotAnImage, TruncatedImage, UnsupportedFormat
-from core.frames.containers import Header, check_structure, find_exif, read_header
+from core.frames.containers import MAX_JPEG_SCANS, Header, find_exif, read_header, read_structure
 from core.frames.images import Limits, decode
 
 BLANK = np.zeros((64, 64, 3), np.uint8)
@@ -56,7 +56,7 @@ def test_format_and_size(wanted: str, extension: str, options: list[int], height
     data = cv2.imencode(extension, np.full((height, width, 3), 99, np.uint8), options)[1].tobytes()
     header = read_header(data)
     assert header == Header(wanted, width, height)  # type: ignore[arg-type]
-    assert check_structure(data, header) is None
+    assert read_structure(data, header).exif is None
 
 
 def test_an_extended_webp_announces_its_canvas() -> None:
@@ -133,11 +133,29 @@ def test_no_exif_block() -> None:
 def test_a_jpeg_without_image_data_is_damaged() -> None:
     data = with_pillow("JPEG")
     with pytest.raises(NotAnImage):
-        check_structure(data[: data.index(b"\xff\xda")] + b"\xff\xd9", read_header(data))
+        read_structure(data[: data.index(b"\xff\xda")] + b"\xff\xd9", read_header(data))
+
+
+@pytest.mark.parametrize("options", [{}, {"progressive": True}])
+def test_scans_are_counted_where_a_decoder_reads_all(options: dict[str, bool]) -> None:
+    """Of a file whose first scan has all colours, decoders read no other; then others are not counted."""
+    data = with_pillow("JPEG", **options)
+    at = data.index(b"\xff\xda")
+    one = b"\xff\xda\0\x08\1\1\0\0\x3f\0"  # of one colour, without data
+    for scans, allowed in ((MAX_JPEG_SCANS - 20, True), (MAX_JPEG_SCANS + 1, False)):
+        many = data[:at] + scans * one + data[at:]
+        if allowed:
+            assert read_structure(many, read_header(many)).coded == at + len(one)
+        else:
+            with pytest.raises(NotAnImage, match="scans"):
+                read_structure(many, read_header(many))
+    if not options:
+        behind = data + 1000 * one
+        assert read_structure(behind, read_header(behind)).coded > at
 
 
 def test_padding_before_a_marker_is_allowed() -> None:
     data = with_pillow("JPEG")
     padded = data[:2] + b"\xff" * 20 + data[2:]
     assert read_header(padded) == Header("jpeg", 40, 24)
-    assert check_structure(padded, read_header(padded)) is None
+    assert read_structure(padded, read_header(padded)).exif is None

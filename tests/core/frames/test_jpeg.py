@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -71,6 +72,20 @@ def test_a_stretch_between_restart_markers_that_was_lost() -> None:
     first, second = data.index(b"\xff\xd2"), data.index(b"\xff\xd3")
     with pytest.raises(TruncatedImage, match="missing"):
         decode(data[:first] + data[second:])
+
+
+@pytest.mark.parametrize(
+    "filling", [b"\xff\x01" * 2_000_000, b"".join(bytes([0xFF, 0xD0 + i % 8]) for i in range(100_000))]
+)
+def test_odd_files_of_many_stretches_take_little_memory(filling: bytes) -> None:
+    data = photograph(3)
+    data = data.replace(b"JFIF\0\1", b"JFIF\0\x09", 1)  # an unknown version, for which it is decoded twice
+    at = len(data) - 2
+    tracemalloc.start()
+    with pytest.raises(InvalidImage):
+        decode(data[:at] + filling + data[at:])
+    assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("way", WAYS)

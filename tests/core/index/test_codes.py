@@ -13,7 +13,7 @@ def test_codes_depend_on_their_own_rows_alone() -> None:
     codes = coder.encode(rows)
     assert (str(codes.dtype), codes.shape) == ("uint8", (600, 1024 // 8 + 8))
     np.testing.assert_array_equal(codes[300:305], coder.encode(rows[300:305]))
-    assert coder.encode(rows[:0]).shape == coder.nothing(0).shape == (0, coder.bytes_per_place)
+    assert coder.encode(rows[:0]).shape == coder.blank(0).shape == (0, coder.bytes_per_place)
 
 
 @pytest.mark.parametrize(("dimension", "width"), [(1, 1), (5, 8), (8, 8), (100, 128), (1024, 1024)])

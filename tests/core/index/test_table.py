@@ -121,8 +121,15 @@ def test_joining_is_told_and_may_be_stopped() -> None:
 
 
 def test_codes_of_few_values_are_all_compared() -> None:
-    made = table_of(descriptors(600, 256))
-    assert not made.is_loose and made.joined() is None
+    rows, coder = descriptors(600, 256), Coder.of(256)
+    made = CodeTable.empty(coder)
+    for start in range(0, 600, 50):
+        made = made.appended(coder.encode(rows[start : start + 50]))
+    assert made.is_loose and len(made.blocks) == 10
+    larger = joined(made)
+    assert not larger.is_loose and len(larger.blocks) < 4 and all(block.scan is None for block in larger.blocks)
+    np.testing.assert_array_equal(larger.codes(0, 600), made.codes(0, 600))
+    assert best(larger, rows[::60]) == best(made, rows[::60])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.6, 1.0])

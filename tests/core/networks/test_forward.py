@@ -69,6 +69,24 @@ def test_the_orders_of_caffenet_and_alexnet(normalize: bool, before: bool) -> No
     assert_same(ShallowNetwork(definition, ("conv2", "conv5", "pool1")).eval(), images(2, 227))
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+def test_a_rectifier_behind_a_pooling(slope: float) -> None:
+    """Caffe's quick network for CIFAR-10 has this order."""
+    network = network_of(
+        Convolution(name="a", channels=8, kernel=3, pad=1),
+        Pooling(name="pool", method="max", kernel=3, stride=2),
+        Relu(name="relu", negative_slope=slope),
+        Convolution(name="b", channels=4, kernel=3),
+        outputs=("pool", "a", "b"),
+    )
+    assert_same(network, images(2, 33))
+
+
+def test_layers_may_have_the_names_of_the_graph_in_lower_case() -> None:
+    network = network_of(Convolution(name="images", channels=4, kernel=3), Relu(name="nchw"), outputs=("images",))
+    assert_same(network, images(1, 33))
+
+
 def test_leaky_rectifiers_and_a_last_layer_without_rectifier() -> None:
     network = network_of(
         Convolution(name="a", channels=8, kernel=3, pad=1),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +67,27 @@ def enrolment(place_id: str, encoding: Encoding) -> Enrolment:
         regions=len(encoding.regions),
         digest=hashlib.sha256(content).digest(),
     )
+
+
+def test_neighbours_that_fill_the_shortlist_do_not_hide_rivals(
+    tmp_path: Path, encoder: Encoder, seen: list[Encoding], query: Encoding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("core.storage.search.snapshot.SHORTLIST", 20)
+    atlas = Atlas(tmp_path)
+    crowded = atlas.create(
+        "crowded", encoder.identity, encoder.dimension, MapSettings(keep="none", index="compact"), encoder.local_shape
+    )
+    crowded.enrol([enrolment(f"p{i}", encoding) for i, encoding in enumerate(seen)])
+    crowded.enrol([replace(enrolment("p3", seen[3]), id=f"again{i}") for i in range(40)])
+    while crowded.index_status().state == "building":
+        time.sleep(0.01)
+    rows, _ = crowded.snapshot().search(query.descriptor)
+    assert len(rows) == 20 and {place and place.id[:5] for place in crowded.places_at(rows.tolist())} <= {"p3", "again"}
+    (found,) = locate(crowded, encoder, [query], 5)
+    assert found.judgement.rival is not None and found.judgement.margin is not None
+    others = [place for place in both_stages(encoder, seen, query) if place != "p3"]
+    assert found.candidates.rows[found.judgement.rival] == int(others[0][1:])
+    atlas.close()
 
 
 def first_stage(encoder: Encoder, places: list[Encoding], query: Encoding) -> dict[str, float]:

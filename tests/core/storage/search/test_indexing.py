@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -408,6 +409,37 @@ def test_a_map_is_closed_while_it_is_built(atlas: Atlas, directory: Path) -> Non
     assert settled(again.get("lab")).tier == "compact"
     assert again.get("lab").verify().ok
     again.close()
+
+
+def test_who_writes_faster_than_codes_are_made_makes_them(atlas: Atlas, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the descriptors that wait for their codes would fill the memory."""
+    monkeypatch.setattr(indexing, "MOST_BEHIND", 3 * ROWS)
+    monkeypatch.setattr(tiers, "COMPACT_FROM", 60)
+    monkeypatch.setattr(tiers, "ON_DISK_FROM", PLACES + 10)
+    lab = make(atlas)
+    settled(lab)
+    assert lab.indexer is not None and everything_held(lab.snapshot())
+    with lab.indexer._building:  # nobody else makes codes
+        for start in range(0, 200, 20):
+            lab.enrol([frame(f"q{start + i}", dimension=DIMENSION) for i in range(20)])
+            found = lab.snapshot()
+            assert found.rows - found.coded <= 3 * ROWS
+            assert sum(segment.held is not None for segment in found.segments) <= 5
+        assert finds(lab, "q0") and finds(lab, "q199")
+    settled(lab)
+    assert lab.snapshot().coded == lab.snapshot().rows == PLACES + 200
+
+
+def test_codes_that_a_snapshot_lacks_are_not_written_as_whole(atlas: Atlas, folder: Path) -> None:
+    lab = make(atlas, index="compact")
+    settled(lab)
+    assert lab.indexer is not None
+    last = lab.indexer._map.entries()[-1]
+    before = {path: path.stat().st_mtime_ns for path in folder.glob("codes-*")}
+    lab.indexer._written.clear()
+    lab.indexer._keep_group([replace(last, rows=last.rows + 1)])  # one more was committed just now
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("codes-*")} == before
+    assert not lab.indexer._written
 
 
 def test_an_empty_map_waits_for_its_first_place(atlas: Atlas) -> None:

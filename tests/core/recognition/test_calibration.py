@@ -1,0 +1,67 @@
+"""Trials for a map's calibration where a ranking is a shortlist, against rankings of all places."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from core.judgement.trials import Trials
+from core.method.catalogue import EncoderCatalogue
+from core.method.encoder import Encoder
+from core.places import PlaceFields, Pose
+from core.recognition.calibration import queries_from_map, run_trials
+from core.storage import Atlas, Enrolment, MapSettings
+from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
+
+PLACES, QUERIES = 400, 30
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
+    folder = tmp_path_factory.mktemp("models")
+    install_two_stage_encoder(folder)
+    return EncoderCatalogue(folder).get(TWO_STAGES)
+
+
+def walk(encoder: Encoder) -> list[Enrolment]:
+    """A place every 20 cm, so that 150 of them are around one; what they show changes slowly."""
+    random = np.random.default_rng(0)
+    steps = random.standard_normal((PLACES + 30, encoder.dimension)).astype(np.float32)
+    cells = random.normal(0, 30, (PLACES + 30, *encoder.local_shape))
+    made = []
+    for i in range(PLACES):
+        weights = np.exp(-(np.linspace(-2, 2, 30) ** 2)).astype(np.float32)
+        descriptor = weights @ steps[i : i + 30]
+        local = np.clip(np.tensordot(weights, cells[i : i + 30], 1) / 3, -127, 127).astype(np.int8)
+        fields = PlaceFields(pose=Pose(x=0.2 * i, y=0))
+        unit = descriptor / np.linalg.norm(descriptor)
+        made.append(Enrolment(f"p{i}", fields, unit, 600, i.to_bytes(32, "big"), local=local))
+    return made
+
+
+def trials(folder: Path, encoder: Encoder, index: str) -> Trials:
+    atlas = Atlas(folder)
+    settings = MapSettings(keep="none", index=index)  # type: ignore[arg-type]
+    dense = atlas.create("dense", encoder.identity, encoder.dimension, settings, encoder.local_shape)
+    dense.enrol(walk(encoder))
+    while dense.index_status().state == "building":
+        time.sleep(0.01)
+    snapshot = dense.snapshot()
+    queries = queries_from_map(dense, snapshot, QUERIES)
+    found = run_trials(dense, encoder, snapshot, queries, encoder.calibration, lambda _done, _all: None)
+    atlas.close()
+    return found
+
+
+def test_a_place_without_its_surroundings_is_tried_in_a_dense_map(
+    tmp_path: Path, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("core.storage.search.snapshot.SHORTLIST", 40)
+    exact, compact = trials(tmp_path / "exact", encoder, "exact"), trials(tmp_path / "compact", encoder, "compact")
+    assert len(compact) == len(exact) == 2 * QUERIES
+    np.testing.assert_array_equal(compact.known, exact.known)
+    np.testing.assert_array_equal(compact.right, exact.right)
+    assert np.isclose(compact.decision, exact.decision, atol=0.01).mean() > 0.9
