@@ -282,7 +282,10 @@ class Indexer:
         number = start // per_segment
         stop = min(start + _ROWS_AT_ONCE, newest.rows, (number + 1) * per_segment)
         codes = codes_of(self._files.coder, newest, start, stop)
-        newest = self._publish(lambda now: now.with_codes(codes) if now.coded == start else now)
+        newest = self._publish(
+            # Another thread may have made them first, or its owner may have chosen exact search.
+            lambda now: now.with_codes(codes) if now.table is not None and now.coded == start else now
+        )
         if stop == (number + 1) * per_segment and newest.segments[number].held is not None and not newest.holds:
             newest = self._publish(lambda now: now.holding(number, None))
         return newest, stop
