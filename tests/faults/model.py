@@ -47,13 +47,14 @@ def told(map_: Map) -> State:
             "descriptor": None if row is None else zlib.crc32(snapshot.descriptors_at(_rows(row)).tobytes()),
             "local": None if row is None else zlib.crc32(snapshot.locals_at(_rows(row)).tobytes()),
         }
-    assert len(snapshot) == len(places)
-    return {
+    state: State = {
         "description": map_.record.description,
         "index": map_.record.index,
         "cameras": {camera.name: camera.mask is not None for camera in map_.cameras.all()},
         "places": places,
     }
+    # A sound map has as many rows as places; of a damaged one this is another answer.
+    return state if len(snapshot) == len(places) else {**state, "rows": len(snapshot)}
 
 
 def _rows(row: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

@@ -215,7 +215,7 @@ def picture(connection: sqlite3.Connection, number: int, place_id: str) -> bytes
     if found is None:
         return None
     content: bytes = found[0]
-    if hashlib.sha256(content).digest() != found[1]:
+    if not isinstance(content, bytes) or hashlib.sha256(content).digest() != found[1]:
         raise StorageFailure(f"The picture kept of place {place_id!r} is damaged.")
     return content
 

@@ -410,10 +410,16 @@ def test_a_deleted_map_answers_no_more(lab: Map, atlas: Atlas) -> None:
             call()
 
 
-def test_a_damaged_picture_is_not_handed_out(lab: Map) -> None:
+@pytest.mark.parametrize("value", ["x'00'", "'text'", "7"])
+def test_a_damaged_picture_is_not_handed_out(lab: Map, value: str) -> None:
     lab.enrol([frame("p")])
     with lab._writing() as write:
-        write.connection.execute("UPDATE pictures SET bytes = x'00'")
+        if value == "x'00'":
+            write.connection.execute(f"UPDATE pictures SET bytes = {value}")
+        else:  # a flipped bit may change the type of a value, which the table itself does not allow
+            write.connection.execute("DROP TABLE pictures")
+            write.connection.execute("CREATE TABLE pictures (place, bytes, digest)")
+            write.connection.execute(f"INSERT INTO pictures SELECT number, {value}, x'00' FROM places")
     for read in (lab.thumbnail, lab.picture):
         with pytest.raises(StorageFailure, match="damaged"):
             read("p")
