@@ -20,7 +20,7 @@ from benchmarks.report import report, verdict
 from core.evaluation.samples import jpeg, sample_frame
 
 READY_LIMIT = 6.0
-MEMORY_LIMIT = 1200.0
+MEMORY_LIMIT = 800.0
 SENDERS = 4
 
 
