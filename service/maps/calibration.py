@@ -42,6 +42,7 @@ from service.errors.faults import (
 from service.errors.problems import problem_documentation
 from service.http.bodies import json_size, parse_json
 from service.http.headers import expected_revision
+from service.http.openapi import NAMED
 from service.http.routing import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
@@ -82,6 +83,7 @@ BODY: dict[str, Any] = {
             FORM: {
                 "schema": {
                     "type": "object",
+                    "propertyNames": NAMED,
                     "required": ["calibration"],
                     "properties": {"calibration": {"$ref": "#/components/schemas/CalibrationOrder"}},
                     "additionalProperties": {"type": "string", "format": "binary"},
