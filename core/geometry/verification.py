@@ -33,7 +33,7 @@ LEAST_COSINE = 0.75
 """Of two descriptors that can match."""
 THRESHOLD = 1.5
 """Pixels by which an inlier may miss its epipolar line, where the longer side of the picture is LONGEST_SIDE."""
-CONFIDENCE, ITERATIONS = 0.999, 1000
+CONFIDENCE, ITERATIONS = 0.999, 300
 LEAST_MATCHES = 8
 """Seven matches determine a fundamental matrix, so they say nothing about it."""
 GRID = 8
