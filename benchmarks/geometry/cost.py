@@ -1,6 +1,6 @@
 """What geometric verification costs: keypoints of a frame, ten candidates of a query, keypoints of an enrolment.
 
-    python -m benchmarks.verification_cost [--images FOLDER]
+    python -m benchmarks.geometry.cost [--images FOLDER]
 
 The images are neighbours of one traverse, so that many of their keypoints match; without them, sample frames and their
 second looks are taken.  Each is resized to 640 x 480.
@@ -101,7 +101,7 @@ def main(
     rows.append(("KB a place", ROW.itemsize / 1000, "", "", verdict(ROW.itemsize / 1000, 40)))
     title = f"{used} threads; {len(matches)} matches with the first candidate"
     figures = {"milliseconds": times, "frames_a_second": enrolled, "matches": len(matches)}
-    report("verification_cost", title, ["", "median ms", "least", "of the processor", ""], rows, figures)
+    report("geometry_cost", title, ["", "median ms", "least", "of the processor", ""], rows, figures)
 
 
 if __name__ == "__main__":

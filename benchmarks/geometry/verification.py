@@ -1,6 +1,6 @@
 """What geometric verification of the best candidates brings, and which of its figures a probability should use.
 
-    python -m benchmarks.verification
+    python -m benchmarks.geometry.verification
 
 Constants are fitted on tasks made of training photographs: nights of the fixed cameras that the encoder was trained on,
 whole and cut on one side; hallways of 160 x 120, cut and disturbed; every second frame of a drive, cut and disturbed,
@@ -51,6 +51,9 @@ OTHERS = 5
 """The best score is compared with the mean of this many other places, as the verdict does."""
 SHARES = (0.0, 0.25, 0.5, 0.7, 1.0, 2.0)
 """Weights that are tried for the share of keypoints that are inliers."""
+QUANTILES = (("true", 0.1), ("true", 0.5), ("far", 0.5), ("far", 0.9), ("far", 0.99))
+FAR = 8
+"""References that are more frames than this from every true one show another place, for the quantiles."""
 ENOUGH = 0.9
 """The weight is the least that has this part of the most recall@1 that any weight gains on the fitted tasks."""
 
@@ -294,6 +297,20 @@ def mean_figures(found: Sequence[Verified], form: Form, candidates: int = CANDID
     return tuple(float(value) for value in np.mean([figures_of(v, form, candidates) for v in found], axis=0))
 
 
+def evidence_quantiles(found: Sequence[Verified]) -> list[float]:
+    """QUANTILES of the evidence, then of the inliers, of pairs that show one place and of pairs FAR apart."""
+    true, far = [], []
+    for v in found:
+        apart = np.ones_like(v.true)
+        if v.task.frames:
+            for row, truth in enumerate(v.task.truth):
+                apart[row] = [not truth[max(0, place - FAR) : place + FAR + 1].any() for place in v.reference[row]]
+        true.append(np.stack([v.evidence[v.true], v.inliers[v.true]]))
+        far.append(np.stack([v.evidence[apart & ~v.true], v.inliers[apart & ~v.true]]))
+    parts = {"true": np.concatenate(true, axis=1), "far": np.concatenate(far, axis=1)}
+    return [float(np.quantile(parts[which][row], share)) for row in range(2) for which, share in QUANTILES]
+
+
 def chosen_weight(found: Sequence[Verified]) -> float:
     """The least weight that has ENOUGH of the recall that any weight gains on the tasks to fit on."""
     fitted = [v for v in found if v.task.fitted]
@@ -415,13 +432,22 @@ def tables(encoder: Encoder, found: Sequence[Verified], parts: Sequence[Verified
         figures[f"{count} candidates"] = by_task
     columns = ["", *(f"{v} (fitted)" if any(f.task.name == v and f.task.fitted for f in found) else v for v in names)]
     title = "recall@1 / AUC-PR / precision at recall 0.5"
-    report("verification", title, columns, rows, {"encoder": encoder.identity, "weight": weight, "figures": figures})
+    kept = {"encoder": encoder.identity, "weight": weight, "figures": figures}
+    report("geometry_verification", title, columns, rows, kept)
+    quantiles = {name: evidence_quantiles([v for v in found if v.task.name == name]) for name in names}
+    report(
+        "geometry_evidence",
+        "evidence, then inliers, of pairs that show one place and of pairs that do not: quantiles",
+        ["", *(f"{which} {share:.0%}" for _ in range(2) for which, share in QUANTILES)],
+        [(name, *(f"{value:.0f}" for value in values)) for name, values in quantiles.items()],
+        {"encoder": encoder.identity, "quantiles": quantiles},
+    )
 
     made = [(v.task, features_of(v, with_share(weight))) for v in parts]
     judged = {choice: judged_choice(choice, made) for choice in CHOICES}
     tested = list(next(iter(judged.values())))
     report(
-        "verification_features",
+        "geometry_features",
         "is the best match right? AUC-ROC / precision at recall 0.5 / calibration error",
         ["features", *tested],
         [
