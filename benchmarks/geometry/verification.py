@@ -192,18 +192,23 @@ def webcams(camera: Camera, folder: Path, distractors: Pictures) -> list[Task]:
     return tasks
 
 
+def traverses(camera: Camera, evaluation: Path) -> tuple[Task, Task]:
+    """The streets of lip6_outdoor, and corridor."""
+    frames = MapSettings().same_place_frames
+    walk = with_corrected_truth(load_traverses(evaluation / "lip6_outdoor", "query", "reference"))
+    street = Task("lip6", camera.take(walk.queries), camera.take(walk.references), walk.truth, frames, False)
+    walk = load_traverses(evaluation / "corridor", "query", "ref")
+    return street, Task("corridor", camera.take(walk.queries), camera.take(walk.references), walk.truth, frames, False)
+
+
 def load_tasks(camera: Camera, datasets: Path) -> list[Task]:
     """All tasks, those to fit on first."""
-    train, evaluation, frames = datasets / "train", datasets / "eval", MapSettings().same_place_frames
+    train, evaluation = datasets / "train", datasets / "eval"
     scenes = camera.take([read(path) for path in find_photographs(train / "scenes15")[::9]])
     tasks = [*nights(camera, train, scenes, held_out=False), hallways(camera, train), drive(camera, train)]
-    walk = with_corrected_truth(load_traverses(evaluation / "lip6_outdoor", "query", "reference"))
-    street = camera.take(walk.references)
-    tasks.append(Task("lip6", camera.take(walk.queries), street, walk.truth, frames, False))
-    walk = load_traverses(evaluation / "corridor", "query", "ref")
-    indoors = camera.take(walk.queries), camera.take(walk.references)
-    tasks.append(Task("corridor", *indoors, walk.truth, frames, False))
-    tasks += webcams(camera, evaluation / "webcams", street.take(range(DISTRACTORS)))
+    street, indoors = traverses(camera, evaluation)
+    tasks += [street, indoors]
+    tasks += webcams(camera, evaluation / "webcams", street.references.take(range(DISTRACTORS)))
     return tasks + nights(camera, train, scenes, held_out=True)
 
 
