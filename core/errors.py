@@ -50,6 +50,10 @@ class NoRegions(PlacerecError):
     """A frame has no region of interest (a blank frame), so it has no descriptor to enrol."""
 
 
+class InvalidKeypoints(PlacerecError):
+    """Arrays or a stored record cannot be the keypoints of a frame."""
+
+
 # Models
 
 

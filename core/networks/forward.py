@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import copy
 import threading
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
+import numpy as np
 import onnxruntime
 import torch
+from numpy.typing import NDArray
+from onnx import ModelProto
 from torch import Tensor
 
 from core.errors import InvalidModel
@@ -26,21 +30,21 @@ SILENT = 4
 """ONNX Runtime's severity from which on it writes to standard error: what goes wrong is raised as well."""
 
 
-class GraphPass:
-    """A network in float32 on the processor, by ONNX Runtime; it is called like the network.
+class GraphRunner:
+    """A graph in the ONNX format on the processor, computed by ONNX Runtime.
 
-    A pass has as many threads as torch has in the thread that calls it.  Thread-safe.
+    A call has as many threads as torch has in the thread that calls it.  Thread-safe.
 
     Args:
-        network: its weights are copied, so that later changes to it have no effect.
+        name: by which errors call the network.
 
     Raises:
         InvalidModel: ONNX Runtime has no such layer, as a normalization over an even number of channels.
     """
 
-    def __init__(self, network: ShallowNetwork) -> None:
-        self._name = network.definition.name
-        self._graph = onnx_graph(network).SerializeToString()
+    def __init__(self, name: str, graph: ModelProto) -> None:
+        self._name = name
+        self._graph = graph.SerializeToString()
         self._sessions: dict[int, onnxruntime.InferenceSession] = {}
         self._making = threading.Lock()
         self._session()
@@ -63,17 +67,39 @@ class GraphPass:
                     raise InvalidModel(f"{self._name!r} cannot be computed: {error}") from error
             return self._sessions[threads]
 
+    def __call__(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[np.float32]]:
+        """The graph's outputs, in their order, for its inputs by name.
+
+        Raises:
+            InvalidModel: the inputs are too small for the layers, or not what the graph takes.
+        """
+        try:
+            return self._session().run(None, dict(inputs))
+        except Exception as error:
+            shapes = ", ".join(str(list(array.shape)) for array in inputs.values())
+            raise InvalidModel(f"{self._name!r} cannot compute images of {shapes}: {error}") from error
+
+
+class GraphPass:
+    """A network in float32 on the processor, by ONNX Runtime; it is called like the network.  Thread-safe.
+
+    Args:
+        network: its weights are copied, so that later changes to it have no effect.
+
+    Raises:
+        InvalidModel: ONNX Runtime has no such layer.
+    """
+
+    def __init__(self, network: ShallowNetwork) -> None:
+        self._run = GraphRunner(network.definition.name, onnx_graph(network))
+
     def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
         """B x 3 x H x W to one B x K x X x Y tensor for each output, float32, channels last in memory.
 
         Raises:
             InvalidModel: the images are too small for the layers.
         """
-        shown = images.permute(0, 2, 3, 1).contiguous().numpy()
-        try:
-            outputs = self._session().run(None, {IMAGES: shown})
-        except Exception as error:
-            raise InvalidModel(f"{self._name!r} cannot compute images of {list(images.shape)}: {error}") from error
+        outputs = self._run({IMAGES: images.permute(0, 2, 3, 1).contiguous().numpy()})
         return tuple(torch.from_numpy(output).permute(0, 3, 1, 2) for output in outputs)
 
 

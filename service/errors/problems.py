@@ -80,6 +80,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.ImageTooSmall: Kind(422, "image-too-small", "The image is smaller than 16 pixels on one side"),
     errors.NoRegions: Kind(422, "no-regions", "The frame has no region of interest"),
     # Models
+    errors.InvalidKeypoints: Kind(500, "invalid-keypoints", "Keypoints of a place are damaged"),
     errors.InvalidModel: Kind(503, "invalid-model", "A model cannot be used"),
     errors.MissingWeights: Kind(503, "missing-weights", "A model has no weights"),
     errors.WrongVocabulary: Kind(503, "wrong-vocabulary", "The vocabulary was trained for another network"),

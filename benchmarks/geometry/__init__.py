@@ -1,0 +1,1 @@
+"""What geometric verification brings and costs."""

