@@ -24,9 +24,10 @@ import typer
 from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
+from core.evaluation.map_sizes import balanced_error
 from core.judgement.curves import auc_roc
-from core.judgement.reliability import BINS, reliability
-from core.judgement.trials import Trial, Trials, gathered
+from core.judgement.reliability import reliability
+from core.judgement.trials import Trial, gathered
 from core.judgement.verdict import Calibration
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -64,17 +65,6 @@ def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool
     return made
 
 
-def balanced_error(probabilities: NDArray[np.float64], trials: Trials) -> float | None:
-    """The calibration error where known and unknown frames count alike; None unless there are both."""
-    known = trials.known
-    if known.all() or not known.any():
-        return None
-    weights = np.where(known, 0.5 / known.sum(), 0.5 / (~known).sum())
-    bins = np.minimum((probabilities * BINS).astype(int), BINS - 1)
-    off = weights * (probabilities - trials.right)
-    return float(np.abs(np.bincount(bins, off, BINS)).sum())
-
-
 def share(flags: NDArray[np.bool_]) -> float | None:
     """The share of flags that are set; None without any."""
     return float(flags.mean()) if len(flags) else None
@@ -97,7 +87,9 @@ def of_size(traverse: Traverse, size: int, how: Cut, calibration: Calibration, r
         "known_best": share(trials.right[trials.known]),
         "known_probability": float(probabilities[trials.known].mean()),
         "auc_roc": auc_roc(probabilities, trials.known),
-        "calibration_error": balanced_error(probabilities, trials),
+        "calibration_error": balanced_error(probabilities, trials.right, trials.known)
+        if 0 < trials.known.sum() < len(trials)
+        else None,
     }
 
 
