@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from core.judgement.alignment import LEAST_FRAMES, best_path, comparable, shared_stretches
 
 Values = NDArray[np.float64]
+Frames = NDArray[np.int64]
 
 
 def ordinary(rows: int, columns: int, seed: int = 0) -> Values:
@@ -18,9 +19,9 @@ def ordinary(rows: int, columns: int, seed: int = 0) -> Values:
     return 0.2 + hubs + random.normal(0, 0.02, (rows, columns))
 
 
-def with_path(scores: Values, first: Values, second: Values) -> Values:
+def with_path(scores: Values, first: Frames, second: Frames) -> Values:
     scores = scores.copy()
-    scores[first.astype(int), second.astype(int)] += 0.08
+    scores[first, second] += 0.08
     return scores
 
 
