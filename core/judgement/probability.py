@@ -31,10 +31,16 @@ class Curve(BaseModel):
     slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by a decision value greater by one.")
     intercept: float = Field(allow_inf_nan=False, description="Log odds at the decision value 0.")
     imagined_slope: float = Field(
-        default=0.0, allow_inf_nan=False, description="Added to the slope where the whole background is imagined."
+        default=0.0,
+        exclude_if=lambda value: value == 0,
+        allow_inf_nan=False,
+        description="Added to the slope where the whole background is imagined; left out if 0.",
     )
     imagined_intercept: float = Field(
-        default=0.0, allow_inf_nan=False, description="Added to the intercept where the whole background is imagined."
+        default=0.0,
+        exclude_if=lambda value: value == 0,
+        allow_inf_nan=False,
+        description="Added to the intercept where the whole background is imagined; left out if 0.",
     )
 
     @model_validator(mode="after")

@@ -75,7 +75,9 @@ class Calibration(BaseModel):
     decision: Literal["leading"] = "leading"
     frames: int | None = Field(default=None, ge=1, description="Held-out or labelled frames it rests on, if known.")
     environment: Environment | None = Field(
-        default=None, description="Scores of other places within one environment; null in calibrations of version 0.1."
+        default=None,
+        exclude_if=lambda environment: environment is None,
+        description="Scores of other places within one environment; calibrations of version 0.1 have none.",
     )
 
     def background(
