@@ -55,8 +55,8 @@ def check(server: Server, expected: dict[str, Any], pictures: Path) -> None:
         map_id, picture = name.split("/")
         answer = server.query(map_id, (pictures / "camera" / f"{picture}.jpg").read_bytes())
         assert (answer["verdict"], answer["place"] and answer["place"]["id"]) == (known["verdict"], known["place"])
-        # Places without pose and sequence are places of their own since, so that a few more scores are compared.
-        assert answer["probability"] == pytest.approx(known["probability"], abs=0.1)
+        # Places without pose and sequence are their own places since, and the default knows more of small maps.
+        assert answer["probability"] == pytest.approx(known["probability"], abs=0.15)
     for job in expected["jobs"]:
         assert server.client.get(f"/v1/jobs/{job}").json()["state"] == "succeeded"
 
