@@ -22,6 +22,9 @@ EARTH_RADIUS = 6_371_008.8  # metres, mean
 NO_POSE, METRIC, GEOGRAPHIC = 0, 1, 2
 """The kinds of poses in a :class:`Whereabouts`: none, metres in the map's frame, degrees on the Earth."""
 
+NO_SEQUENCE = -1
+"""The code of the places that belong to no sequence."""
+
 NO_TIME = -(1 << 63)
 """The timestamp of a place without one."""
 
@@ -159,6 +162,10 @@ class Neighborhood:
     radius: float
     frames: int
 
+    def times(self, factor: float) -> Neighborhood:
+        """The neighbourhood that reaches so many times as far."""
+        return Neighborhood(self.radius * factor, int(self.frames * factor))
+
 
 @dataclass(frozen=True)
 class Whereabouts:
@@ -166,7 +173,7 @@ class Whereabouts:
 
     kind: int8 [n], one of NO_POSE, METRIC, GEOGRAPHIC.
     position: float64 [n, 3], metres (``Pose.position``); zeros without a pose.
-    sequence: int32 [n], a code for the sequence's name; places without one share the code -1.
+    sequence: int32 [n], a code for the sequence's name; NO_SEQUENCE for places without one.
     ordinal: int64 [n], order of enrolment within the sequence.
     heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
@@ -212,9 +219,10 @@ class Whereabouts:
     def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
         """Which of the places are the same place as ``row``, itself included; bool [n].
 
-        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart.
+        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart.  A
+        place with neither a pose nor a sequence is a place of its own.
         """
-        near = self.sequence == self.sequence[row]
+        near = (self.sequence == self.sequence[row]) & (self.sequence != NO_SEQUENCE)
         near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
         kind = self.kind[row]
         if kind != NO_POSE:

@@ -2,7 +2,8 @@
 
 Each trial is one query against a map that holds its place, or from which its place was taken out.
 Three kinds of maps (validation.py) count alike: a street traverse with either half of its references
-left out, webcams over months, and webcams by night shifted sideways.
+left out, webcams over months, and webcams by night shifted sideways.  All of these maps are large; what changes in
+small ones is fitted to others (map_sizes.py).
 
 Run as a program, it measures the calibration of the packaged encoders again and stores it; nothing is
 trained, and the encoders' identities stay.
@@ -29,6 +30,7 @@ from core.method.catalogue import ENCODER_SUFFIX, NETWORK_SUFFIX, PACKAGED, load
 from core.method.encoder import Encoder
 from core.method.presets import NETWORK, PRESETS
 from core.places import Neighborhood, Whereabouts
+from training.map_sizes import fit_environment, fit_small_maps, fitting_traverses
 from training.validation import (
     DISTRACTORS,
     CameraTask,
@@ -141,6 +143,14 @@ def probability_quality(t: Trials, calibration: Calibration) -> dict[str, float]
     return {"ece": found.ece, "brier": found.brier, "brier_by_base_rate": found.brier / found.brier_of_base_rate}
 
 
+def for_small_maps(encoder: Encoder, datasets: Path, calibration: Calibration) -> Calibration:
+    """The calibration with what it needs in maps of a few places (``map_sizes.py``)."""
+    traverses = list(fitting_traverses(encoder, datasets))
+    environment = fit_environment(encoder, datasets, traverses)
+    found = calibration.model_copy(update={"environment": environment})
+    return found.model_copy(update={"curve": fit_small_maps(found, traverses)})
+
+
 def assess(encoder: Encoder, tasks: ValidationTasks) -> tuple[Calibration, dict[str, Any]]:
     """The calibration measured on the tasks, and the figures on them."""
     queries, references = describe(encoder, tasks.lip6.queries), describe(encoder, tasks.lip6.references)
@@ -207,6 +217,7 @@ def main(
         path = models / f"{name}{ENCODER_SUFFIX}"
         loaded = load_encoder(path, models / f"{NETWORK}{NETWORK_SUFFIX}")
         calibration, figures = assess(loaded, tasks)
+        calibration = for_small_maps(loaded, datasets, calibration)
         if not dry_run:
             save_calibration(path, calibration)
             load_encoder(path, models / f"{NETWORK}{NETWORK_SUFFIX}").check_golden()

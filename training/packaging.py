@@ -23,7 +23,7 @@ from core.method.features import FeatureExtractor
 from core.method.presets import NETWORK, PRESETS
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.networks.network import ShallowNetwork, save_network
-from training.default_calibration import UNCALIBRATED, assess
+from training.default_calibration import UNCALIBRATED, assess, for_small_maps
 from training.photographs import read, split_photographs
 from training.projections import fit_projections
 from training.student import student_definition
@@ -91,7 +91,7 @@ def main(
         for name, definition in PRESETS.items():
             encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
             calibration, figures = assess(encoder, tasks)
-            encoder.calibration = calibration
+            calibration = encoder.calibration = for_small_maps(encoder, datasets, calibration)
             training = {"images": len(pictures), "seed": seed, "source": "training photographs, see MODEL_CARD.md"}
             save_encoder(folder, encoder, vocabulary, NETWORK, training)
             made = {"encoder": encoder.identity, "calibration": calibration.model_dump(), **figures}

@@ -124,6 +124,10 @@ class Encodings:
     descriptors: Array
     local: Cells
 
+    def at(self, rows: NDArray[np.int64]) -> Encodings:
+        """The encodings of the pictures ``rows``."""
+        return Encodings(self.descriptors[rows], self.local[rows])
+
     def part(self, rows: slice) -> Encodings:
         """The encodings of some of the pictures."""
         return Encodings(self.descriptors[rows], self.local[rows])

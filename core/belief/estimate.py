@@ -26,7 +26,7 @@ class Candidate:
     """A place where the robot may be.
 
     row: of the map.
-    probability: of the place and of the frames that are the same place.
+    probability: of the place and of the frames that are the same place, but for those that a better candidate counts.
     """
 
     row: int
@@ -77,9 +77,10 @@ def _modes(masses: NDArray[np.float32], graph: PlaceGraph, count: int) -> list[C
         if place in taken:
             continue
         same = graph.same_place(place)
-        taken.update(same.tolist())
+        own = [other for other in same.tolist() if other not in taken]
+        taken.update(own)
         middle = _middle(place, same, masses, graph)
-        found.append(Candidate(int(graph.rows[middle]), float(masses[same].sum(dtype=np.float64))))
+        found.append(Candidate(int(graph.rows[middle]), float(masses[own].sum(dtype=np.float64))))
         if len(found) == count:
             break
     return sorted(found, key=lambda mode: -mode.probability)

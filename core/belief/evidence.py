@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import TOP_PLACES, Calibration, filled_up
+from core.judgement.background import GUARD_FACTOR
+from core.judgement.verdict import Calibration
 from core.places import Neighborhood, Whereabouts
 
 LISTED = 100
@@ -83,15 +84,19 @@ def evidence(
     second_stage = examined is not None and bool(examined.any())
     listed = np.flatnonzero(examined) if examined is not None and second_stage else np.arange(min(len(rows), LISTED))
     values = scores[listed].astype(np.float64)
-    rest = values[~whereabouts.take(listed).near(0, neighborhood)]
-    ordinary, believable = believable_score(rest, calibration)
+    others = ~whereabouts.near(int(listed[0]), neighborhood)
+    apart = ~whereabouts.near(int(listed[0]), neighborhood.times(GUARD_FACTOR))
+    rest = values[others[listed]]
+    ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])
     shares = (values - ordinary) / (believable - ordinary)
     gains = np.minimum(STRENGTH * shares + CLEARNESS * np.maximum(shares - 1, 0), STRONGEST).astype(np.float32)
     gaining = gains > 0
     return Evidence(rows[listed][gaining], gains[gaining], STRENGTH * UNKNOWN)
 
 
-def believable_score(rest: NDArray[np.float64], calibration: Calibration) -> tuple[float, float]:
+def believable_score(
+    rest: NDArray[np.float64], others: int, calibration: Calibration, apart: NDArray[np.float64] | None = None
+) -> tuple[float, float]:
     """The mean score of the rest, and the least score at which a best match would be accepted beside that rest.
 
     The second solves the verdict's rule threshold² = s · (s - top) for s, where top is the mean of the best few of the
@@ -99,10 +104,12 @@ def believable_score(rest: NDArray[np.float64], calibration: Calibration) -> tup
 
     Args:
         rest: float64 [n], best first: scores of listed places other than the best match's.
+        others: how many other places the map has, at least n.
+        apart: float64 [m], the scores of those of them that cannot overlap with the best match; None: all.
     """
-    scores = filled_up(rest.astype(np.float32), calibration)
-    ordinary, top = float(scores.mean()), float(scores[:TOP_PLACES].mean())
-    spread = max(float(scores.std()), 0.1 * calibration.background_deviation)
+    behind = calibration.background(rest, others, apart)
+    ordinary, top = float(behind.scores.mean()), behind.top
+    spread = max(float(behind.scores.std()), 0.1 * calibration.background_deviation)
     positive = max(top, 0.0)
     believable = (positive + np.sqrt(positive**2 + 4 * max(calibration.threshold, 0.0) ** 2)) / 2
     return ordinary, float(max(believable, ordinary + 0.5 * spread))

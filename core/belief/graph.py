@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.kernels.belief import same_place
-from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Whereabouts
+from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 
 NEAREST = 24
 """A place is joined to at most this many of the nearest places."""
@@ -101,7 +101,7 @@ class PlaceGraph:
             where.position,
             where.ordinal,
             self.neighborhood.radius,
-            self.neighborhood.frames,
+            self.neighborhood.frames if where.sequence[place] != NO_SEQUENCE else 0,
         )
         return found
 

@@ -1,6 +1,6 @@
 """How well systems recognize one traverse by another: the thesis's protocol, data sets, and report."""
 
-from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
 from core.evaluation.protocol.figures import (
     DEPTHS,
     STAGES,
@@ -22,6 +22,7 @@ __all__ = [
     "Run",
     "ScalePoint",
     "SeverityCurve",
+    "SizePoint",
     "extended_precision",
     "judge",
     "judge_ranking",

@@ -17,7 +17,8 @@ from core.baselines.encoders import EncoderSystem
 from core.baselines.system import System
 from core.evaluation.cache import CacheEntry, EvaluationCache
 from core.evaluation.data.pairs import TraversePair
-from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve
+from core.evaluation.map_sizes import map_sizes
+from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
 from core.evaluation.protocol.figures import STAGES, summarize
 from core.evaluation.protocol.outcomes import judge
 from core.evaluation.protocol.trust import trust_figures
@@ -41,11 +42,12 @@ class Watch(Protocol):
 
 @dataclass(frozen=True)
 class Extras:
-    """What is measured besides the figures, and the seed of disturbances."""
+    """What is measured besides the figures, and the seed of disturbances and of maps."""
 
     scalability: bool = False
     severity: bool = False
     seed: int = 0
+    map_sizes: bool = False
 
 
 def compare_systems(
@@ -67,6 +69,7 @@ def compare_systems(
     """
     runs: list[Run] = []
     points: list[ScalePoint] = []
+    sizes: list[SizePoint] = []
     curves: list[SeverityCurve] = []
     for system in systems:
         subject = Subject(system, pair, training, load, watch.advance)
@@ -74,6 +77,8 @@ def compare_systems(
         runs.append(evaluate(subject, cache))
         if extras.scalability:
             points += scalability(subject, cache)
+        if extras.map_sizes:
+            sizes += map_sizes(subject, cache, seed=extras.seed)
         if extras.severity:
             curves += severity(subject, cache, seed=extras.seed)
         watch.end()
@@ -89,6 +94,7 @@ def compare_systems(
         regions=None if seeing is None else lambda path: seeing.region_boxes(load(path)),
         regions_of=None if seeing is None else seeing.identity,
         scalability=points if extras.scalability else None,
+        map_sizes=sizes if extras.map_sizes else None,
         severity=curves if extras.severity else None,
         notes=list(pair.notes),
     )

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.judgement.background import GUARD_FACTOR
 from core.judgement.priors import decision_slope, log_odds
 from core.judgement.probability import FARTHEST
-from core.judgement.verdict import Calibration, Judgement, Verdict, leading
+from core.judgement.verdict import Calibration, Judgement, Verdict
 from core.places import Neighborhood, Whereabouts
 
 Values = NDArray[np.float64]
@@ -96,7 +97,13 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
     for camera, (view, part) in enumerate(zip(views, listed, strict=True)):
         scores[camera, np.searchsorted(rows, view.rows[part])] = view.scores[part]
     near = np.stack([places.near(i, neighborhood) for i in range(len(rows))])
-    of_place = _added(np.stack([_camera_log_odds(row, near, calibration) for row in scores]))
+    beside = np.stack([places.near(i, neighborhood.times(GUARD_FACTOR)) for i in range(len(rows))])
+    counts = [len(view.rows) for view in views]
+    of_place = _added(
+        np.stack(
+            [_camera_log_odds(row, near, beside, count, calibration) for row, count in zip(scores, counts, strict=True)]
+        )
+    )
     prior = np.concatenate(
         [
             np.zeros(len(part)) if view.weights is None else view.weights[part]
@@ -127,12 +134,16 @@ def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
     )
 
 
-def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calibration) -> Values:
+def _camera_log_odds(
+    scores: Values, near: NDArray[np.bool_], beside: NDArray[np.bool_], places: int, calibration: Calibration
+) -> Values:
     """The log odds of each place by one camera, float64 [n].
 
     Args:
         scores: float64 [n], -inf for places that the camera does not list.
         near: bool [n, n], which places are the same place.
+        beside: bool [n, n], which places may overlap.
+        places: how many the camera's ranking has.
     """
     found = np.empty(len(scores))
     for place, same in enumerate(near):
@@ -140,7 +151,9 @@ def _camera_log_odds(scores: Values, near: NDArray[np.bool_], calibration: Calib
         rest = np.sort(scores[~same & np.isfinite(scores)])[::-1].astype(np.float32)
         if not np.isfinite(best):
             best = min(calibration.background_mean, float(rest[0]) if len(rest) else np.inf)
-        found[place] = log_odds(leading(best, rest, calibration), calibration)
+        apart = scores[~beside[place] & np.isfinite(scores)]
+        behind = calibration.background(rest, places - int(same.sum()), apart)
+        found[place] = log_odds(behind.decision(best), calibration, behind.imagined)
     return found
 
 

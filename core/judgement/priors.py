@@ -227,11 +227,15 @@ def decision_slope(calibration: Calibration) -> float:
     return UNCALIBRATED_STEEPNESS / max(abs(calibration.threshold), 1e-6)
 
 
-def log_odds(decision: float, calibration: Calibration) -> float:
-    """The log odds of a match with this decision value; without a curve, with even odds at the threshold."""
-    slope = decision_slope(calibration)
-    intercept = -slope * calibration.threshold if calibration.curve is None else calibration.curve.intercept
-    return slope * decision + intercept
+def log_odds(decision: float, calibration: Calibration, imagined: float = 0.0) -> float:
+    """The log odds of a match with this decision value; without a curve, with even odds at the threshold.
+
+    Args:
+        imagined: the share of the background that was imagined.
+    """
+    if calibration.curve is not None:
+        return float(calibration.curve.log_odds(decision, imagined))
+    return decision_slope(calibration) * (decision - calibration.threshold)
 
 
 def weighed(scores: NDArray[np.float32], weights: Values, calibration: Calibration) -> NDArray[np.float32]:

@@ -4,13 +4,17 @@ The curve is logistic, P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), 
 answers whose truth is known (Platt, "Probabilistic outputs for support vector machines", 1999).  Its two parameters
 can be fitted to few frames without following their noise.  As it rises everywhere, thresholds on the decision value
 and on the probability are equivalent.
+
+In a small map a decision value says less, as much of the background that it rests on is imagined (``background.py``).
+With the share u of imagined places, slope and intercept are slope + u · imagined_slope and
+intercept + u · imagined_intercept.  Both are fitted to maps of 1 to 30 places that were cut from real traverses.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 FARTHEST = 35.0
 """Log odds are limited to this: beyond it 1 - P would be lost in rounding, and no measurement is as certain."""
@@ -26,17 +30,41 @@ class Curve(BaseModel):
 
     slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by a decision value greater by one.")
     intercept: float = Field(allow_inf_nan=False, description="Log odds at the decision value 0.")
+    imagined_slope: float = Field(
+        default=0.0,
+        exclude_if=lambda value: value == 0,
+        allow_inf_nan=False,
+        description="Added to the slope where the whole background is imagined; left out if 0.",
+    )
+    imagined_intercept: float = Field(
+        default=0.0,
+        exclude_if=lambda value: value == 0,
+        allow_inf_nan=False,
+        description="Added to the intercept where the whole background is imagined; left out if 0.",
+    )
 
-    def probability(self, decision: float) -> float:
+    @model_validator(mode="after")
+    def _rises_in_any_map(self) -> Curve:
+        if self.slope + self.imagined_slope <= 0:
+            raise ValueError("slope and imagined_slope add up to more than 0")
+        return self
+
+    def log_odds(self, decisions: ArrayLike, imagined: ArrayLike = 0.0) -> NDArray[np.float64]:
+        """The log odds for decision values of any shape, given the shares of imagined places, each in [0, 1]."""
+        d, share = np.asarray(decisions, np.float64), np.asarray(imagined, np.float64)
+        slope, intercept = self.slope + share * self.imagined_slope, self.intercept + share * self.imagined_intercept
+        return np.asarray(slope * d + intercept, np.float64)
+
+    def probability(self, decision: float, imagined: float = 0.0) -> float:
         """The probability for one decision value, in (0, 1)."""
-        return float(self.probabilities([decision])[0])
+        return float(self.probabilities([decision], imagined)[0])
 
-    def probabilities(self, decisions: ArrayLike) -> NDArray[np.float64]:
+    def probabilities(self, decisions: ArrayLike, imagined: ArrayLike = 0.0) -> NDArray[np.float64]:
         """The probabilities for decision values of any shape, each in (0, 1)."""
-        return sigmoid(self.slope * np.asarray(decisions, np.float64) + self.intercept)
+        return sigmoid(self.log_odds(decisions, imagined))
 
     def decision(self, probability: float) -> float:
-        """The decision value for a probability in (0, 1)."""
+        """The decision value for a probability in (0, 1), where nothing is imagined."""
         return float((np.log(probability) - np.log1p(-probability) - self.intercept) / self.slope)
 
 

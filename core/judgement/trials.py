@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.verdict import Calibration, Judgement, probability_of
+
+_NUMBERS = ("decision", "margin", "known", "right", "imagined")
 
 Flags = NDArray[np.bool_]
 Values = NDArray[np.float64]
@@ -24,6 +26,7 @@ class Trials:
     right: bool [n], whether it was the best match.
     frame: int64 [n], the number of the query's frame, in the order in which the frames were taken.  A frame that is a
         query of a map with its place and of a map without it has the same number in both.
+    imagined: float64 [n], the share of the background that was imagined; zeros if left out.
     """
 
     decision: Values
@@ -31,13 +34,18 @@ class Trials:
     known: Flags
     right: Flags
     frame: NDArray[np.int64]
+    imagined: Values = field(default_factory=lambda: np.empty(0))
+
+    def __post_init__(self) -> None:
+        if len(self.imagined) < len(self.decision):
+            object.__setattr__(self, "imagined", np.zeros(len(self.decision)))
 
     def __len__(self) -> int:
         return len(self.decision)
 
     def take(self, chosen: Flags) -> Trials:
         """The trials that are chosen, bool [n]."""
-        return Trials(*(getattr(self, field.name)[chosen] for field in fields(self)))
+        return Trials(*(getattr(self, column.name)[chosen] for column in fields(self)))
 
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
@@ -45,8 +53,8 @@ class Trials:
 
     def probabilities(self, calibration: Calibration) -> Values:
         """The probability that each is right, by a calibration with a curve, float64 [n]."""
-        pairs = zip(self.decision.tolist(), self.margin.tolist(), strict=True)
-        return np.array([probability_of(decision, margin, calibration) for decision, margin in pairs], np.float64)
+        rows = zip(self.decision.tolist(), self.margin.tolist(), self.imagined.tolist(), strict=True)
+        return np.array([probability_of(d, margin, calibration, share) for d, margin, share in rows], np.float64)
 
 
 @dataclass(frozen=True)
@@ -68,17 +76,19 @@ def gathered(trials: Iterable[Trial]) -> Trials:
             one.known,
             one.right,
             one.frame,
+            one.judgement.imagined,
         )
         for one in trials
         if one.judgement.decision is not None
     ]
-    decision, margin, known, right, frame = zip(*rows, strict=True) if rows else ((),) * 5
+    decision, margin, known, right, frame, imagined = zip(*rows, strict=True) if rows else ((),) * 6
     return Trials(
         np.array(decision, np.float64),
         np.array(margin, np.float64),
         np.array(known, np.bool_),
         np.array(right, np.bool_),
         np.array(frame, np.int64),
+        np.array(imagined, np.float64),
     )
 
 
@@ -89,6 +99,5 @@ def joined(parts: Sequence[Trials], same_frames: bool = False) -> Trials:
         shifted.append(part.frame + first)
         if len(part) and not same_frames:
             first += int(part.frame.max()) + 1
-    names = ("decision", "margin", "known", "right")
-    decision, margin, known, right = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-    return Trials(decision, margin, known, right, np.concatenate(shifted))
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _NUMBERS}
+    return Trials(frame=np.concatenate(shifted), **columns)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
+from core.judgement.background import GUARD_FACTOR
 from core.judgement.calibration import FittedCalibration, Target, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered
 from core.judgement.verdict import Calibration, judge
@@ -30,9 +31,6 @@ Item = TypeVar("Item")
 Flags = NDArray[np.bool_]
 ProgressCallback = Callable[[int, int], None]
 """Called with the number of queries done, and the number of all queries."""
-
-GUARD_FACTOR = 3
-"""Without a place all places within so many times the same-place distance are left out."""
 
 TOGETHER = 16
 """The number of queries that are searched for at a time."""
@@ -256,8 +254,7 @@ class _SamePlace:
         self._whereabouts, self._neighborhood = snapshot.whereabouts, neighborhood
 
     def __call__(self, row: int, times: float = 1) -> Flags:
-        reach = Neighborhood(self._neighborhood.radius * times, int(self._neighborhood.frames * times))
-        return self._whereabouts.near(row, reach)
+        return self._whereabouts.near(row, self._neighborhood.times(times))
 
 
 def _trial(

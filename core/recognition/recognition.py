@@ -26,7 +26,7 @@ from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder, Encoding
 from core.places import Place, PlaceFields
 from core.recognition.selection import Selection
-from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
+from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, rank_places
 from core.storage import Enrolment, Map
 
 ATTEMPTS = 3
@@ -34,6 +34,20 @@ ATTEMPTS = 3
 
 THUMBNAIL_SIDE = 320
 """The longer side of a thumbnail, in pixels."""
+
+
+@dataclass(frozen=True)
+class RivalGroup:
+    """Rivals of the best match, as ``core.judgement.verdict.Rivals``.
+
+    places: ids, best first.
+    score: of the first.
+    same_place: whether they show what the best match shows; else they are one place that looks like the query.
+    """
+
+    places: tuple[str, ...]
+    score: float
+    same_place: bool
 
 
 @dataclass(frozen=True)
@@ -49,6 +63,7 @@ class Answer:
     pose: the estimated pose of the query, from the poses of the best match and its neighbours; None if they have none.
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them.
+    rivals: what makes an answer ambiguous, the places of each group best first.
     """
 
     judgement: Judgement
@@ -59,6 +74,7 @@ class Answer:
     pose: PoseEstimate | None
     encoding: Encoding
     candidates: Candidates
+    rivals: tuple[RivalGroup, ...] = ()
 
     @property
     def place(self) -> Place | None:
@@ -239,6 +255,7 @@ def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidat
         calibration,
         neighborhood,
         candidates.examined,
+        lambda positions: likeness(map_, encoder, candidates, positions),
     )
     matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
     if matches:
@@ -246,4 +263,16 @@ def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidat
     log_odds = decision_slope(calibration) * candidates.ordered.astype(np.float64)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
-    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates)
+    rivals = _rivals(map_, candidates, judgement)
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, rivals)
+
+
+def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalGroup, ...]:
+    """The rivals by id; places that were deleted since the search are left out."""
+    groups = []
+    for group in judgement.rivals:
+        places = map_.places_at(candidates.rows[list(group.positions)].tolist())
+        ids = tuple(place.id for place in places if place is not None)
+        if ids:
+            groups.append(RivalGroup(ids, float(candidates.scores[group.positions[0]]), group.same_place))
+    return tuple(groups)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.errors import UnknownPlace
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
 from core.method.agreement import Cells
@@ -201,6 +202,24 @@ def _examined(
         if length >= len(rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
             break
     return candidates
+
+
+def likeness(map_: Map, encoder: Encoder, candidates: Candidates, positions: Positions) -> Array:
+    """The scores of the best candidate, as if it were the query, at the candidates ``positions``, int64 [k].
+
+    Returns:
+        float32 [k], after both stages; zeros if one of the places has been deleted since the search.
+
+    Raises:
+        StorageFailure: the map's files cannot be read.
+    """
+    snapshot, rows = map_.snapshot(), candidates.rows[np.concatenate([[0], positions])]
+    try:
+        descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
+    except UnknownPlace:
+        return np.zeros(len(positions), np.float32)
+    scores = encoder.scores_from_inner_products(descriptors[1:] @ descriptors[0])
+    return scores + encoder.agreement(local[0], local[1:])
 
 
 def _is_enough(candidates: Candidates, neighborhood: Neighborhood, has_second_stage: bool) -> bool:

@@ -22,13 +22,12 @@ from core.disk.sqlite_file import transaction
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.index.table import LARGEST_BLOCK
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Pose, Whereabouts, microseconds
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Pose, Whereabouts, microseconds
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
 from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.database.schema import (
-    NO_SEQUENCE,
     check_schema,
     migrate,
     rebuild_metadata_index,

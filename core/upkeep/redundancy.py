@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from core.places import NO_POSE, Neighborhood, Whereabouts
+from core.places import NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 from core.upkeep.hubness import NONE
 
 MOST_NEIGHBOURS = 32
@@ -47,7 +47,7 @@ def _along_sequences(where: Whereabouts, frames: int) -> list[NDArray[np.int64]]
             np.abs(where.ordinal[second] - where.ordinal[first]) <= frames
         )
         posed = (where.kind[first] == where.kind[second]) & (where.kind[first] != NO_POSE)
-        chosen = near & ~posed
+        chosen = near & ~posed & (where.sequence[first] != NO_SEQUENCE)
         pairs.append(np.stack([first[chosen], second[chosen]], axis=1))
     return pairs
 

@@ -18,7 +18,7 @@ from service.engine.engine import Engine
 from service.engine.searches import Recognized
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
-from service.queries.schemas import EstimatedPose, Match, QueryAnswer
+from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup
 from service.queries.statistics import QueryStatistics, map_key
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
@@ -70,6 +70,10 @@ def answer_of(encoded: Encoded, found: Answer) -> QueryAnswer:
         threshold=found.calibration.threshold,
         reason=None if matches else "no-place-allowed" if found.candidates.places else "empty-map",
         matches=matches,
+        rivals=[
+            RivalGroup(places=list(group.places), score=group.score, same_place=group.same_place)
+            for group in found.rivals
+        ],
         encoder=encoded.encoder.identity,
         milliseconds=rounded({**encoded.milliseconds, "search": found.search}),
     )

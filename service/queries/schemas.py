@@ -117,6 +117,17 @@ class EstimatedPose(BaseModel):
         return {name: value for name, value in shown.items() if value is not None or name == "heading_spread"}
 
 
+class RivalGroup(BaseModel):
+    """Places that keep an answer from being recognized, as one."""
+
+    places: list[str] = Field(description="Ids, best first; of each place and its neighbours the best.")
+    score: float = Field(description="Score of the first.")
+    same_place: bool = Field(
+        description="Whether they show what the best match shows, such as another traverse's view of it. Otherwise "
+        "it is another place that looks like the frame."
+    )
+
+
 Reason = Literal["no-regions", "empty-map", "no-place-allowed"]
 
 
@@ -162,12 +173,15 @@ class QueryAnswer(BaseModel):
     score: float | None = Field(description="Score of the best match (see its `score`); null if there is none.")
     margin: float | None = Field(description="Best score minus that of the best rival; null without a rival.")
     decision: float | None = Field(
-        description="By how much the best match stands out from the rest of the map: in standard deviations of the "
-        "other scores or, if the encoder has a second stage, the geometric mean of its score and its lead."
+        description="By how much the best match stands out from the rest of the map: the geometric mean of its score "
+        "and its lead; less than 0 where it is behind what a small map is expected to hold."
     )
     threshold: float = Field(description="The least decision value at which the best match can be recognized.")
     reason: Reason | None = Field(default=None, description="Why there are no matches, if so.")
     matches: list[Match]
+    rivals: list[RivalGroup] = Field(
+        default_factory=list, description="Why the answer is ambiguous; empty for other verdicts."
+    )
     explanation: MatchExplanation | None = Field(
         default=None, description="With `explain`: the explanation of the best match's score."
     )

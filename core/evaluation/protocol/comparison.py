@@ -58,6 +58,25 @@ class ScalePoint:
 
 
 @dataclass(frozen=True)
+class SizePoint:
+    """The verdicts of one system in maps of so many places, by the calibration that it ships.
+
+    known, strangers: queries whose place was in the map, and queries whose place was not.
+    known_recognized: share of the known that are recognized and right.
+    strangers_recognized: share of the strangers that are recognized; None without any.
+    calibration_error: of the probabilities, known and strangers counting alike; None without strangers.
+    """
+
+    system: str
+    places: int
+    known: int
+    strangers: int
+    known_recognized: float
+    strangers_recognized: float | None
+    calibration_error: float | None
+
+
+@dataclass(frozen=True)
 class SeverityCurve:
     """One system on query traverses that one disturbance changes more and more (thesis, 5.2 item 3).
 
@@ -96,5 +115,6 @@ class Comparison:
     regions: Callable[[Path], Sequence[Box] | None] | None = None
     regions_of: str | None = None
     scalability: list[ScalePoint] | None = None
+    map_sizes: list[SizePoint] | None = None
     severity: list[SeverityCurve] | None = None
     notes: list[str] = field(default_factory=list)

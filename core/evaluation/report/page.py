@@ -20,7 +20,7 @@ from core.evaluation.report.table import columns
 from core.evaluation.report.text import counted, enumerate_words, file_stems, number, plain
 from core.evaluation.report.theme import DARK, LIGHT, Cast, variables
 from core.evaluation.report.thumbnails import Thumbnails
-from core.evaluation.report.trends import plot_cost, plot_scalability, plot_severity
+from core.evaluation.report.trends import plot_cost, plot_map_sizes, plot_scalability, plot_severity
 
 if TYPE_CHECKING:
     from core.evaluation.protocol.comparison import Comparison
@@ -60,6 +60,7 @@ def write_report(folder: Path, comparison: Comparison) -> None:
     drawn: dict[str, Sequence[Chart | None]] = {
         "accuracy": accuracy,
         "reliability": [plot_reliability(runs, cast)],
+        "sizes": plot_map_sizes(comparison.map_sizes or [], cast),
         "scalability": plot_scalability(comparison.scalability or [], cast),
         "severity": plot_severity(comparison.severity or [], cast),
     }

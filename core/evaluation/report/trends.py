@@ -14,7 +14,7 @@ from core.evaluation.report.theme import LIGHT, Cast, Mark, short
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from core.evaluation.protocol.comparison import Run, ScalePoint, SeverityCurve
+    from core.evaluation.protocol.comparison import Run, ScalePoint, SeverityCurve, SizePoint
 
 
 SHORTEST = 1e-3
@@ -93,6 +93,25 @@ def plot_scalability(points: Sequence[ScalePoint], cast: Cast) -> list[Chart]:
             plots.append(
                 _trend(name, title, "references", what, lines, logarithmic=True, is_time=what == "milliseconds")
             )
+    return plots
+
+
+def plot_map_sizes(points: Sequence[SizePoint], cast: Cast) -> list[Chart]:
+    """The verdicts of the shipped calibrations, and the error of their probabilities, by size of map."""
+    asked: list[tuple[str, str, str, Callable[[SizePoint], float | None]]] = [
+        ("sizes-error", "Probabilities by size of map", "calibration error", lambda point: point.calibration_error),
+        ("sizes-known", "Known places by size of map", "recognized, right", lambda point: point.known_recognized),
+        ("sizes-strangers", "Strangers by size of map", "recognized", lambda point: point.strangers_recognized),
+    ]
+    plots = []
+    for name, title, what, value in asked:
+        found: dict[str, list[tuple[float, float]]] = {}
+        for point in points:
+            if (y := value(point)) is not None:
+                found.setdefault(point.system, []).append((float(point.places), y))
+        lines = [Line(cast.named(system), [x for x, _ in some], [y for _, y in some]) for system, some in found.items()]
+        if lines:
+            plots.append(_trend(name, title, "places", what, lines, logarithmic=True))
     return plots
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from core.disk.files import Damage, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage
+from core.places import NO_SEQUENCE
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
@@ -24,7 +25,6 @@ from core.storage.cameras import MOST_CAMERAS
 from core.storage.database import ledger, row_checksums
 from core.storage.database.connections import FILE, connect
 from core.storage.database.ledger import moment_text, segment_entries
-from core.storage.database.schema import NO_SEQUENCE
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout

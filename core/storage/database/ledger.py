@@ -15,10 +15,9 @@ from typing import Any
 
 from core.disk.files import Damage
 from core.errors import InvalidField, StorageFailure, UnknownPlace
-from core.places import Place, PlaceFields, Pose
+from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
 from core.storage.database import row_checksums
 from core.storage.database.row_checksums import CHECKED
-from core.storage.database.schema import NO_SEQUENCE
 from core.storage.files.segment_files import Layout
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 from core.disk.files import Damage
 from core.disk.sqlite_file import NotOurs, Schema, UnreadVersion, transaction
+from core.places import NO_SEQUENCE
 from core.storage.database import row_checksums
 
 APPLICATION_ID = 0x504C5243  # "PLRC"
@@ -19,9 +20,6 @@ APPLICATION_ID = 0x504C5243  # "PLRC"
 Migration = Sequence[str]
 
 T = TypeVar("T")
-
-NO_SEQUENCE = -1
-"""Code of the places that belong to no sequence."""
 
 FIRST_VERSION = 7
 """The version of the tables of placerec 0.1.0."""

@@ -252,9 +252,8 @@ def evaluate(
     systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
     kept = EvaluationCache(None if no_cache else cache or default_folder())
     with progress() as bar:
-        comparison = compare_systems(
-            systems, pair, lessons, load_image, kept, _Bar(bar), Extras(scalability, severity, seed)
-        )
+        extras = Extras(scalability, severity, seed, map_sizes=report is not None)
+        comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras)
     _show(comparison, kept)
     by_name = {run.about.name: run for run in comparison.runs}
     runs = [by_name[system.about.name] for system in systems]  # in the order of the command line

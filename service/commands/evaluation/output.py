@@ -117,6 +117,8 @@ def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, An
     trends: dict[str, Any] = {}
     if comparison.scalability is not None:
         trends["scalability"] = [asdict(point) for point in comparison.scalability]
+    if comparison.map_sizes is not None:
+        trends["map_sizes"] = [asdict(point) for point in comparison.map_sizes]
     if comparison.severity is not None:
         trends["severity"] = [asdict(curve) for curve in comparison.severity]
     if comparison.notes:

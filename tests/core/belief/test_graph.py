@@ -17,7 +17,7 @@ def test_the_same_place_is_what_the_verdict_takes_for_it(frames: int) -> None:
     kinds = np.where(random.random(80) < 0.6, METRIC, NO_POSE).astype(np.int8)
     position = np.where(kinds[:, None] == METRIC, random.uniform(0, 30, (80, 3)) * (1, 1, 0), 0.0)
     ordinal = np.sort(random.choice(400, 80, replace=False))
-    where = Whereabouts(kinds, position, random.integers(0, 3, 80).astype(np.int32), ordinal)
+    where = Whereabouts(kinds, position, random.integers(-1, 3, 80).astype(np.int32), ordinal)
     neighborhood = Neighborhood(3.0, frames)
     graph = graph_of(where, neighborhood)
     for place in range(80):

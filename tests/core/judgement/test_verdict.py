@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,8 +12,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from core.judgement.probability import Curve
-from core.judgement.verdict import Calibration, judge, probability_of
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, Neighborhood, Pose, Whereabouts
+from core.judgement.verdict import Calibration, Environment, Likeness, Rivals, judge, probability_of
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Pose, Whereabouts
 
 CALIBRATION = Calibration(
     source="encoder-default", threshold=0.2, margin=0.01, background_mean=0.02, background_deviation=0.01
@@ -173,3 +175,98 @@ def test_which_places_were_examined_may_be_said_one_by_one() -> None:
     expected = judge(falling(0.6, 0.2, 0.1), in_sequence(3, [0, 20, 30]), CURVED, NEARBY, 3)
     assert judgement.decision == pytest.approx(expected.decision)
     assert judgement.margin == pytest.approx(0.1)
+
+
+SMALL = CURVED.model_copy(
+    update={
+        "threshold": 0.09,
+        "margin": 0.004,
+        "environment": Environment(mean=0.13, deviation=0.034, mean_weight=0.66, deviation_weight=6.6),
+        "curve": Curve(slope=37, intercept=-3.5, imagined_slope=-28, imagined_intercept=3),
+    }
+)
+
+
+def alone(n: int) -> Whereabouts:
+    """Places with neither a pose nor a sequence."""
+    return Whereabouts(np.zeros(n, np.int8), np.zeros((n, 3)), np.full(n, NO_SEQUENCE, np.int32), np.arange(n))
+
+
+def test_places_without_pose_and_sequence_are_places_of_their_own() -> None:
+    assert alone(3).near(1, NEARBY).tolist() == [False, True, False]
+    with_poses = at([(0, 0), (3, 0), (8, 0)])
+    without_sequence = replace(with_poses, sequence=np.full(3, NO_SEQUENCE, np.int32))
+    assert without_sequence.near(0, NEARBY).tolist() == [True, True, False]
+
+
+def test_in_a_map_of_one_place_only_a_high_score_is_recognized() -> None:
+    """0.2 is what another place of one corridor scores: there it says nothing, in a full map of streets it says all."""
+    assert judge(falling(0.2), alone(1), SMALL, NEARBY).verdict == "unknown"
+    rest = np.sort(np.random.default_rng(0).normal(0.09, 0.02, 200))[::-1].astype(np.float32)
+    full = judge(np.append(np.float32(0.22), rest), in_sequence(201, [10 * n for n in range(201)]), SMALL, NEARBY)
+    assert full.verdict == "recognized" and full.imagined == 0
+    certain = judge(falling(0.8), alone(1), SMALL, NEARBY)
+    assert certain.verdict == "recognized" and certain.imagined == 1
+    unsure = judge(falling(0.2), alone(1), SMALL, NEARBY)
+    assert unsure.probability is not None and certain.probability is not None
+    assert 0.05 < unsure.probability < 0.5 < certain.probability < 0.999
+
+
+def test_two_places_of_one_picture_are_ambiguous_and_one_group() -> None:
+    judgement = judge(falling(0.85, 0.85), alone(2), SMALL, NEARBY, likeness=lambda at: np.full(len(at), 0.86))
+    assert judgement.verdict == "ambiguous"
+    assert judgement.rivals == (Rivals((1,), True),)
+    assert judgement.probability is not None and judgement.probability <= 0.5
+
+
+def twice(count: int = 60) -> Whereabouts:
+    """Sixty places of one sequence, and the same of another; the first two of the ranking are counterparts."""
+    order = np.repeat(np.arange(count) * 10, 2)
+    return Whereabouts(np.zeros(2 * count, np.int8), np.zeros((2 * count, 3)), np.tile([0, 1], count), order)
+
+
+def likeness_of(counterparts: set[int]) -> Likeness:
+    return lambda at: np.array([0.7 if position in counterparts else 0.15 for position in at.tolist()], np.float32)
+
+
+def test_rivals_of_another_traverse_explain_that_nothing_stands_out() -> None:
+    scores = np.concatenate([falling(0.25, 0.245, 0.24), np.linspace(0.15, 0.05, 117, dtype=np.float32)])
+    places = twice()
+    calibration = SMALL.model_copy(update={"threshold": 0.145})
+    plain = judge(scores, places, calibration, NEARBY)
+    assert plain.verdict == "unknown" and plain.rivals == (), "nothing says that the rivals show the same place"
+    known = judge(scores, places, calibration, NEARBY, likeness=likeness_of({1, 2}))
+    assert (known.verdict, known.rivals) == ("ambiguous", (Rivals((1, 2), True),))
+    assert known.decision == plain.decision and known.probability == plain.probability
+
+
+def test_rivals_do_not_make_a_stranger_ambiguous() -> None:
+    scores = np.linspace(0.16, 0.05, 120, dtype=np.float32)
+    asked: list[int] = []
+
+    def likeness(at: NDArray[np.int64]) -> NDArray[np.float32]:
+        asked.extend(at.tolist())
+        return np.full(len(at), 0.7, np.float32)
+
+    assert judge(scores, twice(), SMALL, NEARBY, likeness=likeness).verdict == "unknown"
+    assert asked == [], "it would not stand out without rivals either, so none is looked at"
+
+
+def test_another_place_that_looks_like_the_query_is_a_group_of_its_own() -> None:
+    scores = np.concatenate([falling(0.5, 0.499), np.linspace(0.1, 0.05, 118, dtype=np.float32)])
+    judgement = judge(scores, twice(), SMALL, NEARBY, likeness=likeness_of(set()))
+    assert (judgement.verdict, judgement.rivals) == ("ambiguous", (Rivals((1,), False),))
+
+
+def test_a_calibration_of_the_first_release_is_read_and_means_what_it_meant() -> None:
+    stored = (
+        '{"source": "measured", "threshold": 0.2, "margin": 0.01, "background_mean": 0.07,'
+        ' "background_deviation": 0.01, "curve": {"slope": 30.0, "intercept": -4.0}, "decision": "leading"}'
+    )
+    calibration = Calibration.model_validate_json(stored)
+    judgement = judge(falling(0.3, 0.1), in_sequence(2, [0, 50]), calibration, NEARBY)
+    top = (0.1 + 4 * 0.07) / 5
+    assert judgement.decision == pytest.approx(np.sqrt(0.3 * (0.3 - top)), abs=1e-4)
+    assert judgement.imagined == 0
+    with pytest.raises(ValidationError, match="imagined_slope"):
+        Curve(slope=10, intercept=0, imagined_slope=-10)

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import NoRegions, UnknownCamera
+from core.errors import NoRegions, UnknownCamera, UnknownPlace
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import TOP_PLACES
-from core.method.catalogue import EncoderCatalogue
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
+from core.recognition.stages import likeness, rank_places
 from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
 from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
@@ -234,3 +235,41 @@ def test_a_camera_must_be_known(lab: Map, encoder: Encoder) -> None:
         recognize(lab, jpeg(40), encoder, camera="rear")
     with pytest.raises(UnknownCamera):
         enrol(lab, "here", jpeg(40), encoder, PlaceFields(camera="rear"))
+
+
+@pytest.fixture
+def rooms(tmp_path: Path) -> Iterator[tuple[Map, Encoder]]:
+    """An empty map of the packaged default."""
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    atlas = Atlas(tmp_path)
+    yield atlas.create("rooms", encoder.identity, encoder.dimension, local_shape=encoder.local_shape), encoder
+    atlas.close()
+
+
+def test_two_places_of_one_picture_are_one_group_of_rivals(rooms: tuple[Map, Encoder]) -> None:
+    lab, encoder = rooms
+    enrol(lab, "first", jpeg(1), encoder)
+    assert recognize(lab, jpeg(1), encoder).judgement.verdict == "recognized"
+    enrol(lab, "second", jpeg(1), encoder)
+    answer = recognize(lab, jpeg(1), encoder)
+    assert (answer.judgement.verdict, answer.place) == ("ambiguous", None)
+    assert answer.probability is not None and answer.probability <= 0.5
+    assert [(group.places, group.same_place) for group in answer.rivals] == [(("second",), True)]
+    assert answer.rivals[0].score == pytest.approx(answer.matches[0][0], abs=1e-6)
+
+
+def test_a_rival_that_is_deleted_meanwhile_is_no_rival(
+    rooms: tuple[Map, Encoder], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab, encoder = rooms
+    for name in ("first", "second"):
+        enrol(lab, name, jpeg(1), encoder)
+    (candidates,) = rank_places(lab, encoder, [encoder.encode(decode(jpeg(1)))])
+    positions = np.array([1])
+    assert likeness(lab, encoder, candidates, positions)[0] > 0.5
+
+    def gone(self: Snapshot, rows: np.ndarray) -> np.ndarray:
+        raise UnknownPlace("A place was deleted while it was read.")
+
+    monkeypatch.setattr(Snapshot, "descriptors_at", gone)
+    assert likeness(lab, encoder, candidates, positions).tolist() == [0.0]

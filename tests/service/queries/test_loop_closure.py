@@ -120,3 +120,17 @@ def test_invalid_loop_closures(server: Server, map_id: str) -> None:
     assert_problem(close(server, "no-such-map", "p", data), 404, "unknown-map")
     assert_problem(close(server, map_id, "p", b"plainly no picture"), 422, "not-an-image")
     assert count(server, map_id) == 0
+
+
+def test_a_place_that_the_map_has_twice_is_not_enrolled_a_third_time(server: Server, map_id: str) -> None:
+    """Two sequences without poses: the counterparts are rivals, which explains that neither can be recognized."""
+    for sequence in ("monday", "tuesday"):
+        for number in (1, *BACKGROUND):
+            server.enrol(map_id, f"{sequence}-{number}", jpeg(number), sequence=sequence)
+    before = count(server, map_id)
+    answer = close(server, map_id, "again", encoded(seen_again(scene(1)))).json()
+    assert (answer["verdict"], answer["place"], answer["change"]) == ("ambiguous", None, None)
+    (group,) = answer["rivals"]
+    counterpart = "tuesday-1" if answer["matches"][0]["place"]["id"] == "monday-1" else "monday-1"
+    assert group["places"] == [counterpart] and group["same_place"] is True
+    assert count(server, map_id) == before

@@ -92,7 +92,7 @@ def test_the_best_places_are_examined_by_the_second_stage(server: Server) -> Non
     frames = {f"p{seed}": jpeg(seed) for seed in range(20, 26)}
     server.create_map("two-stages", encoder=TWO_STAGES)
     for place_id, data in frames.items():
-        assert server.enrol("two-stages", place_id, data).status_code == 201
+        assert server.enrol("two-stages", place_id, data, sequence="walk").status_code == 201
     question = encoded(seen_again(scene(22)))
     answer = server.query("two-stages", question, k=100)
 

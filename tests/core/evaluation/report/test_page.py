@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from core.errors import MissingExtra, StorageFailure, StorageFull
-from core.evaluation import Comparison, ScalePoint, SeverityCurve
+from core.evaluation import Comparison, ScalePoint, SeverityCurve, SizePoint
 from core.evaluation.report import page as page_module
 from core.evaluation.report import write_report
 from core.evaluation.report.page import write_files
@@ -42,6 +42,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
     comparison = replace(
         make_comparison(folder, systems=2, kept=range(6), noise=6),
         scalability=[ScalePoint("system-0", n, n, 0.9 / n, 0.8, 0.0) for n in (1, 2)],
+        map_sizes=[SizePoint("system-0", n, 4, 3, 0.5, 0.0625, 0.1875) for n in (1, 4)],
         severity=[SeverityCurve("a/b <c>", "unknown", [0.0, 1.0], "", [0.9, 0.5], [0.8, 0.3])],
         regions=lambda path: [(0.0, 0.25, 0.5, 1.0)],
     )
@@ -101,6 +102,12 @@ def test_every_image_has_a_text(written: Written) -> None:
     assert all("scope" in head.attributes for head in page.named("th"))
 
 
+def test_the_verdicts_by_size_of_map_are_in_a_table(written: Written) -> None:
+    assert "In maps of any size" in written.html
+    row = "<td>4</td><td>4</td><td>0.500</td><td>3</td><td>0.062</td><td>0.188</td>"
+    assert row in written.html
+
+
 def test_files_beside_the_page_are_pictures(written: Written) -> None:
     names = sorted(path.name for path in written.folder.iterdir())
     assert names == [
@@ -120,6 +127,9 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
         "severity-a-b-c.png",
         "similarity-system-0.png",
         "similarity-system-1.png",
+        "sizes-error.png",
+        "sizes-known.png",
+        "sizes-strangers.png",
     ]
     for name in names:
         if name.endswith(".png"):

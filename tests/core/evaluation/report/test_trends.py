@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from core.evaluation import ScalePoint, SeverityCurve
+from core.evaluation import ScalePoint, SeverityCurve, SizePoint
 from core.evaluation.report.theme import Cast
-from core.evaluation.report.trends import plot_cost, plot_scalability, plot_severity, time_per_query
+from core.evaluation.report.trends import plot_cost, plot_map_sizes, plot_scalability, plot_severity, time_per_query
 from tests.core.evaluation.report.comparisons import make_comparison
 
 
@@ -41,6 +41,21 @@ def test_scalability_sorts_its_points(tmp_path: Path) -> None:
     assert "system-0 from 0.750 at 10 to 0.500 at 100" in plots["scalability-auc-pr"]
     assert "system-0 from 1.000 at 10 to 1.000 at 10" in plots["scalability-recall"]
     assert "system-0 from 0.50 at 10 to 20 at 100" in plots["scalability-time"]
+
+
+def test_sizes_without_strangers_have_no_error(tmp_path: Path) -> None:
+    cast = Cast(make_comparison(tmp_path, systems=1).runs)
+    points = [
+        SizePoint("system-0", 1, 5, 60, 0.25, 0.05, 0.2),
+        SizePoint("system-0", 10, 20, 60, 0.5, 0.0, 0.1),
+        SizePoint("system-0", 111, 20, 0, 0.75, None, None),
+    ]
+    plots = {plot.name: plot.alt for plot in plot_map_sizes(points, cast)}
+    assert list(plots) == ["sizes-error", "sizes-known", "sizes-strangers"]
+    assert "from 0.200 at 1 to 0.100 at 10" in plots["sizes-error"]
+    assert "from 0.250 at 1 to 0.750 at 111" in plots["sizes-known"]
+    assert "from 0.050 at 1 to 0.000 at 10" in plots["sizes-strangers"]
+    assert plot_map_sizes([], cast) == []
 
 
 def test_two_plots_for_each_disturbance(tmp_path: Path) -> None:

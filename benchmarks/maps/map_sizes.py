@@ -1,0 +1,199 @@
+"""Verdicts in maps of 1, 2, 5, 10, 30, 100 and all places, cut from real traverses; known against unknown; twins.
+
+    python -m benchmarks.maps.map_sizes [--encoder NAME] [--cache FOLDER] [--fitted] [--repeats 24]
+
+A map holds a run of neighbouring references, or references drawn at random (``spread``).  It is asked frames whose
+place it holds, and strangers, whose place is more than eight frames from all that it holds.  ``strangers`` is the share
+of these that is recognized, and ``ambiguous`` the share that is ambiguous; ``right`` is the share of the other frames
+that is recognized and right, and ``best`` that whose best match is right whatever the verdict.  The calibration error
+counts known and unknown frames alike.  Judged is by the calibration that the encoder ships; nothing of corridor is in
+it, and of lip6 no map of fewer than 300 places.
+
+*Halves*: each half of the references alone is a map; AUC-ROC of the probability, known against unknown, and the best
+recall at a precision of 0.98.  *Twice*: every reference in two sequences without poses.  *Twins*: two places of one
+picture, without sequence and pose.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from benchmarks.report import report, verdict
+from core.evaluation.map_sizes import balanced_error
+from core.judgement.curves import auc_roc
+from core.judgement.reliability import reliability
+from core.judgement.trials import Trial, gathered
+from core.judgement.verdict import Calibration
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.threads import share_cores
+from training.map_sizes import SMALL, Cut, Traverse, corridor_and_lip6, fitting_traverses, scored, trials_of_size
+from training.validation import describe
+
+SIZES = (*SMALL, 100)
+MOST_STRANGERS, LEAST_RIGHT = 0.05, {"corridor": 0.3, "lip6": 0.7}
+LEAST_AREA = {"corridor": 0.95, "lip6": 0.93}
+PARTS = ("first", "both", "among", "truth")
+PRECISION, LEAST_RECALL, MOST_ERROR = 0.98, 0.5, 0.06
+
+
+def traverses(encoder: Encoder, datasets: Path, cache: Path | None, fitted: bool) -> dict[str, Traverse]:
+    """The traverses by name, from the cache if they are there."""
+    kept = None if cache is None else cache / f"{encoder.identity.replace('@', '-')}{'-fitted' if fitted else ''}.npz"
+    if kept is not None and kept.is_file():
+        with np.load(kept) as read:
+            names = sorted({name.rsplit(":", 1)[0] for name in read.files})
+            columns = {name: {part: read[f"{name}:{part}"] for part in PARTS} for name in names}
+            return {name: Traverse(**columns[name], candidates=encoder.candidates) for name in names}
+    made = {
+        name: scored(encoder, describe(encoder, task.queries), describe(encoder, task.references), task.truth)
+        for name, task in corridor_and_lip6(datasets)
+    }
+    if fitted:
+        made.update(fitting_traverses(encoder, datasets))
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(
+            kept,
+            **{f"{name}:{part}": getattr(one, part) for name, one in made.items() for part in PARTS},
+        )
+    return made
+
+
+def share(flags: NDArray[np.bool_]) -> float | None:
+    """The share of flags that are set; None without any."""
+    return float(flags.mean()) if len(flags) else None
+
+
+def of_size(traverse: Traverse, size: int, how: Cut, calibration: Calibration, repeats: int) -> dict[str, Any]:
+    """The figures of maps of one size."""
+    trials, judgements = trials_of_size(traverse, size, how, calibration, repeats)
+    recognized, ambiguous = (
+        np.array([one.verdict == name for one in judgements], np.bool_) for name in ("recognized", "ambiguous")
+    )
+    probabilities = trials.probabilities(calibration)
+    return {
+        "strangers": int((~trials.known).sum()),
+        "strangers_recognized": share(recognized[~trials.known]),
+        "strangers_ambiguous": share(ambiguous[~trials.known]),
+        "strangers_probability": float(probabilities[~trials.known].mean()) if (~trials.known).any() else None,
+        "known": int(trials.known.sum()),
+        "known_right": share((recognized & trials.right)[trials.known]),
+        "known_best": share(trials.right[trials.known]),
+        "known_probability": float(probabilities[trials.known].mean()),
+        "auc_roc": auc_roc(probabilities, trials.known),
+        "calibration_error": balanced_error(probabilities, trials.right, trials.known)
+        if 0 < trials.known.sum() < len(trials)
+        else None,
+    }
+
+
+def halves(traverse: Traverse, calibration: Calibration) -> dict[str, Any]:
+    """Known against unknown, with either half of the references left out."""
+    made = []
+    middle, end = traverse.truth.shape[1] // 2, traverse.truth.shape[1]
+    for kept in (np.arange(middle), np.arange(middle, end)):
+        for query, true in enumerate(traverse.truth):
+            found, best = traverse.judged(query, kept, calibration, np.zeros(len(kept), np.int64))
+            made.append(Trial(found, bool(true[kept].any()), bool(true[best]), query))
+    trials = gathered(made)
+    probabilities = trials.probabilities(calibration)
+    order = np.argsort(-probabilities, kind="stable")
+    hits = np.cumsum(trials.right[order])
+    precision, recall = hits / np.arange(1, len(hits) + 1), hits / trials.known.sum()
+    there, reached = recall >= LEAST_RECALL, precision >= PRECISION
+    return {
+        "auc_roc": auc_roc(probabilities, trials.known),
+        "precision_at_recall": float(precision[there][0]) if there.any() else None,
+        "recall_at_precision": float(recall[reached][-1]) if reached.any() else 0.0,
+        "calibration_error": reliability(probabilities, trials.right).ece,
+    }
+
+
+def verdicts(traverse: Traverse, kept: NDArray[np.int64], sequence: NDArray[np.int64], calibration: Calibration) -> Any:
+    """The shares of the verdicts on all frames whose place is there."""
+    asked = np.flatnonzero(traverse.truth[:, kept].any(axis=1)).tolist()
+    found = [traverse.judged(query, kept, calibration, sequence)[0].verdict for query in asked]
+    return {name: found.count(name) / len(found) for name in ("recognized", "ambiguous", "unknown")}
+
+
+def duplicates(traverse: Traverse, calibration: Calibration) -> dict[str, Any]:
+    """Each place in one sequence, in two, without any; and two places of one picture."""
+    once = np.arange(traverse.truth.shape[1])
+    nothing = np.zeros(len(once), np.int64)
+    twins: list[str] = []
+    for reference in range(0, len(once), 5):
+        pair, alone = np.full(2, reference), np.full(2, -1)
+        asked = np.flatnonzero(traverse.truth[:, reference]).tolist()
+        twins += [traverse.judged(query, pair, calibration, alone)[0].verdict for query in asked]
+    return {
+        "once": verdicts(traverse, once, nothing, calibration),
+        "twice": verdicts(traverse, np.tile(once, 2), np.repeat([0, 1], len(once)), calibration),
+        "without sequences": verdicts(traverse, once, nothing - 1, calibration),
+        "twins": {name: twins.count(name) / len(twins) for name in ("recognized", "ambiguous", "unknown")},
+    }
+
+
+def main(
+    datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
+    encoder: str = DEFAULT_ENCODER,
+    cache: Annotated[Path | None, typer.Option(help="Folder where the scores are kept.")] = None,
+    fitted: Annotated[bool, typer.Option(help="Show the traverses that are fitted to as well.")] = False,
+    repeats: Annotated[int, typer.Option(min=1, help="Maps of each size.")] = 24,
+) -> None:
+    """Measure and report."""
+    share_cores(1)
+    loaded = EncoderCatalogue().get(encoder)
+    calibration = loaded.calibration
+    figures: dict[str, Any] = {"encoder": loaded.identity, "calibration": calibration.model_dump(), "traverses": {}}
+    by_size: list[list[str]] = []
+    others: list[list[Any]] = []
+    for name, traverse in traverses(loaded, datasets, cache, fitted).items():
+        references = traverse.truth.shape[1]
+        made: dict[str, Any] = {}
+        for how in ("run", "spread"):
+            for size in [size for size in SIZES if size < references] + [references]:
+                one = of_size(traverse, size, how, calibration, repeats if size < references else 1)
+                made[f"{how} {size}"] = one
+                bars = ""
+                if how == "run" and size in SMALL and name in LEAST_RIGHT:
+                    many, few = one["strangers_recognized"] > MOST_STRANGERS, one["known_right"] < LEAST_RIGHT[name]
+                    bars = "none" if not (many or few) else " and ".join(["strangers"] * many + ["right"] * few)
+                names = ("strangers_recognized", "strangers_ambiguous", "known_right", "known_best")
+                values = [one[key] for key in (*names, "auc_roc", "calibration_error")]
+                cells = ["" if value is None else f"{value:.3f}" for value in values]
+                by_size.append([f"{name} {how} {size}", *cells, bars])
+        made["halves"], made["duplicates"] = halves(traverse, calibration), duplicates(traverse, calibration)
+        figures["traverses"][name] = made
+        if name in LEAST_AREA:
+            half = made["halves"]
+            others += [
+                [f"{name}, halves, AUC-ROC", half["auc_roc"], verdict(half["auc_roc"], LEAST_AREA[name], True)],
+                [
+                    f"{name}, halves, recall at precision {PRECISION}",
+                    half["recall_at_precision"],
+                    verdict(half["recall_at_precision"], LEAST_RECALL, True),
+                ],
+                [f"{name}, halves, precision at recall {LEAST_RECALL}", half["precision_at_recall"], ""],
+                [
+                    f"{name}, halves, calibration error",
+                    half["calibration_error"],
+                    verdict(half["calibration_error"], MOST_ERROR),
+                ],
+            ]
+        for case, shares in made["duplicates"].items():
+            told = ", ".join(f"{kind} {value:.2f}" for kind, value in shares.items())
+            others.append([f"{name}, {case}", told, ""])
+    columns = ["map", "strangers", "ambiguous", "right", "best", "AUC", "error", "missed"]
+    report("map-sizes", f"verdicts by size of map, {encoder}", columns, by_size, figures)
+    rows = [[name, f"{value:.3f}" if isinstance(value, float) else value, bar] for name, value, bar in others]
+    report("map-sizes", "halves and duplicates", ["", "measured", "bar"], rows, figures)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,139 @@
+"""Verdicts and probabilities of an encoder in maps of any size, by the calibration that it ships.
+
+A map is a run of neighbouring references.  It is asked queries whose place it holds, and strangers: queries whose true
+references are all more than ``APART`` frames from any that it holds.  Both kinds count alike in the calibration error,
+as they did when the calibration was measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.baselines.encoders import EncoderSystem, local_of
+from core.baselines.system import stack
+from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
+from core.evaluation.protocol.comparison import SizePoint
+from core.evaluation.subject import Subject
+from core.judgement.reliability import BINS
+from core.judgement.verdict import Judgement, judge
+from core.places import Neighborhood, Whereabouts
+from core.recognition.stages import examine
+from core.storage import MapSettings
+
+if TYPE_CHECKING:
+    from core.method.encoder import Encoder
+
+Positions = NDArray[np.int64]
+
+SIZES = (1, 2, 5, 10, 30, 100)
+APART = 8
+MAPS = 6
+"""Maps of each size, but one of all references."""
+
+ASKED = 20
+"""Queries of either kind that a map is asked at most; they are drawn at random."""
+
+
+def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[SizePoint]:
+    """The points of one system by rising size; none for a system that ships no probabilities.
+
+    Args:
+        seed: of the draw of maps and queries.
+    """
+    system = subject.system
+    if not isinstance(system, EncoderSystem) or system.encoder.calibration.curve is None:
+        return []
+    key = subject.key(
+        "map-sizes",
+        seed=seed,
+        calibration=system.encoder.calibration.model_dump(),
+        truth=arrays_digest(subject.pair.truth),
+        kept=subject.pair.kept.tolist(),
+    )
+    entry = cache.load(key)
+    if entry is not None:
+        return [SizePoint(**point) for point in entry.values["points"]]
+    maps = _Maps(subject, system.encoder)
+    references = len(subject.pair.kept)
+    sizes = [size for size in SIZES if size < references] + [references]
+    points = [point for size in sizes if (point := maps.point(size, np.random.default_rng((seed, size)))) is not None]
+    cache.store(key, CacheEntry({"points": [asdict(point) for point in points]}))
+    return points
+
+
+class _Maps:
+    """Maps of the references of one subject, and the queries against them."""
+
+    def __init__(self, subject: Subject, encoder: Encoder) -> None:
+        self.encoder, self.name, self.kept = encoder, subject.about.name, subject.pair.kept
+        self.truth = [np.asarray(true, np.int64) for true in subject.pair.truth]
+        references, queries = subject.references.descriptions, subject.queries.descriptions
+        self.products = stack(queries) @ stack(references).T
+        cells = bool(encoder.candidates)
+        empty = np.zeros((len(references), 0, 0), np.int8), np.zeros((len(queries), 0, 0), np.int8)
+        self.local, self.asked = (local_of(references), local_of(queries)) if cells else empty
+        settings = MapSettings()
+        self.neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
+
+    def point(self, size: int, generator: np.random.Generator) -> SizePoint | None:
+        """The figures of maps of one size; None if no query has its place in one."""
+        rows: list[tuple[bool, bool, bool, float]] = []
+        for start in generator.integers(0, len(self.kept) - size + 1, MAPS if size < len(self.kept) else 1).tolist():
+            part = np.arange(start, start + size)
+            for queries, there in self._queries(part):
+                for query in generator.permutation(queries)[:ASKED].tolist():
+                    found, best = self._judged(query, part)
+                    right = there and bool(np.isin(best, self.truth[query]))
+                    rows.append((there, right, found.verdict == "recognized", found.probability or 0.0))
+        if not any(there for there, *_ in rows):
+            return None
+        known, hits, believed = (np.array([row[column] for row in rows], np.bool_) for column in range(3))
+        strangers = int((~known).sum())
+        return SizePoint(
+            system=self.name,
+            places=size,
+            known=int(known.sum()),
+            strangers=strangers,
+            known_recognized=float((believed & hits)[known].mean()),
+            strangers_recognized=float(believed[~known].mean()) if strangers else None,
+            calibration_error=balanced_error(np.array([row[3] for row in rows]), hits, known) if strangers else None,
+        )
+
+    def _queries(self, part: Positions) -> Iterator[tuple[Positions, bool]]:
+        """The queries whose place is among the references, and the strangers; int64 each."""
+        held = self.kept[part]
+        around = np.arange(held.min() - APART, held.max() + APART + 1)
+        yield np.flatnonzero([bool(np.isin(true, held).any()) for true in self.truth]), True
+        yield np.flatnonzero([bool(len(true)) and not np.isin(true, around).any() for true in self.truth]), False
+
+    def _judged(self, query: int, part: Positions) -> tuple[Judgement, int]:
+        """The judgement of a query against the references ``part``, and the index of the best match."""
+        encoder = self.encoder
+        scores = np.asarray(encoder.scores_from_inner_products(self.products[query, part]), np.float32)
+        order = np.argsort(-scores, kind="stable")
+        rows = part[order]
+        places = Whereabouts.along_sequence(self.kept[rows])
+
+        def gains(at: Positions) -> NDArray[np.float32]:
+            return encoder.agreement(self.asked[query], self.local[rows[at]])
+
+        seen = examine(scores[order], places, self.neighborhood, encoder.candidates, gains)
+        judged = judge(seen.scores, places.take(seen.order), encoder.calibration, self.neighborhood, seen.examined)
+        return judged, int(self.kept[rows[seen.order[0]]])
+
+
+def balanced_error(probabilities: NDArray[np.float64], right: NDArray[np.bool_], known: NDArray[np.bool_]) -> float:
+    """The expected calibration error if known and unknown queries, of which there are both, count alike.
+
+    Args:
+        probabilities: float64 [n], that each best match is right.
+        right, known: bool [n], whether it is, and whether the place was there.
+    """
+    weights = np.where(known, 0.5 / known.sum(), 0.5 / (~known).sum())
+    bins = np.minimum((probabilities * BINS).astype(np.int64), BINS - 1)
+    return float(np.abs(np.bincount(bins, weights * (probabilities - right), BINS)).sum())

@@ -1,0 +1,256 @@
+"""Maps of any size, cut from real traverses: what the verdicts are on frames whose place is there, and on strangers.
+
+A map holds so many of a traverse's references, a run of neighbours or frames drawn at random.  It is asked frames whose
+place it holds, and strangers: frames whose true references are all more than ``APART`` frames from any that it holds.
+The environment's prior (``core.judgement.background``) and what a curve loses in small maps are fitted here to the
+traverses of train/ and to nordland_tiny; corridor and lip6 judge the result (``benchmarks.maps.map_sizes``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.judgement.background import Environment
+from core.judgement.probability import Curve, sigmoid
+from core.judgement.trials import Trial, Trials, gathered
+from core.judgement.verdict import Calibration, Judgement, judge
+from core.method.encoder import Encoder
+from core.places import NO_POSE, Neighborhood, Whereabouts
+from core.recognition.stages import examine
+from training.photographs import find_photographs, read
+from training.validation import Encodings, TraverseTask, describe, load_traverses, with_corrected_truth
+
+Array = NDArray[np.float32]
+Positions = NDArray[np.int64]
+Cut = Literal["run", "spread"]
+
+APART = 8
+"""A stranger's true references are more than so many frames from every place of the map."""
+
+SMALL = (1, 2, 5, 10, 30)
+"""Sizes of maps for which something is imagined."""
+
+NEIGHBORHOOD = Neighborhood(radius=5.0, frames=3)
+"""The default of maps."""
+
+STRETCHES = ((300, 700), (2200, 2600))
+"""Frames of nordland_tiny that are two environments."""
+
+MOST_ASKED = 60
+"""Frames of either kind that a map is asked at most."""
+
+
+@dataclass(frozen=True)
+class Traverse:
+    """Q queries and R references, scored all against all.
+
+    first, both: float32 [Q, R], the scores of the first stage and of both.
+    among: float32 [R, R], of the references with each other, after both stages.
+    truth: bool [Q, R].
+    candidates: how many the encoder's second stage examines.
+    """
+
+    first: Array
+    both: Array
+    among: Array
+    truth: NDArray[np.bool_]
+    candidates: int
+
+    def strangers(self, kept: Positions) -> Positions:
+        """The queries whose true references are all more than APART frames from the references ``kept``, int64."""
+        near = np.zeros(self.truth.shape[1], np.bool_)
+        for place in kept.tolist():
+            near[max(0, place - APART) : place + APART + 1] = True
+        return np.flatnonzero(~self.truth[:, near].any(axis=1) & self.truth.any(axis=1))
+
+    def judged(
+        self, query: int, kept: Positions, calibration: Calibration, sequence: Positions
+    ) -> tuple[Judgement, int]:
+        """The judgement of a query against a map of the references ``kept``, int64 [n], and its best match.
+
+        Args:
+            sequence: int64 [n], the code of each place's sequence; -1: it has none.
+        """
+        order = np.argsort(-self.first[query, kept], kind="stable")
+        rows = kept[order]
+        count = len(rows)
+        places = Whereabouts(
+            np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), sequence[order].astype(np.int32), rows
+        )
+
+        def gains(at: Positions) -> Array:
+            return np.asarray(self.both[query, rows[at]] - self.first[query, rows[at]])
+
+        seen = examine(self.first[query, rows], places, NEIGHBORHOOD, self.candidates, gains)
+        rows = rows[seen.order]
+
+        def likeness(at: Positions) -> Array:
+            return np.asarray(self.among[rows[0], rows[at]])
+
+        found = judge(seen.scores, places.take(seen.order), calibration, NEIGHBORHOOD, seen.examined, likeness)
+        return found, int(rows[0])
+
+
+def scored(encoder: Encoder, queries: Encodings, references: Encodings, truth: NDArray[np.bool_]) -> Traverse:
+    """A traverse with the scores of all its queries and references."""
+    first, both = all_scores(encoder, queries, references)
+    return Traverse(first, both, all_scores(encoder, references, references)[1], truth, encoder.candidates)
+
+
+def all_scores(encoder: Encoder, queries: Encodings, references: Encodings) -> tuple[Array, Array]:
+    """The scores of the first stage and of both for every pair, float32 [Q, R] each."""
+    first = encoder.scores_from_inner_products(queries.descriptors @ references.descriptors.T)
+    return first, first + np.stack([encoder.agreement(cells, references.local) for cells in queries.local])
+
+
+def cut(traverse: Traverse, size: int, how: Cut, generator: np.random.Generator) -> Positions:
+    """The references of one map, int64 [size], ascending."""
+    count = traverse.truth.shape[1]
+    if how == "spread":
+        return np.sort(generator.choice(count, size, replace=False))
+    start = int(generator.integers(0, count - size + 1))
+    return np.arange(start, start + size)
+
+
+def trials_of_size(
+    traverse: Traverse, size: int, how: Cut, calibration: Calibration, repeats: int, seed: int = 0
+) -> tuple[Trials, list[Judgement]]:
+    """Trials against ``repeats`` maps of one size, of frames whose place is there and of strangers."""
+    generator = np.random.default_rng((seed, size))
+    trials: list[Trial] = []
+    judgements: list[Judgement] = []
+    for _ in range(repeats):
+        kept = cut(traverse, size, how, generator)
+        sequence = np.zeros(size, np.int64)
+        known = np.flatnonzero(traverse.truth[:, kept].any(axis=1))
+        for asked, there in ((known, True), (traverse.strangers(kept), False)):
+            chosen = generator.choice(asked, MOST_ASKED, replace=False) if len(asked) > MOST_ASKED else asked
+            for query in chosen.tolist():
+                found, best = traverse.judged(query, kept, calibration, sequence)
+                trials.append(Trial(found, there, there and bool(traverse.truth[query, best]), len(trials)))
+                judgements.append(found)
+    return gathered(trials), judgements
+
+
+def corridor_and_lip6(datasets: Path) -> Iterator[tuple[str, TraverseTask]]:
+    """The traverses that nothing here is fitted to; lip6 with the truth put right."""
+    yield "corridor", load_traverses(datasets / "eval/corridor", "query", "ref")
+    yield "lip6", with_corrected_truth(load_traverses(datasets / "eval/lip6_outdoor", "query", "reference"))
+
+
+def fitting_traverses(encoder: Encoder, datasets: Path) -> Iterator[tuple[str, Traverse]]:
+    """The traverses that are fitted to: two stretches of nordland_tiny, and the sequences of camvid.
+
+    A sequence of camvid was driven once; every third frame is a reference, and the others are queries that show the
+    place of the reference beside them.
+    """
+    folder = datasets / "eval/nordland_tiny"
+    for start, stop in STRETCHES:
+        summer, winter = (find_photographs(folder / season)[start:stop] for season in ("summer", "winter"))
+        apart = np.abs(np.arange(stop - start)[:, None] - np.arange(stop - start))
+        queries, references = (describe(encoder, [read(path) for path in side]) for side in (winter, summer))
+        yield f"nordland {start}", scored(encoder, queries, references, apart <= 2)
+    for name, paths in _grouped(find_photographs(datasets / "train/camvid")):
+        frames = describe(encoder, [read(path) for path in paths])
+        asked = np.flatnonzero(np.arange(len(paths)) % 3)
+        kept = np.arange(0, len(paths), 3)
+        truth = np.abs(asked[:, None] - kept) <= 2
+        yield f"camvid {name}", scored(encoder, frames.at(asked), frames.at(kept), truth)
+
+
+def _grouped(paths: Sequence[Path]) -> list[tuple[str, list[Path]]]:
+    """The frames of each sequence of camvid, whose name is the first part of a file's."""
+    names = sorted({path.stem.split("_")[0] for path in paths})
+    return [(name, [path for path in paths if path.stem.split("_")[0] == name]) for name in names]
+
+
+def fit_environment(encoder: Encoder, datasets: Path, traverses: Sequence[tuple[str, Traverse]]) -> Environment:
+    """The prior of the scores of other places: floors of tower, sequences of camvid, stretches of nordland_tiny.
+
+    Each of the three kinds counts alike.  By moments: μ₀ and σ₀² are the means of the environments' means and
+    variances, κ₀ is σ₀² by the variance of the means, and ν₀ is 2 by the squared coefficient of variation of the
+    variances, as of a χ² distribution.
+    """
+    kinds: dict[str, list[Array]] = {}
+    for name, traverse in traverses:
+        far = ~_within(traverse.truth, APART)
+        kinds.setdefault(name.split()[0], []).append(traverse.both[far])
+    floors = sorted(path for path in (datasets / "train/tower").iterdir() if path.is_dir())
+    for floor in floors:
+        frames = describe(encoder, [read(path) for path in find_photographs(floor)])
+        index = np.arange(len(frames.local))
+        both = all_scores(encoder, frames, frames)[1]
+        kinds.setdefault("tower", []).append(both[np.abs(index[:, None] - index) > APART])
+    means, variances, shares = [], [], []
+    for parts in kinds.values():
+        there = [part for part in parts if len(part) > 1]
+        means += [float(part.mean()) for part in there]
+        variances += [float(part.var()) for part in there]
+        shares += [1 / len(there)] * len(there)
+    mean, between = _moments(means, shares)
+    variance, of_variances = _moments(variances, shares)
+    return Environment(
+        mean=round(mean, 4),
+        deviation=round(float(np.sqrt(variance)), 4),
+        mean_weight=round(variance / between, 3),
+        deviation_weight=round(2 * variance**2 / of_variances, 2),
+    )
+
+
+def _within(truth: NDArray[np.bool_], frames: int) -> NDArray[np.bool_]:
+    """Which references are within so many frames of a true one; bool [Q, R]."""
+    wide = truth.copy()
+    for shift in range(1, frames + 1):
+        wide[:, shift:] |= truth[:, :-shift]
+        wide[:, :-shift] |= truth[:, shift:]
+    return wide
+
+
+def _moments(values: Sequence[float], shares: Sequence[float]) -> tuple[float, float]:
+    """Weighted mean and variance."""
+    mean = float(np.average(values, weights=shares))
+    return mean, float(np.average(np.square(np.array(values) - mean), weights=shares))
+
+
+def fit_small_maps(calibration: Calibration, traverses: Sequence[tuple[str, Traverse]], repeats: int = 10) -> Curve:
+    """The calibration's curve with what changes where the background is imagined.
+
+    Slope and intercept for full maps are kept.  The two other parameters are fitted by maximum likelihood to maps of
+    SMALL sizes, runs and drawn ones, in which frames of known and of unknown places count alike, as do the kinds of
+    traverses.
+    """
+    assert calibration.curve is not None
+    curve = calibration.curve
+    columns: list[list[NDArray[np.float64]]] = [[], [], [], []]
+    kinds = [name.split()[0] for name, _ in traverses]
+    for (_, traverse), kind in zip(traverses, kinds, strict=True):
+        for how in ("run", "spread"):
+            for size in SMALL:
+                trials, _ = trials_of_size(traverse, size, how, calibration, repeats)
+                counts = int(trials.known.sum()), int((~trials.known).sum())
+                if min(counts) < 5:
+                    continue
+                weight = np.where(trials.known, 0.5 / counts[0], 0.5 / counts[1]) / kinds.count(kind)
+                for column, values in zip(
+                    columns, (trials.decision, trials.imagined, trials.right, weight), strict=True
+                ):
+                    column.append(values.astype(np.float64))
+    decision, imagined, right, weights = (np.concatenate(column) for column in columns)
+    design = np.stack([imagined * decision, imagined], axis=1)
+    known = curve.log_odds(decision)
+    found = np.zeros(2)
+    for _ in range(100):
+        p = sigmoid(known + design @ found)
+        curvature = (design * (weights * p * (1 - p))[:, None]).T @ design + 1e-6 * np.eye(2)
+        step = np.linalg.solve(curvature, design.T @ (weights * (p - right)))
+        found -= np.clip(step, -5, 5)
+        if np.abs(step).max() < 1e-9:
+            break
+    terms = {"imagined_slope": round(float(found[0]), 3), "imagined_intercept": round(float(found[1]), 4)}
+    return Curve.model_validate({**curve.model_dump(), **terms})
