@@ -31,7 +31,6 @@ SETTINGS = {
     "cert": ("SSL_CERT_FILE", " "),
     "proxy": ("ALL_PROXY", " "),
     "timeout": ("UV_HTTP_TIMEOUT", " "),
-    "default-timeout": ("UV_HTTP_TIMEOUT", " "),
 }
 """uv's variable for each of pip's settings, and what separates several values in it."""
 
@@ -41,26 +40,31 @@ def pip_settings() -> str:
     return subprocess.run([*PIP[:3], "config", "list"], check=True, capture_output=True, text=True).stdout
 
 
-def uv_settings(listing: str) -> dict[str, str]:
-    """uv's environment variables for what ``pip config list`` has printed."""
-    found: dict[str, tuple[int, str]] = {}
+def configured(listing: str) -> dict[str, list[str]]:
+    """The values of pip's settings by what ``pip config list`` has printed; empty ones count as not set, as for pip."""
+    found: dict[str, tuple[int, list[str]]] = {}
     for line in listing.splitlines():
         name, _, value = line.partition("=")
         section, _, key = name.partition(".")
-        if section in SECTIONS and key in SETTINGS and (values := str(ast.literal_eval(value)).split()):
-            variable, separator = SETTINGS[key]
-            rank = SECTIONS.index(section)
-            if rank >= found.get(variable, (0, ""))[0]:
-                found[variable] = rank, separator.join(values)
+        if section in SECTIONS and (values := str(ast.literal_eval(value)).split()):
+            key, rank = key.removeprefix("default-"), SECTIONS.index(section)  # pip's timeout has two names
+            if rank >= found.get(key, (0, []))[0]:
+                found[key] = rank, values
+    return {key: values for key, (_, values) in found.items()}
+
+
+def uv_settings(listing: str) -> dict[str, str]:
+    """uv's environment variables for what ``pip config list`` has printed."""
+    told = configured(listing)
     # Of all indexes the best version, as pip does, not that of the first index; hashes say which files are right.
-    return {"UV_INDEX_STRATEGY": "unsafe-best-match"} | {name: value for name, (_, value) in found.items()}
+    return {"UV_INDEX_STRATEGY": "unsafe-best-match"} | {
+        variable: separator.join(told[key]) for key, (variable, separator) in SETTINGS.items() if key in told
+    }
 
 
 def without_index(listing: str) -> bool:
     """Whether pip is told to ask no index, by what ``pip config list`` has printed; uv has no variable for it."""
-    told = {name: ast.literal_eval(value) for name, _, value in (line.partition("=") for line in listing.splitlines())}
-    last = next((told[f"{section}.no-index"] for section in reversed(SECTIONS) if f"{section}.no-index" in told), "")
-    return str(last).lower() in ("1", "true", "yes", "on", "y", "t")
+    return " ".join(configured(listing).get("no-index", [])).lower() in ("1", "true", "yes", "on", "y", "t")
 
 
 class UnknownBackend(Exception):

@@ -130,16 +130,12 @@ class EncoderQueue:
         if identity in self._loaded:
             return self._loaded[identity]
         loading = asyncio.ensure_future(self.load(identity))
-        gone = asyncio.ensure_future(deadline.hung_up())
-        waited: set[asyncio.Future[Any]] = {loading, gone}
         try:
-            await asyncio.wait(waited, timeout=deadline.seconds_left(), return_when=asyncio.FIRST_COMPLETED)
-            if loading.done():
-                return loading.result()
-            raise _gone() if gone.done() else deadline_exceeded()
+            if (ended := await _ended(loading, deadline)) is not None:
+                raise ended
+            return loading.result()
         finally:
             loading.cancel()
-            gone.cancel()
 
     async def encode(
         self,
@@ -165,21 +161,13 @@ class EncoderQueue:
         frame = QueuedFrame(encoder, data, mask, deadline.at, after_encoding=after_encoding)
         self._threads.put([frame])
         result = asyncio.wrap_future(frame.result)
-        gone: asyncio.Future[Any] | None = None
         try:
-            await asyncio.wait({result}, timeout=min(UNWATCHED, deadline.seconds_left()))
-            if not result.done():
-                gone = asyncio.ensure_future(deadline.hung_up())
-                waited: set[asyncio.Future[Any]] = {result, gone}
-                left = max(0.0, deadline.seconds_left())
-                await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            ended = await _ended(result, deadline)
             # A frame whose encoding has begun is finished: dropping it would save nothing.
-            if not result.done() and frame.result.cancel():
-                raise _gone() if gone is not None and gone.done() else deadline_exceeded()
+            if ended is not None and frame.result.cancel():
+                raise ended
             encoded = await result
         finally:
-            if gone is not None:
-                gone.cancel()
             result.cancel()
         self._metrics.observe_stages(encoded.milliseconds)
         return encoded
@@ -243,6 +231,22 @@ class EncoderQueue:
             for future, (_, frame) in open_.items():
                 frame.result.cancel()
                 future.cancel()
+
+
+async def _ended(awaited: asyncio.Future[Any], deadline: RequestDeadline) -> ClientGone | DeadlineExceeded | None:
+    """Wait for a future; what ended its request before it was done, or None."""
+    await asyncio.wait({awaited}, timeout=min(UNWATCHED, deadline.seconds_left()))
+    if awaited.done():
+        return None
+    gone = asyncio.ensure_future(deadline.hung_up())
+    try:
+        waited: set[asyncio.Future[Any]] = {awaited, gone}
+        await asyncio.wait(waited, timeout=max(0.0, deadline.seconds_left()), return_when=asyncio.FIRST_COMPLETED)
+        if awaited.done():
+            return None
+        return _gone() if gone.done() else deadline_exceeded()
+    finally:
+        gone.cancel()
 
 
 def _outcome(future: asyncio.Future[Encoded]) -> Encoded | Exception:

@@ -254,9 +254,8 @@ class Indexer:
         while newest.coded < newest.rows:
             newest = self._let_go(self._code_group(newest.coded))
             self._report(newest.coded, newest.rows)
-        for number, segment in enumerate(newest.segments):
-            if segment.held is not None and not newest.holds:
-                self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
+        if not newest.holds:
+            self._free(newest, len(newest.segments))
 
     def _code_group(self, start: int) -> Snapshot:
         """Add the codes of the next rows: those of a whole group from its file if that is good, else computed ones."""
@@ -294,9 +293,14 @@ class Indexer:
         """Free what has codes if the map has grown too large to hold its descriptors since its codes were begun."""
         if newest.holds and not self._holds(newest):
             newest = self._publish(lambda now: replace(now, holds=False))
-            for number in range(newest.coded // newest.rows_per_segment):
-                if newest.segments[number].held is not None:
-                    newest = self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
+            newest = self._free(newest, newest.coded // newest.rows_per_segment)
+        return newest
+
+    def _free(self, newest: Snapshot, count: int) -> Snapshot:
+        """Free the descriptors in memory of the first ``count`` segments."""
+        for number in range(count):
+            if newest.segments[number].held is not None:
+                newest = self._publish(lambda now, number=number: now.holding(number, None))  # type: ignore[misc]
         return newest
 
     def keep_up(self) -> None:

@@ -17,7 +17,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from threading import Barrier
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,17 +248,8 @@ class Snapshot:
             IndexError: there is no such row.
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
-        self._check_rows(rows)
         found = np.empty((len(rows), *self.local_shape), np.int8)
-        held = self._held[rows]
-        for position in np.flatnonzero(held).tolist():
-            number, offset = divmod(int(rows[position]), self.rows_per_segment)
-            found[position] = self.segments[number].local[offset]
-        if not held.all():
-            assert self.row_reader is not None
-            wanted = rows[~held]
-            with self.guard():
-                found[~held] = self.row_reader.locals(wanted, self._checksums(wanted))
+        self._read(rows, found, lambda segment, offset: segment.local[offset], RowReader.locals)
         return found
 
     def descriptors_at(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -268,18 +259,28 @@ class Snapshot:
             IndexError: there is no such row.
             UnknownPlace: the place of a row was deleted, and its segment was removed.
         """
-        self._check_rows(rows)
         found = np.empty((len(rows), self.dimension), np.float32)
+        self._read(rows, found, lambda segment, offset: vectors(segment.index)[offset], RowReader.descriptors)
+        return found
+
+    def _read(
+        self,
+        rows: NDArray[np.int64],
+        found: NDArray[Any],
+        in_memory: Callable[[Segment, int], NDArray[Any]],
+        on_disk: Callable[[RowReader, NDArray[np.int64], NDArray[np.uint32]], NDArray[Any]],
+    ) -> None:
+        """Fill ``found`` with what is kept of rows, by what gives a held row of a segment and what reads others."""
+        self._check_rows(rows)
         held = self._held[rows]
         for position in np.flatnonzero(held).tolist():
-            segment = self.segments[int(rows[position]) // self.rows_per_segment]
-            found[position] = vectors(segment.index)[int(rows[position]) - segment.first_row]
+            number, offset = divmod(int(rows[position]), self.rows_per_segment)
+            found[position] = in_memory(self.segments[number], offset)
         if not held.all():
             assert self.row_reader is not None
             wanted = rows[~held]
             with self.guard():
-                found[~held] = self.row_reader.descriptors(wanted, self._checksums(wanted))
-        return found
+                found[~held] = on_disk(self.row_reader, wanted, self._checksums(wanted))
 
     def appended(
         self,

@@ -29,6 +29,7 @@ from service.engine.queue import AHEAD, EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
+from tests.service.engine.busy import keep_busy
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server
 from tests.service.wire import eventually
@@ -61,27 +62,17 @@ class Watched:
 
         def noted() -> tuple[QueuedFrame, bool] | None:
             with self.threads._changed:
-                if (found := take()) is not None and found[0] not in self._held:
+                if (found := take()) is not None:
                     self.taken.append(found[0])
                 return found
 
-        self._held: list[QueuedFrame] = []
         self.threads._next = noted  # type: ignore[method-assign]
         self.hold()()  # they wait in the method of before
 
     def hold(self) -> Callable[[], None]:
         """Keep the threads busy until what is returned is called."""
-        free, begun = threading.Event(), threading.Semaphore(0)
-
-        def wait(_: Encoded) -> None:
-            begun.release()
-            free.wait(30)
-
-        held = [self.frame(0, after_encoding=wait) for _ in range(torch.get_num_threads())]
-        self._held += held
-        self.threads.put(held)
-        for _ in held:
-            assert begun.acquire(timeout=30)
+        held, free = keep_busy(self.threads, self._encoders[DEFAULT_ENCODER])
+        self.taken = [frame for frame in self.taken if frame not in held]
         return free.set
 
     def wait_until_idle(self) -> None:
@@ -311,19 +302,7 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
         await asyncio.sleep(0.2)
 
     encoder = await queue.load(EncoderCatalogue().resolve(DEFAULT_ENCODER))
-    free, begun = threading.Event(), threading.Semaphore(0)
-
-    def wait(_: Encoded) -> None:
-        begun.release()
-        free.wait(30)
-
-    held = [
-        QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=wait)
-        for _ in range(torch.get_num_threads())
-    ]
-    queue._threads.put(held)
-    for _ in held:
-        assert begun.acquire(timeout=30)
+    _, free = keep_busy(queue._threads, encoder)
     deadline = RequestDeadline(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
     if fault is DeadlineExceeded:
         deadline = RequestDeadline(deadline.at, stays)

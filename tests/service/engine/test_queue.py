@@ -12,16 +12,15 @@ from statistics import median
 
 import httpx
 import pytest
-import torch
 
 from core.errors import NotAnImage, UnknownEncoder
 from core.frames.images import Limits
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
-from service.engine.encoder_threads import Encoded, QueuedFrame
 from service.engine.queue import EncoderQueue, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
+from tests.service.engine.busy import keep_busy
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import Server, assert_problem
 
@@ -49,20 +48,7 @@ async def queue() -> AsyncIterator[EncoderQueue]:
 @pytest.fixture
 def busy(queue: EncoderQueue) -> Iterator[threading.Event]:
     """The encoder's threads are at work until the event is set."""
-    done, begun = threading.Event(), threading.Semaphore(0)
-
-    def work(_: Encoded) -> None:
-        begun.release()
-        done.wait(30)
-
-    encoder = queue._loaded[IDENTITY]
-    frames = [
-        QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=work)
-        for _ in range(torch.get_num_threads())
-    ]
-    queue._threads.put(frames)
-    for _ in frames:
-        assert begun.acquire(timeout=30)
+    _, done = keep_busy(queue._threads, queue._loaded[IDENTITY])
     yield done
     done.set()
 

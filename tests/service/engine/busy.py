@@ -1,0 +1,30 @@
+"""Encoder threads that are at work until a test lets them go on."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import torch
+
+from core.method.encoder import Encoder
+from service.engine.encoder_threads import Encoded, EncoderThreads, QueuedFrame
+from tests.service.scenes import jpeg
+
+
+def keep_busy(encoder_threads: EncoderThreads, encoder: Encoder) -> tuple[list[QueuedFrame], threading.Event]:
+    """Give every thread a frame that it does not finish until the event is set; those frames, and the event."""
+    done, begun = threading.Event(), threading.Semaphore(0)
+
+    def wait(_: Encoded) -> None:
+        begun.release()
+        done.wait(30)
+
+    frames = [
+        QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=wait)
+        for _ in range(torch.get_num_threads())
+    ]
+    encoder_threads.put(frames)
+    for _ in frames:
+        assert begun.acquire(timeout=30)
+    return frames, done
