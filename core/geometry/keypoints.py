@@ -115,6 +115,30 @@ def keypoints_of(row: NDArray[np.void]) -> Keypoints:
     return Keypoints(int(row["width"]), int(row["height"]), np.array(row["positions"][:count]), descriptors)
 
 
+@dataclass(frozen=True)
+class View:
+    """A frame as the network sees it.
+
+    pixels: uint8 [rows, columns, 3], BGR; the size is that of :func:`shown_size`.
+    width, height: of the frame, in pixels.
+    mask: hides a part of the frame, in which there are no keypoints then.
+    """
+
+    pixels: Pixels
+    width: int
+    height: int
+    mask: Mask | None = None
+
+    @classmethod
+    def of(cls, pixels: Pixels, mask: Mask | None = None) -> View:
+        """The view of a frame, uint8 [H, W, 3], BGR, of any size."""
+        height, width = pixels.shape[:2]
+        columns, rows = shown_size(width, height)
+        interpolation = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
+        shown = cv2.resize(pixels, (columns, rows), interpolation=interpolation)
+        return cls(np.asarray(shown, np.uint8), width, height, mask)
+
+
 def shown_size(width: int, height: int) -> tuple[int, int]:
     """Width and height at which the network sees a frame: the longer side LONGEST_SIDE, both multiples of MULTIPLE."""
     scale = LONGEST_SIDE / max(width, height)
@@ -129,21 +153,24 @@ def find_keypoints(network: XFeat, pixels: Pixels, mask: Mask | None = None) -> 
         pixels: uint8 [H, W, 3], BGR, of any size.
         mask: hides a part of the frame, in which there are no keypoints then.
     """
-    height, width = pixels.shape[:2]
-    columns, rows = shown_size(width, height)
-    interpolation = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
-    maps = network(np.asarray(cv2.resize(pixels, (columns, rows), interpolation=interpolation), np.uint8))
+    return keypoints_in(network, View.of(pixels, mask))
+
+
+def keypoints_in(network: XFeat, view: View) -> Keypoints:
+    """The keypoints of the frame of a view; a blank frame has none."""
+    rows, columns = view.pixels.shape[:2]
+    maps = network(view.pixels)
     highest = cv2.dilate(maps.heat, np.ones((NEIGHBORHOOD, NEIGHBORHOOD), np.uint8))
     found = (maps.heat == highest) & (maps.heat > LEAST_HEAT)
-    if mask is not None:
-        found &= ~mask.covered(rows, columns)
+    if view.mask is not None:
+        found &= ~view.mask.covered(rows, columns)
     y, x = np.nonzero(found)
     reliability = cv2.resize(maps.reliability, (columns, rows), interpolation=cv2.INTER_LINEAR)
     best = np.argsort(-maps.heat[y, x] * reliability[y, x], kind="stable")[:MOST]
     x, y = x[best], y[best]
     centres = np.stack([(x + 0.5) / columns, (y + 0.5) / rows], axis=1)
     positions = np.minimum(centres * SHARES, SHARES - 1).astype(np.uint16)
-    return Keypoints(width, height, positions, _descriptors_at(maps.descriptors, x, y))
+    return Keypoints(view.width, view.height, positions, _descriptors_at(maps.descriptors, x, y))
 
 
 def _descriptors_at(maps: NDArray[np.float32], x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int8]:
