@@ -234,7 +234,7 @@ def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
     made = Keyed(tmp_path_factory.mktemp("keyed"))
     for name in ("lab", "yard"):
         made.server.create_map(name)
-        assert made.server.enrol(name, "p1", jpeg(1)).status_code == 201
+        assert made.server.enrol(name, "p1", jpeg(1), sequence="monday").status_code == 201
     yield made
     assert made.server.stop() == 0
     log = made.server.log_file.read_text()
@@ -357,6 +357,7 @@ def test_every_change_is_told_with_who_made_it(keyed: Keyed) -> None:
         assert edited.status_code == 200
         operator.delete("/v1/maps/lab/places/absent", headers={"X-Request-Id": "a-miss"})
         operator.patch("/v1/maps/lab", json={}, headers={"X-Request-Id": "a-refusal"})
+    keyed.server.enrol("lab", "beside", jpeg(1, width=300), sequence="monday")  # else there is nothing to prune
     job = keyed.server.client.post("/v1/maps/lab/prune", json={"dry_run": True}, headers={"X-Request-Id": "a-job"})
     keyed.server.client.post("/v1/maps/lab/verify?background=true", headers={"X-Request-Id": "a-look"})
 
