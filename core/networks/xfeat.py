@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +149,16 @@ def load_xfeat(path: Path = PACKAGED_XFEAT) -> XFeat:
     except (OSError, SafetensorError) as error:
         raise InvalidModel(f"{path.name} is not a readable file of weights: {error}") from error
     return XFeat(weights)
+
+
+@cache
+def packaged_xfeat() -> XFeat:
+    """The packaged network, which is loaded once; this takes a tenth of a second.  Thread-safe.
+
+    Raises:
+        InvalidModel: its file is missing or damaged.
+    """
+    return load_xfeat()
 
 
 def xfeat_graph(weights: Mapping[str, Array]) -> ModelProto:

@@ -24,7 +24,9 @@ from core.frames.containers import read_header
 from core.frames.images import Limits, decode
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
+from core.geometry.keypoints import Keypoints, View, keypoints_in
 from core.method.encoder import Encoder, Encoding
+from core.networks.xfeat import packaged_xfeat
 from core.threads import cores, keep_to, use_threads
 from service.errors.faults import DeadlineExceeded
 
@@ -43,7 +45,9 @@ class Encoded:
 
     encoder: the encoder that has encoded it.
     pixels: uint8 [H, W, 3], BGR.
-    milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions`` and ``vlad``.
+    milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
+    mask: the part of the frame that was ignored.
+    keypoints: its keypoints, if they were asked for.
     search_result: what the frame's ``after_encoding`` returned for it; None if it had none, or that failed.
     """
 
@@ -51,11 +55,27 @@ class Encoded:
     encoding: Encoding
     encoder: Encoder
     milliseconds: dict[str, float]
+    mask: Mask | None = None
+    keypoints: Keypoints | None = None
     search_result: Any = None
+    _view: View | None = None
 
-    def without_pixels(self) -> Encoded:
-        """A copy with 0 x 0 pixels, for frames that stay in memory for a while."""
-        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8))
+    @property
+    def view(self) -> View:
+        """The frame as keypoints are found in it."""
+        return self._view or View.of(self.pixels, self.mask)
+
+    def find_keypoints(self) -> Keypoints:
+        """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
+        return self.keypoints or keypoints_in(packaged_xfeat(), self.view)
+
+    def without_pixels(self, keep_view: bool = False) -> Encoded:
+        """A copy with 0 x 0 pixels, for frames that stay in memory for a while.
+
+        Args:
+            keep_view: keep what keypoints are found in, at most 0.7 MB.
+        """
+        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8), _view=self.view if keep_view else None)
 
 
 AfterEncoding = Callable[[Encoded], object]
@@ -70,6 +90,7 @@ class QueuedFrame:
     mask: the part of the frame that is ignored.
     deadline: the ``time.monotonic`` after which its encoding is not begun any more.
     bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
+    keypoints: whether the frame's keypoints are wanted, too.
     after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
         only milliseconds.
     result: the encoded frame, or the error that kept it from being encoded.
@@ -82,6 +103,7 @@ class QueuedFrame:
     mask: Mask | None
     deadline: float
     bulk: bool = False
+    keypoints: bool = False
     after_encoding: AfterEncoding | None = None
     result: Future[Encoded] = field(default_factory=Future)
     queued: float = field(default_factory=time.perf_counter)
@@ -187,13 +209,18 @@ class EncoderThreads:
             pixels = decode(frame.data, self._limits)
             decoded = time.perf_counter()
             encoding = frame.encoder.encode(pixels, frame.mask)
+            encoded_at = time.perf_counter()
+            wanted = frame.keypoints and len(encoding.regions) > 0
+            keypoints = keypoints_in(packaged_xfeat(), View.of(pixels, frame.mask)) if wanted else None
         except Exception as error:
             if not isinstance(error, InvalidImage | DeadlineExceeded):
                 log.exception("a frame could not be encoded")
             frame.result.set_exception(error)
             return
         times = {"wait": 1e3 * (began - frame.queued), "decode": 1e3 * (decoded - began), **encoding.milliseconds}
-        encoded = Encoded(pixels, encoding, frame.encoder, times)
+        if wanted:
+            times["keypoints"] = 1e3 * (time.perf_counter() - encoded_at)
+        encoded = Encoded(pixels, encoding, frame.encoder, times, frame.mask, keypoints)
         if frame.after_encoding is not None:
             with suppress(Exception):  # Searches repeats the search and reports the error
                 encoded = replace(encoded, search_result=frame.after_encoding(encoded))

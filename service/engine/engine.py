@@ -201,15 +201,19 @@ class Engine:
         deadline: RequestDeadline,
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
+        keypoints: bool = False,
     ) -> Encoded:
         """Encode a frame with a map's encoder; call it within ``queue.place``.
+
+        Args:
+            keypoints: whether the frame's keypoints are wanted, too.
 
         Raises:
             EncoderNotInstalled: the map's encoder is not installed.
             Others: see ``EncoderQueue.encode``.
         """
         try:
-            return await self.queue.encode(map_.record.encoder, data, deadline, mask, after_encoding)
+            return await self.queue.encode(map_.record.encoder, data, deadline, mask, after_encoding, keypoints)
         except UnknownEncoder as error:
             raise EncoderNotInstalled(str(error)) from error
 
@@ -246,16 +250,18 @@ class Engine:
         frames: Sequence[bytes],
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
+        keypoints: bool = False,
     ) -> AsyncGenerator[Outcomes]:
         """Encode many frames by ``EncoderQueue.encode_many``; close the generator (``contextlib.aclosing``).
 
         Args:
             identity: the identity of the map's encoder.
+            keypoints: whether the frames' keypoints are wanted, too.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.
         """
-        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks)) as outcomes:
+        async with aclosing(self.queue.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
             try:
                 async for some in outcomes:
                     yield some
@@ -268,17 +274,23 @@ class Engine:
         frames: Sequence[bytes],
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
+        keypoints: bool = False,
+        keep_views: bool = False,
     ) -> list[Encoded | Exception]:
         """Encode many frames: each frame, without its pixels, or the error that kept it from being encoded.
+
+        Args:
+            keypoints: whether the frames' keypoints are wanted, too.
+            keep_views: keep of each frame what keypoints are found in.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.
         """
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many(identity, frames, deadline, masks)) as outcomes:
+        async with aclosing(self.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
-                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels()
+                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_views)
         return [made[index] for index in range(len(frames))]
 
     def assert_encoder(self, map_: Map, asserted: str | None) -> None:

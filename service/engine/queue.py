@@ -144,12 +144,14 @@ class EncoderQueue:
         deadline: RequestDeadline,
         mask: Mask | None = None,
         after_encoding: AfterEncoding | None = None,
+        keypoints: bool = False,
     ) -> Encoded:
         """Wait in the queue, then decode and encode one frame; call it within ``place``.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
             mask: the part of the frame that is ignored.
+            keypoints: whether the frame's keypoints are wanted, too.
             after_encoding: see :class:`QueuedFrame`.
 
         Raises:
@@ -158,7 +160,9 @@ class EncoderQueue:
             UnknownEncoder, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
-        frame = QueuedFrame(encoder, data, mask, deadline.at, after_encoding=after_encoding)
+        frame = QueuedFrame(
+            encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding
+        )
         self._threads.put([frame])
         result = asyncio.wrap_future(frame.result)
         try:
@@ -178,6 +182,7 @@ class EncoderQueue:
         frames: Sequence[bytes],
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
+        keypoints: bool = False,
     ) -> AsyncGenerator[Outcomes]:
         """Encode the frames of a bulk request; call it within ``place``.
 
@@ -187,6 +192,7 @@ class EncoderQueue:
         Args:
             frames: the bytes of the files.
             masks: for each frame the part that is ignored; None: all frames are used whole.
+            keypoints: whether the frames' keypoints are wanted, too.
 
         Yields:
             Frames that are done, with their indices, as they are done.  An error concerns one frame.
@@ -204,7 +210,7 @@ class EncoderQueue:
         try:
             while begun < len(frames) or open_:
                 following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
-                queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk) for i in following]
+                queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk, keypoints) for i in following]
                 self._threads.put(queued)
                 open_ |= {
                     asyncio.wrap_future(frame.result): (i, frame) for i, frame in zip(following, queued, strict=True)
