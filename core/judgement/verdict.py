@@ -22,6 +22,9 @@ probability is left.
 Rivals can be the reason why nothing stands out: a second traverse of the same places, or another place that looks the
 same.  They are left out of the background one after the other.  If the best match stands out of what is left, the
 verdict is ``ambiguous`` and names them; it would be wrong to call such a frame unknown and to enrol it once more.
+
+Where candidates were verified geometrically, the evidence of the best match joins the decision value in one probability
+(``geometry.py``), which takes the threshold's place, and the margin is a lead in the final order of three stages.
 """
 
 from __future__ import annotations
@@ -35,10 +38,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.judgement.background import FULL, GUARD_FACTOR, TOP_PLACES, Background, Environment, background, unrelated
-from core.judgement.probability import Curve
+from core.judgement.geometry import Geometry, GeometryTerms, final_values
+from core.judgement.probability import Curve, sigmoid
 from core.places import Neighborhood, Whereabouts
 
-__all__ = ["TOP_PLACES", "Calibration", "Environment", "Judgement", "Rivals", "Verdict", "judge"]
+__all__ = ["TOP_PLACES", "Calibration", "Environment", "Judgement", "Rivals", "Verdict", "judge", "worth_verifying"]
 
 Verdict = Literal["recognized", "ambiguous", "unknown"]
 Positions = NDArray[np.int64]
@@ -52,6 +56,9 @@ corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no shar
 MOST_RIVALS = 8
 """So many rivals, each with its neighbours, are looked at; they are the best ones."""
 
+HOPELESS, CERTAIN = 0.05, 0.95
+"""Between these probabilities two stages leave doubt."""
+
 
 class Calibration(BaseModel):
     """When to believe a match; measured on frames held out of training.
@@ -61,7 +68,8 @@ class Calibration(BaseModel):
     frames, in units of the score.  ``curve`` tells how probable a decision value is right; a calibration on
     frames that are all alike has none.  ``decision`` names the decision value, of which there is one.
     ``environment`` describes the scores of other places of one environment, which stand for those that a small map does
-    not have yet; calibrations of placerec 0.1.0 have none, and mean what they meant.
+    not have yet; calibrations of placerec 0.1.0 have none, and mean what they meant.  ``geometry`` says how geometric
+    evidence joins the probability; without it, or without a curve, evidence changes the order of the candidates only.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -78,6 +86,11 @@ class Calibration(BaseModel):
         default=None,
         exclude_if=lambda environment: environment is None,
         description="Scores of other places within one environment; calibrations of version 0.1 have none.",
+    )
+    geometry: GeometryTerms | None = Field(
+        default=None,
+        exclude_if=lambda terms: terms is None,
+        description="How geometric evidence joins the probability; calibrations of version 0.1 have none.",
     )
 
     def background(
@@ -113,11 +126,12 @@ class Judgement:
 
     score: of the best match.
     decision: the decision value.
-    margin: the lead over the best rival.
+    margin: the lead over the best rival, in the order of the ranking: of scores, or of three stages.
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
     rivals: what makes the query ambiguous; empty for other verdicts.
+    evidence: what verification found of the best match, -ln of the number of false alarms; None if it was not verified.
     """
 
     verdict: Verdict
@@ -128,10 +142,33 @@ class Judgement:
     probability: float | None = None
     imagined: float = 0.0
     rivals: tuple[Rivals, ...] = ()
+    evidence: float | None = None
+
+
+def log_odds_of(
+    decision: float, calibration: Calibration, imagined: float = 0.0, evidence: float | None = None
+) -> float | None:
+    """The log odds that the best match is right, its rivals left out of account; None without a curve.
+
+    Args:
+        decision: the decision value.
+        imagined: the share of the background that was imagined.
+        evidence: of the best match; None if it was not verified.
+    """
+    if calibration.curve is None:
+        return None
+    two_stages = calibration.curve.log_odds(decision, imagined)
+    if evidence is None or calibration.geometry is None:
+        return float(two_stages)
+    return float(calibration.geometry.log_odds(two_stages, evidence))
 
 
 def probability_of(
-    decision: float, margin: float | None, calibration: Calibration, imagined: float = 0.0
+    decision: float,
+    margin: float | None,
+    calibration: Calibration,
+    imagined: float = 0.0,
+    evidence: float | None = None,
 ) -> float | None:
     """The probability that the best match is right, by the calibration's curve and the lead over the best rival.
 
@@ -139,16 +176,56 @@ def probability_of(
         decision: the decision value.
         margin: the lead over the best rival, at least 0; None without a rival.
         imagined: the share of the background that was imagined.
+        evidence: of the best match; None if it was not verified.
 
     Returns:
         In (0, 1); None if the calibration has no curve.
     """
-    if calibration.curve is None:
+    odds = log_odds_of(decision, calibration, imagined, evidence)
+    if odds is None:
         return None
-    clear = 1.0
+    clear, least = 1.0, least_margin(calibration, evidence)
     if margin is not None:
-        clear = min(1.0, max(0.0, margin) / calibration.margin) if calibration.margin else float(margin > 0)
-    return calibration.curve.probability(decision, imagined) * (1 + clear) / 2
+        clear = min(1.0, max(0.0, margin) / least) if least else float(margin > 0)
+    return float(sigmoid(np.array([odds]))[0]) * (1 + clear) / 2
+
+
+def least_margin(calibration: Calibration, evidence: float | None) -> float:
+    """The lead under which an answer is ambiguous, given the evidence of the best match; None: it was not verified."""
+    return calibration.margin if evidence is None or calibration.geometry is None else calibration.geometry.margin
+
+
+def stands_out(decision: float, calibration: Calibration, imagined: float = 0.0, evidence: float | None = None) -> bool:
+    """Whether a best match is believed if its lead is large enough.
+
+    By the decision value alone, or by the probability of three stages where it was verified.  The arguments are those
+    of :func:`log_odds_of`.
+    """
+    if evidence is None or calibration.geometry is None or calibration.curve is None:
+        return decision >= calibration.threshold
+    odds = log_odds_of(decision, calibration, imagined, evidence)
+    return odds is not None and float(sigmoid(np.array([odds]))[0]) >= calibration.geometry.threshold
+
+
+def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
+    """Whether ``verify=auto`` verifies candidates after this judgement, because it leaves doubt.
+
+    It is asked after two stages, and again after the best match alone was verified, whose evidence may settle it.
+
+    Args:
+        judgement: of two stages; or of three, after the best match was verified.
+        calibration: by which it was judged.
+
+    Returns:
+        False for an empty map, and for a calibration that cannot weigh evidence.
+    """
+    if calibration.geometry is None or judgement.probability is None:
+        return False
+    if judgement.evidence is not None:
+        return judgement.verdict != "recognized"
+    if judgement.imagined > 0 or judgement.verdict == "ambiguous":
+        return True
+    return HOPELESS < judgement.probability < CERTAIN
 
 
 def judge(
@@ -158,11 +235,13 @@ def judge(
     neighborhood: Neighborhood,
     examined: int | NDArray[np.bool_] = 0,
     likeness: Likeness | None = None,
+    geometry: Geometry | None = None,
 ) -> Judgement:
     """Judge one query.
 
     Args:
-        scores: float32 [n], best first: of the query against all places of the map, or against the best of them.
+        scores: float32 [n], best first: of the query against all places of the map, or against the best of them.  With
+            ``geometry``, they are the scores of two stages in the final order of three (``geometry.final_order``).
         whereabouts: of the same n places in the same order.
         calibration: of the map or of the encoder.
         neighborhood: which places are the same place and so no rivals of each other.
@@ -170,48 +249,54 @@ def judge(
             0: it has no second stage.
         likeness: compares the best match with its rivals; it is called at most once, and only where rivals matter.
             None: which rivals show the same place is not known, and they explain nothing.
+        geometry: what verification found of the n places, in the same order; None: none was verified.
 
     Returns:
-        ``unknown`` for an empty map, and for a decision value under the threshold that rivals do not explain;
-        ``ambiguous`` where they do, and for a lead over the best rival under the margin; else ``recognized``.
+        ``unknown`` for an empty map, and for a best match that does not stand out, which rivals do not explain;
+        ``ambiguous`` where they do, and for a lead over the best rival under the margin; else ``recognized``.  A best
+        match stands out by its decision value, or by the probability of three stages if it was verified.
     """
     if len(scores) == 0:
         return Judgement("unknown", None, None, None, None)
-    ranking = _Ranking.of(scores, whereabouts, calibration, neighborhood, examined)
-    best, others = float(scores[0]), ranking.others
+    ranking = _Ranking.of(scores, whereabouts, calibration, neighborhood, examined, geometry)
+    best, others, evidence = float(scores[0]), ranking.others, ranking.evidence
     behind = ranking.background()
     decision = behind.decision(best)
     rival = int(others[0]) if len(others) else None
-    margin = None if rival is None else best - float(scores[rival])
+    margin = None if rival is None else float(ranking.values[0]) - float(ranking.values[rival])
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
-    if decision < calibration.threshold:
+    if not stands_out(decision, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
-    elif margin is not None and margin < calibration.margin:
+    elif margin is not None and margin < ranking.least_margin:
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
-    probability = probability_of(decision, margin, calibration, behind.imagined)
-    return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals)
+    probability = probability_of(decision, margin, calibration, behind.imagined, evidence)
+    return Judgement(verdict, best, decision, margin, rival, probability, behind.imagined, rivals, evidence)
 
 
 @dataclass(frozen=True)
 class _Ranking:
     """A ranking, and which of its places are other than the best match.
 
+    values: float [n], by which the places are ordered, best first: the scores, or those of three stages.
     others: int64 [m], positions of the other places.
     compared: int64 [k], those of them whose scores are compared with the best.
     apart: bool [n], the places that cannot overlap with the best match.
+    evidence: of the best match; None if it was not verified.
     """
 
     scores: NDArray[np.float32]
+    values: NDArray[np.floating]
     whereabouts: Whereabouts
     calibration: Calibration
     neighborhood: Neighborhood
     others: Positions
     compared: Positions
     apart: NDArray[np.bool_]
+    evidence: float | None
 
     @classmethod
     def of(
@@ -221,6 +306,7 @@ class _Ranking:
         calibration: Calibration,
         neighborhood: Neighborhood,
         examined: int | NDArray[np.bool_],
+        geometry: Geometry | None,
     ) -> _Ranking:
         """The arguments are those of :func:`judge`."""
         others = np.flatnonzero(~whereabouts.near(0, neighborhood))
@@ -229,7 +315,14 @@ class _Ranking:
         apart = np.ones(len(scores), np.bool_)
         if len(others) < FULL:  # nothing is estimated otherwise
             apart = ~whereabouts.near(0, neighborhood.times(GUARD_FACTOR))
-        return cls(scores, whereabouts, calibration, neighborhood, others, compared, apart)
+        values: NDArray[np.floating] = scores if geometry is None else final_values(scores, geometry.share)
+        evidence = None if geometry is None else geometry.best
+        return cls(scores, values, whereabouts, calibration, neighborhood, others, compared, apart, evidence)
+
+    @property
+    def least_margin(self) -> float:
+        """The lead under which the answer is ambiguous."""
+        return least_margin(self.calibration, self.evidence)
 
     def background(self, left_out: NDArray[np.bool_] | None = None) -> Background:
         """The background without some places, bool [n]."""
@@ -237,7 +330,8 @@ class _Ranking:
         if left_out is not None:
             compared, others = compared[~left_out[compared]], int((~left_out[self.others]).sum())
         apart = compared[self.apart[compared]]
-        return self.calibration.background(self.scores[compared], others, self.scores[apart])
+        falling = np.sort(self.scores[compared])[::-1]  # verification may have changed the order
+        return self.calibration.background(falling, others, self.scores[apart])
 
     def calm(self) -> Background:
         """The background without its best few, among which the rivals are."""
@@ -247,16 +341,19 @@ class _Ranking:
 
     def explaining_rivals(self, likeness: Likeness | None) -> tuple[Rivals, ...]:
         """The rivals without which the best match would stand out; empty if it would not."""
-        best, threshold = float(self.scores[0]), self.calibration.threshold
-        if likeness is None or self.calm().decision(best) < threshold:
-            return ()  # it would not stand out, whoever its rivals are
+        if likeness is None or not self.would_stand_out(self.calm()):
+            return ()  # whoever its rivals are
         heads = self.heads()
         alike = self.alike(heads, likeness)
         if not alike.any():
             return ()
         near = [self.whereabouts.near(head, self.neighborhood) for head in heads[alike].tolist()]
-        decision = self.background(np.logical_or.reduce(near)).decision(best)
-        return self.grouped(heads, alike) if decision >= threshold else ()
+        return self.grouped(heads, alike) if self.would_stand_out(self.background(np.logical_or.reduce(near))) else ()
+
+    def would_stand_out(self, behind: Background) -> bool:
+        """Whether the best match would stand out of another background."""
+        decision = behind.decision(float(self.scores[0]))
+        return stands_out(decision, self.calibration, behind.imagined, self.evidence)
 
     def heads(self) -> Positions:
         """The best few of the other places, without neighbours of a better one; int64 [k]."""
@@ -276,6 +373,6 @@ class _Ranking:
 
     def grouped(self, heads: Positions, alike: NDArray[np.bool_]) -> tuple[Rivals, ...]:
         """The rivals that show the same place as the best match, and each other one that scores nearly as well."""
-        near = self.scores[0] - self.scores[heads] < self.calibration.margin
+        near = self.values[0] - self.values[heads] < self.least_margin
         same = (Rivals(tuple(heads[alike].tolist()), True),) if alike.any() else ()
         return same + tuple(Rivals((head,), False) for head in heads[near & ~alike].tolist())

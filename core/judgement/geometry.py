@@ -1,0 +1,101 @@
+"""What geometric verification adds to a judgement: the third stage.
+
+Verification (``core.geometry.verification``) tells of a candidate how many of its keypoints fit the query's, and how
+surprising that is, the evidence e.  The share of inliers puts the candidates into their final order,
+
+    score + WEIGHT · inliers / min(keypoints of both),
+
+and the evidence of the best match joins the log odds L of the first two stages in one probability,
+
+    log odds = support · L + slope · ln(1 + e) + intercept.
+
+Evidence needs no other place to be compared with, so it says in a map of one place what it says in a large one.  Where
+two stages say next to nothing, as in a small map, the evidence decides; where a picture can give no evidence, they do.
+
+A rival takes away from the certainty of an answer as far as it fits as well: its lead is measured in the final order.
+Two places of one picture are so ``ambiguous``, however much evidence both have, and a best match that fits, of whose
+rivals none does, is ``recognized`` even if its lead in score is small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["WEIGHT", "Geometry", "GeometryTerms", "final_order", "final_values"]
+
+Values = NDArray[np.float64]
+
+WEIGHT = 0.7
+"""Of the share of inliers beside a score.  It is the least that has nine tenths of what any weight gains in recall@1 on
+tasks made of training photographs (``benchmarks.geometry.verification``)."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What verification found of the candidates of a ranking, in its order; NaN where one was not verified.
+
+    evidence: float64 [n], at least 0.
+    share: float64 [n], inliers by the number of keypoints of the picture that has fewer, in [0, 1].
+
+    Raises:
+        ValueError: the arrays differ in shape, or in which candidates were verified.
+    """
+
+    evidence: Values
+    share: Values
+
+    def __post_init__(self) -> None:
+        if self.evidence.shape != self.share.shape or (np.isnan(self.evidence) != np.isnan(self.share)).any():
+            raise ValueError("evidence and share are of the same candidates")
+
+    @property
+    def best(self) -> float | None:
+        """The evidence of the first candidate; None if it was not verified, or there is none."""
+        return None if not len(self.evidence) or np.isnan(self.evidence[0]) else float(self.evidence[0])
+
+    def take(self, kept: NDArray[np.int64]) -> Geometry:
+        """What was found of the candidates at some positions, int64 [m]."""
+        return Geometry(self.evidence[kept], self.share[kept])
+
+
+class GeometryTerms(BaseModel):
+    """How evidence joins the log odds of the first two stages (see the module); the same for every encoder.
+
+    ``margin`` is the lead in the final order under which an answer is ambiguous.  A match that was verified is believed
+    from the probability ``threshold`` on, rivals left out of account.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    support: float = Field(ge=0, allow_inf_nan=False, description="Weight of the log odds of the first two stages.")
+    slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by an evidence e times greater.")
+    intercept: float = Field(allow_inf_nan=False, description="Log odds where neither says anything.")
+    margin: float = Field(ge=0, allow_inf_nan=False, description="Least lead in the final order.")
+    threshold: float = Field(gt=0, lt=1, description="Probability from which on a verified match is believed.")
+
+    def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike) -> Values:
+        """The log odds of three stages, from those of two and from the evidence; all of one shape."""
+        before, found = np.asarray(two_stages, np.float64), np.asarray(evidence, np.float64)
+        return np.asarray(self.support * before + self.slope * np.log1p(found) + self.intercept, np.float64)
+
+
+def final_values(scores: NDArray[np.floating], share: Values) -> Values:
+    """The values by which three stages order candidates, float64 [n]; one that was not verified keeps its score.
+
+    Args:
+        scores: float [n], of two stages, changed by a prior if there is one.
+        share: float64 [n], see :class:`Geometry`.
+    """
+    return scores.astype(np.float64) + WEIGHT * np.nan_to_num(share)
+
+
+def final_order(scores: NDArray[np.floating], share: Values) -> NDArray[np.int64]:
+    """The order after verification, int64 [n], positions in the ranking of two stages, best first.
+
+    Equal values keep their order.  The arguments are those of :func:`final_values`.
+    """
+    return np.argsort(-final_values(scores, share), kind="stable")
