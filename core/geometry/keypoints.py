@@ -83,9 +83,13 @@ class Keypoints:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def shares(self) -> NDArray[np.float64]:
+        """Positions in shares of the frame's width and height, float64 [n, 2], x and y from its upper left corner."""
+        return (self.positions + 0.5) / SHARES
+
     def pixels(self) -> NDArray[np.float64]:
         """Positions in pixels of the frame, float64 [n, 2], x and y from its upper left corner."""
-        return (self.positions + 0.5) * np.array([self.width / SHARES, self.height / SHARES])
+        return self.shares() * np.array([self.width, self.height])
 
     def row(self) -> NDArray[np.void]:
         """The keypoints as one record of the type ROW."""

@@ -62,6 +62,11 @@ class Verification:
         """How many matches fit."""
         return int(self.inliers.sum())
 
+    @property
+    def inlier_share(self) -> float:
+        """Inliers by the number of keypoints of the picture that has fewer, in [0, 1]."""
+        return self.inlier_count / max(1, min(self.keypoints))
+
 
 def verify(query: Keypoints, candidates: Sequence[Keypoints]) -> list[Verification]:
     """Verify each candidate of a query; the same input gives the same result.

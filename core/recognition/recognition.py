@@ -1,6 +1,6 @@
 """Place recognition as an algorithm: from a picture to an answer, and from a picture to a place of a map.
 
-    answer = recognize(map_, picture, encoder)          # decode, encode, search, agree, judge
+    answer = recognize(map_, picture, encoder)          # decode, encode, search, agree, verify, judge
     place = enrol(map_, "p7", picture, encoder)         # decode, encode, store
 
 The service takes the same steps.  It decodes and encodes the frames of several requests together, and then calls
@@ -20,13 +20,16 @@ from core.errors import NoRegions
 from core.frames.images import decode, encode_thumbnail
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
+from core.geometry.keypoints import Keypoints, find_keypoints
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder, Encoding
+from core.networks.xfeat import packaged_xfeat
 from core.places import Place, PlaceFields
 from core.recognition.selection import Selection
 from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, rank_places
+from core.recognition.verification import NOT_VERIFIED, ThirdStage, Verifier, Verify, third_stage
 from core.storage import Enrolment, Map
 
 ATTEMPTS = 3
@@ -58,11 +61,12 @@ class Answer:
     matches: score and place of the best matches, best first; at most k.
     weights: the prior weight of each match, in (0, 1]; None if the query had no prior.
     calibration: the calibration by which the query was judged.
-    search: milliseconds spent on both stages of the search, the judgement and the look-up of the places; for several
-        queries that were searched for together, the mean.
+    search: milliseconds spent on the first two stages of the search, the judgement and the look-up of the places; for
+        several queries that were searched for together, the mean.
     pose: the estimated pose of the query, from the poses of the best match and its neighbours; None if they have none.
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them.
+    third_stage: whether the candidates were verified geometrically.
     rivals: what makes an answer ambiguous, the places of each group best first.
     """
 
@@ -74,6 +78,7 @@ class Answer:
     pose: PoseEstimate | None
     encoding: Encoding
     candidates: Candidates
+    third_stage: ThirdStage = NOT_VERIFIED
     rivals: tuple[RivalGroup, ...] = ()
 
     @property
@@ -94,6 +99,7 @@ def recognize(
     k: int = 5,
     selection: Selection | None = None,
     camera: str | None = None,
+    verify: Verify = "auto",
 ) -> Answer:
     """Find where a picture was taken.
 
@@ -103,6 +109,7 @@ def recognize(
         k: how many matches to list.
         selection: what is known of the place; None: nothing.
         camera: the name of the map's camera that took the picture, whose mask is applied; None: no mask.
+        verify: whether the geometry of the best candidates is verified; ``auto``: where the scores leave doubt.
 
     Raises:
         InvalidImage: the picture cannot be decoded.
@@ -111,10 +118,12 @@ def recognize(
         StorageFailure: the map's files cannot be read.
     """
     pixels = decode(picture)  # uint8 [H, W, 3]
-    encoding = encoder.encode(pixels, _mask(map_, camera))  # descriptor float32 [D], local descriptors int8 [C, L]
+    mask = _mask(map_, camera)
+    encoding = encoder.encode(pixels, mask)  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
         raise NoRegions("The picture has no region of interest: it is blank, or nearly so.")
-    (answer,) = locate(map_, encoder, [encoding], k, selection)
+    verifier = Verifier(verify, lambda: find_keypoints(packaged_xfeat(), pixels, mask))
+    (answer,) = locate(map_, encoder, [encoding], k, selection, [verifier])
     return answer
 
 
@@ -144,7 +153,9 @@ def enrol(
     pixels = decode(picture)
     encoding = encoder.encode(pixels, mask)
     digest = frame_digest(hashlib.sha256(picture).digest(), mask)
-    ((place, _change),) = map_.enrol([describe(map_, place_id, fields, picture, digest, pixels, encoding)])
+    keypoints = find_keypoints(packaged_xfeat(), pixels, mask) if map_.record.verification else None
+    described = describe(map_, place_id, fields, picture, digest, pixels, encoding, keypoints=keypoints)
+    ((place, _change),) = map_.enrol([described])
     return place
 
 
@@ -173,6 +184,7 @@ def describe(
     pixels: Pixels,
     encoding: Encoding,
     thumbnail_side: int = THUMBNAIL_SIDE,
+    keypoints: Keypoints | None = None,
 ) -> Enrolment:
     """The record that a map stores of an encoded frame: its descriptors, fields, and the picture that the map keeps.
 
@@ -181,6 +193,7 @@ def describe(
         digest: the frame's ``frame_digest``.
         pixels: uint8 [H, W, 3], BGR.
         thumbnail_side: the longer side of the thumbnail, in pixels.
+        keypoints: of the frame; None: the place has none to be verified by.
 
     Raises:
         NoRegions: the frame is blank, or nearly so.
@@ -197,11 +210,17 @@ def describe(
         digest=digest,
         thumbnail=encode_thumbnail(pixels, thumbnail_side) if keep == "thumbnail" else None,
         image=picture if keep == "image" else None,
+        keypoints=keypoints,
     )
 
 
 def locate(
-    map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
+    map_: Map,
+    encoder: Encoder,
+    encodings: Sequence[Encoding],
+    k: int,
+    selection: Selection | None = None,
+    verifiers: Sequence[Verifier | None] | None = None,
 ) -> list[Answer]:
     """Search a map for queries that are encoded already, and judge each.
 
@@ -210,61 +229,86 @@ def locate(
         encodings: the queries, encoded by it, each with at least one region; at least one query.
         k: how many matches to list.
         selection: what is known of the places; None: nothing.
+        verifiers: for each query when to verify its candidates, and its keypoints; None: never.
 
     Returns:
         One answer for each query, in order.
 
     Raises:
         StorageFailure: the map's files cannot be read.
+        InvalidModel: the network of keypoints cannot be loaded.
     """
     began = time.perf_counter()
     ranked = rank_places(map_, encoder, encodings, selection)  # both stages of the search
     answers = [
-        _answer(map_, encoder, encoding, candidates, k, selection)
-        for encoding, candidates in zip(encodings, ranked, strict=True)
+        _answer(map_, encoder, encoding, candidates, k, selection, verifier)
+        for encoding, candidates, verifier in zip(encodings, ranked, verifiers or [None] * len(encodings), strict=True)
     ]
-    milliseconds = 1e3 * (time.perf_counter() - began) / len(encodings)
+    verifying = sum(answer.third_stage.milliseconds for answer in answers)
+    milliseconds = (1e3 * (time.perf_counter() - began) - verifying) / len(encodings)
     return [replace(answer, search=milliseconds) for answer in answers]
 
 
 def _answer(
-    map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, k: int, selection: Selection | None
+    map_: Map,
+    encoder: Encoder,
+    encoding: Encoding,
+    candidates: Candidates,
+    k: int,
+    selection: Selection | None,
+    verifier: Verifier | None,
 ) -> Answer:
-    """Look up the best places and judge the query; search again if one of them was deleted since the search."""
+    """Verify and judge the candidates, and look up the best places; again if one was deleted since the search."""
+
+    def judged(candidates: Candidates) -> Judgement:
+        return judge(
+            candidates.ordered,
+            candidates.whereabouts,
+            calibration_of(map_, encoder),
+            neighborhood_of(map_),
+            candidates.examined,
+            lambda positions: likeness(map_, encoder, candidates, positions),
+            candidates.geometry,
+        )
+
+    ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
     attempt = 1
-    while None in (places := _places(map_, candidates, k)) and attempt < ATTEMPTS:
+    while None in (places := _places(map_, ranked, k)) and attempt < ATTEMPTS:
         (candidates,) = rank_places(map_, encoder, [encoding], selection)
+        ranked, judgement, stage = third_stage(map_, encoder, candidates, judged, verifier)
         attempt += 1
     if None in places:  # places are being deleted all the time: go on without those that are gone
-        present = np.ones(len(candidates.rows), np.bool_)
+        present = np.ones(len(ranked.rows), np.bool_)
         present[: len(places)] = [place is not None for place in places]
-        candidates = candidates.take(np.flatnonzero(present))
-    return _judge(map_, encoder, encoding, candidates, [place for place in places if place is not None])
+        ranked = ranked.take(np.flatnonzero(present))
+        judgement = judged(ranked)
+    found = [place for place in places if place is not None]
+    return _told(map_, encoder, encoding, ranked, found, judgement, stage)
 
 
 def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
     return map_.places_at(candidates.rows[:k].tolist()) if len(candidates.rows) else []
 
 
-def _judge(map_: Map, encoder: Encoder, encoding: Encoding, candidates: Candidates, places: list[Place]) -> Answer:
-    """The verdict on a query by its candidates, of which ``places`` are the best."""
+def _told(
+    map_: Map,
+    encoder: Encoder,
+    encoding: Encoding,
+    candidates: Candidates,
+    places: list[Place],
+    judgement: Judgement,
+    stage: ThirdStage,
+) -> Answer:
+    """The answer by the judged candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
-    judgement = judge(
-        candidates.ordered,
-        candidates.whereabouts,
-        calibration,
-        neighborhood,
-        candidates.examined,
-        lambda positions: likeness(map_, encoder, candidates, positions),
-    )
     matches = [(float(score), place) for score, place in zip(candidates.scores, places, strict=False)]
     if matches:
         judgement = replace(judgement, score=matches[0][0])
-    log_odds = decision_slope(calibration) * candidates.ordered.astype(np.float64)
+    log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
     pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     rivals = _rivals(map_, candidates, judgement)
-    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, rivals)
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, stage, rivals)
 
 
 def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalGroup, ...]:

@@ -15,11 +15,17 @@ from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import ATTEMPTS, Answer, locate
 from core.recognition.selection import Selection
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
+from core.recognition.verification import Verifier
 from core.storage import Map
 
 
 def locate_rig(
-    map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
+    map_: Map,
+    encoder: Encoder,
+    encodings: Sequence[Encoding],
+    k: int,
+    selection: Selection | None = None,
+    verifiers: Sequence[Verifier | None] | None = None,
 ) -> Answer:
     """Search one snapshot of a map for the frames of a rig, and judge them as one query.
 
@@ -28,12 +34,13 @@ def locate_rig(
         encodings: the rig's frames that have regions, encoded by it; at least one.
         k: how many matches to list.
         selection: what is known of the place; None: nothing.
+        verifiers: for each frame when to verify its candidates; None: never.  Several frames are never verified.
 
     Raises:
         StorageFailure: the map's files cannot be read.
     """
     if len(encodings) == 1:
-        return locate(map_, encoder, encodings, k, selection)[0]
+        return locate(map_, encoder, encodings, k, selection, verifiers)[0]
     began = time.perf_counter()
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     for _attempt in range(ATTEMPTS):  # again, if places were deleted during the search
@@ -62,6 +69,7 @@ def _candidates_of_rig(fused: Fused, one: Candidates, steepness: float) -> Candi
         one,
         rows=fused.rows,
         scores=fused.scores,
+        first=None,
         whereabouts=fused.whereabouts,
         examined=np.full(len(fused.rows), one.examined.any()),
         weights=fused.weights,

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownPlace
+from core.geometry.verification import Verification
+from core.judgement.geometry import Geometry, final_values
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
 from core.method.agreement import Cells
@@ -42,20 +44,36 @@ class Candidates:
 
     rows: int64 [n], rows of the snapshot, best first.
     scores: float32 [n], the scores after both stages.
+    first: float32 [n], those of the first stage; None where several frames were fused.
     whereabouts: the poses and sequences of these places.
     examined: bool [n], which of them the second stage has compared with the query.
     weights: float64 [n], the log prior of each place; None if the query had no prior.
-    ordered: float32 [n], the values by which the places are ordered: the scores, changed by the prior.
+    ordered: float32 [n], the values by which two stages order the places: the scores, changed by the prior.
     places: the number of places in the map, including those that the query may not find.
+    geometry: what verification found of the places, which are in the order of three stages then; None: none was
+        verified.
+    verifications: of the first places, in their order; None for one that was not verified.
     """
 
     rows: Positions
     scores: Array
+    first: Array | None
     whereabouts: Whereabouts
     examined: NDArray[np.bool_]
     weights: Values | None
     ordered: Array
     places: int
+    geometry: Geometry | None = None
+    verifications: tuple[Verification | None, ...] = ()
+
+    @property
+    def values(self) -> NDArray[np.floating]:
+        """The values by which the places are in their order, float [n]: ``ordered``, and the share of inliers."""
+        return self.ordered if self.geometry is None else final_values(self.ordered, self.geometry.share)
+
+    def with_geometry(self, geometry: Geometry, verifications: tuple[Verification | None, ...]) -> Candidates:
+        """The candidates, which are in the order of three stages, with what verification found of them."""
+        return replace(self, geometry=geometry, verifications=verifications)
 
     def take(self, kept: Positions) -> Candidates:
         """The candidates at some positions, int64 [m]."""
@@ -63,10 +81,13 @@ class Candidates:
             self,
             rows=self.rows[kept],
             scores=self.scores[kept],
+            first=None if self.first is None else self.first[kept],
             whereabouts=self.whereabouts.take(kept),
             examined=self.examined[kept],
             weights=None if self.weights is None else self.weights[kept],
             ordered=self.ordered[kept],
+            geometry=None if self.geometry is None else self.geometry.take(kept),
+            verifications=tuple(self.verifications[at] for at in kept.tolist() if at < len(self.verifications)),
         )
 
 
@@ -193,6 +214,7 @@ def _examined(
         candidates = Candidates(
             rows[order],
             scores[order] + (found.scores - ordered[order]),
+            scores[order],
             places.take(order),
             found.examined,
             None if weights is None else weights[order],

@@ -17,7 +17,9 @@ from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
+from core.networks.xfeat import packaged_xfeat
 from core.recognition.selection import Selection
+from core.recognition.verification import Verify
 from core.storage import Atlas, Map, MapRecord
 from service.engine.encoder_threads import AfterEncoding, Encoded
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
@@ -116,6 +118,7 @@ class Engine:
         try:
             identity = await in_thread(self.catalogue.resolve, self.settings.encoder)
             await self.queue.load(identity)
+            await in_thread(packaged_xfeat)  # which finds keypoints
         except PlacerecError as error:
             self.encoder_state = str(error)
             log.error("the default encoder cannot be used: %s", error)
@@ -225,14 +228,16 @@ class Engine:
         k: int,
         selection: Selection | None = None,
         mask: Mask | None = None,
+        verify: Verify = "never",
     ) -> Recognized:
-        """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, judge.
+        """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, verify, judge.
 
         Args:
             data: the bytes of a JPEG, PNG or WebP file.
             k: how many matches to list.
             selection: what is known of the place; None: nothing.
             mask: the part of the frame that is ignored.
+            verify: when the geometry of the best candidates is verified.
 
         Raises:
             QueueFull: too many requests are waiting.
@@ -240,8 +245,8 @@ class Engine:
             Others: see ``encode_for``.
         """
         with self.queue.place():
-            encoded = await self.encode_for(map_, data, deadline, mask, search_ahead(map_, k, selection))
-        (recognized,) = await self.searches.recognize(map_, [encoded], k, selection)
+            encoded = await self.encode_for(map_, data, deadline, mask, search_ahead(map_, k, selection, verify))
+        (recognized,) = await self.searches.recognize(map_, [encoded], k, selection, verify)
         return recognized
 
     async def encode_many(

@@ -160,9 +160,7 @@ class EncoderQueue:
             UnknownEncoder, InvalidModel: see ``load``.
         """
         encoder = await self._load_in_time(identity, deadline)
-        frame = QueuedFrame(
-            encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding
-        )
+        frame = QueuedFrame(encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding)
         self._threads.put([frame])
         result = asyncio.wrap_future(frame.result)
         try:

@@ -20,6 +20,7 @@ from anyio import to_thread
 from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
+from core.recognition.verification import Verifier, Verify
 from core.storage import Map
 from core.threads import cores
 from service.engine.encoder_threads import Encoded
@@ -48,20 +49,27 @@ class SearchAhead:
 
     map_: Map
     k: int
+    verify: Verify = "never"
 
     def __call__(self, encoded: Encoded) -> Answer | None:
         """The answer for a frame; None for a frame that is left to :meth:`Searches.recognize`."""
         if not len(encoded.encoding.regions) or not self.map_.snapshot().holds:  # it would have to read from the disk
             return None
-        (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k)
+        verifiers = _verifiers([encoded], self.verify)
+        (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k, None, verifiers)
         return answer
 
 
-def search_ahead(map_: Map, k: int, selection: Selection | None) -> SearchAhead | None:
+def _verifiers(frames: Sequence[Encoded], verify: Verify) -> list[Verifier | None]:
+    """What ``locate`` needs to verify the candidates of each frame."""
+    return [None if verify == "never" else Verifier(verify, frame.find_keypoints) for frame in frames]
+
+
+def search_ahead(map_: Map, k: int, selection: Selection | None, verify: Verify = "never") -> SearchAhead | None:
     """The search to do in the encoder's thread, or None if other frames would wait too long for it."""
     if selection is not None or map_.count_places() > MOST_AHEAD:
         return None
-    return SearchAhead(map_, k)
+    return SearchAhead(map_, k, verify)
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,7 @@ class _SearchKey:
 @dataclass
 class _Waiting:
     encodings: Sequence[Encoding]
+    verifiers: Sequence[Verifier | None]
     answer: asyncio.Future[list[Answer]]
 
 
@@ -92,13 +101,19 @@ class Searches:
         self._at_once = max(1, cores() // CORES_A_SEARCH)
 
     async def recognize(
-        self, map_: Map, frames: Sequence[Encoded], k: int, selection: Selection | None = None
+        self,
+        map_: Map,
+        frames: Sequence[Encoded],
+        k: int,
+        selection: Selection | None = None,
+        verify: Verify = "never",
     ) -> list[Recognized]:
         """Search a map for frames that its encoder has encoded; a result of ``SearchAhead`` is taken as it is.
 
         Args:
             k: how many matches to list.
             selection: what is known of the place; None: nothing.
+            verify: when the candidates are verified; the frames have their pixels or their views then.
 
         Raises:
             StorageFailure: the map's files cannot be read.
@@ -108,27 +123,38 @@ class Searches:
             answers: list[Answer] = [seen[0].search_result]
         else:
             encodings = [frame.encoding for frame in seen]
-            answers = await self.locate(map_, seen[0].encoder, encodings, k, selection) if seen else []
+            verifiers = _verifiers(seen, verify)
+            answers = await self.locate(map_, seen[0].encoder, encodings, k, selection, verifiers) if seen else []
         remaining = iter(answers)
         return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]
 
     async def locate(
-        self, map_: Map, encoder: Encoder, encodings: Sequence[Encoding], k: int, selection: Selection | None = None
+        self,
+        map_: Map,
+        encoder: Encoder,
+        encodings: Sequence[Encoding],
+        k: int,
+        selection: Selection | None = None,
+        verifiers: Sequence[Verifier | None] | None = None,
     ) -> list[Answer]:
         """Call :func:`core.recognition.recognition.locate` in a thread, for these and other waiting queries at once.
 
         Args:
             encodings: queries that have regions.
+            verifiers: for each query when to verify its candidates; None: never.
 
         Raises:
             StorageFailure: the map's files cannot be read.
         """
+        looks = verifiers or [None] * len(encodings)
         if selection is not None:
-            return await to_thread.run_sync(locate, map_, encoder, encodings, k, selection)
+            return await to_thread.run_sync(locate, map_, encoder, encodings, k, selection, looks)
         loop = asyncio.get_running_loop()
         key = _SearchKey(map_, encoder, k)
         parts = [
-            _Waiting(encodings[start : start + MOST_TOGETHER], loop.create_future())
+            _Waiting(
+                encodings[start : start + MOST_TOGETHER], looks[start : start + MOST_TOGETHER], loop.create_future()
+            )
             for start in range(0, len(encodings), MOST_TOGETHER)
         ]
         self._waiting.setdefault(key, deque()).extend(parts)
@@ -172,8 +198,9 @@ class Searches:
 
     async def _answer(self, key: _SearchKey, together: Sequence[_Waiting]) -> None:
         encodings = [encoding for one in together for encoding in one.encodings]
+        verifiers = [verifier for one in together for verifier in one.verifiers]
         try:
-            answers = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k)
+            answers = await to_thread.run_sync(locate, key.map_, key.encoder, encodings, key.k, None, verifiers)
         except Exception as error:
             if len(together) > 1:  # search for each alone, so that only the faulty ones fail
                 for one in together:

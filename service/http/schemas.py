@@ -8,6 +8,7 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.places import Camera
+from core.recognition.verification import Verify
 from service.errors.faults import InvalidRequest
 from service.errors.problems import invalid_request
 
@@ -23,6 +24,13 @@ EncoderAssertion = Annotated[
     Field(max_length=256, description="Name or identity that the map's encoder must have (409 otherwise)."),
 ]
 Matches = Annotated[int, Field(ge=1, le=100, description="How many matches to list.")]
+Verification = Annotated[
+    Verify,
+    Field(
+        description="Whether the keypoints of the frame and of its best candidates are compared: always, never, or "
+        "(auto) only where the scores leave doubt."
+    ),
+]
 
 Model = TypeVar("Model", bound=BaseModel)
 

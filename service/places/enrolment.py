@@ -71,6 +71,7 @@ def describe_frame(engine: Engine, map_: Map, frame: FrameToEnrol, digest: bytes
         encoded.pixels,
         encoded.encoding,
         engine.settings.thumbnail_side,
+        encoded.keypoints,
     )
 
 
@@ -121,8 +122,9 @@ async def enrol(
         if sent:
             new, bodies = [i for i, _ in sent], [data for _, data in sent]
             masks = [frames[i].mask for i in new]
+            identity, keypoints = map_.record.encoder, map_.record.verification
             with engine.queue.place(len(sent)) if queued else nullcontext():
-                async with aclosing(engine.encode_many(map_.record.encoder, bodies, deadline, masks)) as outcomes:
+                async with aclosing(engine.encode_many(identity, bodies, deadline, masks, keypoints)) as outcomes:
                     async for some in outcomes:
                         encoded = {new[index]: outcome for index, outcome in some}
                         # Thumbnails are made, and pixels freed, while the encoder works at the next frames.

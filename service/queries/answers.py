@@ -11,14 +11,14 @@ from fastapi import Depends
 from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
 from core.recognition.recognition import Answer
-from core.recognition.stages import calibration_of
+from core.recognition.stages import Candidates, calibration_of
 from core.storage import Map
 from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine
 from service.engine.searches import Recognized
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
-from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup
+from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup, ScoreParts, VerificationView
 from service.queries.statistics import QueryStatistics, map_key
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
@@ -29,7 +29,7 @@ def counted_answer(engine: Engine, statistics: QueryStatistics, map_: Map, recog
     if recognized.answer is None:
         answer = blank_answer(map_, recognized.encoded)
     else:
-        answer = answer_of(recognized.encoded, recognized.answer)
+        answer = answer_of(map_, recognized.encoded, recognized.answer)
     count_answer(engine, statistics, map_, answer)
     return answer
 
@@ -50,13 +50,15 @@ def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answ
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
 
 
-def answer_of(encoded: Encoded, found: Answer) -> QueryAnswer:
-    """The JSON answer to a frame that was searched for."""
+def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
+    """The JSON answer to a frame that was searched for in a map."""
     judgement = found.judgement
     weights: Sequence[float | None] = found.weights or [None] * len(found.matches)
     matches = [
-        Match(rank=rank, score=score, weight=weight, place=PlaceView.of(place))
-        for rank, ((score, place), weight) in enumerate(zip(found.matches, weights, strict=True), start=1)
+        Match(
+            rank=at + 1, score=score, parts=score_parts(found.candidates, at), weight=weight, place=PlaceView.of(place)
+        )
+        for at, ((score, place), weight) in enumerate(zip(found.matches, weights, strict=True))
     ]
     recognized = judgement.verdict == "recognized"
     return QueryAnswer(
@@ -74,9 +76,40 @@ def answer_of(encoded: Encoded, found: Answer) -> QueryAnswer:
             RivalGroup(places=list(group.places), score=group.score, same_place=group.same_place)
             for group in found.rivals
         ],
+        verification=verification_view(found) if matches else None,
+        revision=map_.record.revision,
         encoder=encoded.encoder.identity,
-        milliseconds=rounded({**encoded.milliseconds, "search": found.search}),
+        milliseconds=rounded({**encoded.milliseconds, "search": found.search, **_verifying(found)}),
     )
+
+
+def _verifying(found: Answer) -> dict[str, float]:
+    """The time of the third stage, if it did anything."""
+    stage = found.third_stage
+    return {"verify": stage.milliseconds} if stage.state == "verified" else {}
+
+
+def score_parts(candidates: Candidates, at: int) -> ScoreParts | None:
+    """What the place at a position of a ranking owes its place to; None where several frames were fused."""
+    if candidates.first is None:
+        return None
+    verified = candidates.verifications[at] if at < len(candidates.verifications) else None
+    similarity, score = float(candidates.first[at]), float(candidates.scores[at])
+    return ScoreParts(
+        similarity=similarity,
+        agreement=score - similarity,
+        inliers=None if verified is None else verified.inlier_count,
+        keypoints=None if verified is None else min(verified.keypoints),
+        evidence=None if verified is None else verified.evidence,
+    )
+
+
+def verification_view(found: Answer) -> VerificationView:
+    """The JSON view of the third stage."""
+    stage = found.third_stage
+    verified = sum(one is not None for one in found.candidates.verifications)
+    keypoints = None if stage.keypoints is None else len(stage.keypoints)
+    return VerificationView(state=stage.state, candidates=verified, keypoints=keypoints)
 
 
 def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedPose | None:
@@ -107,6 +140,7 @@ def blank_answer(map_: Map, encoded: Encoded) -> QueryAnswer:
         threshold=calibration_of(map_, encoded.encoder).threshold,
         reason="no-regions",
         matches=[],
+        revision=map_.record.revision,
         encoder=encoded.encoder.identity,
         milliseconds=rounded(encoded.milliseconds),
     )

@@ -10,12 +10,14 @@ import numpy as np
 
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
+from core.geometry.verification import LEAST_MATCHES
 from core.method.encoder import Encoder
 from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
 from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
 from core.places import Place
+from core.recognition.recognition import Answer
 from core.storage import Map
 from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
@@ -25,6 +27,7 @@ from service.queries.schemas import (
     CellPair,
     ExplainedRegion,
     ExplanationView,
+    KeypointPair,
     MatchExplanation,
     RegionPair,
     RelativeBox,
@@ -45,7 +48,7 @@ def scaled_for_drawing(encoded: Encoded) -> Encoded:
 
 
 async def explain_match(
-    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, place_id: str, deadline: RequestDeadline
+    engine: Engine, pictures: ExplanationPictures, map_: Map, query: Encoded, answer: Answer, deadline: RequestDeadline
 ) -> MatchExplanation | None:
     """The explanation of a query's best match, with the path of a picture of both frames; None if the place is gone.
 
@@ -53,15 +56,17 @@ async def explain_match(
 
     Args:
         query: the query, with pixels scaled for drawing.
-        place_id: the id of the best match.
+        answer: the map's answer to it, which has a match.
 
     Raises:
         QueueFull, EncoderNotInstalled: the picture cannot be encoded.
         Others: see ``EncoderQueue.encode``.
     """
+    place_id = answer.matches[0][1].id
     found = await in_thread(_stored_place, map_, place_id)
     if found is None:
         return None
+    inliers = await in_thread(_inliers, map_, answer)
     stored, place, picture = found
     encoder, encoded = query.encoder, None
     if picture is not None:
@@ -75,9 +80,23 @@ async def explain_match(
     explained = await in_thread(lambda: explanation_view(encoder, explain(encoder, shown, match), shown, match))
     path = None
     if encoded is not None:
-        drawn = await in_thread(draw_explanation, explained, query.pixels, encoded.pixels)
+        drawn = await in_thread(draw_explanation, explained, query.pixels, encoded.pixels, inliers)
         path = f"/v1/maps/{map_.record.id}/explanations/{pictures.keep(map_key(map_), drawn)}"
-    return MatchExplanation(**explained.__dict__, place=place_id, match_picture=place.picture, picture=path)
+    return MatchExplanation(
+        **explained.__dict__, place=place_id, inliers=inliers, match_picture=place.picture, picture=path
+    )
+
+
+def _inliers(map_: Map, answer: Answer) -> list[KeypointPair]:
+    """The keypoints of the query and of its best match that fit one rigid scene; none if they were not verified."""
+    candidates, ours = answer.candidates, answer.third_stage.keypoints
+    verified = candidates.verifications[0] if candidates.verifications else None
+    (theirs,) = map_.keypoints_at(candidates.rows[:1].tolist())
+    if verified is None or ours is None or theirs is None:
+        return []
+    pairs = verified.matches[verified.inliers]
+    sides = [np.round(keypoints.shares()[pairs[:, side]], 4).tolist() for side, keypoints in enumerate((ours, theirs))]
+    return [KeypointPair(query=query, match=match) for query, match in zip(*sides, strict=True)]
 
 
 def _stored_place(map_: Map, place_id: str) -> tuple[Shown, Place, bytes | None] | None:
@@ -165,14 +184,21 @@ def _listed(encoder: Encoder, regions: Regions | None, losses: np.ndarray | None
     return _Listed(chosen, listed)
 
 
-def draw_explanation(shown: ExplanationView, query: Pixels, match: Pixels) -> bytes:
-    """A PNG of both frames side by side: matching cells are joined by lines, or, without a second stage, regions.
+def draw_explanation(
+    shown: ExplanationView, query: Pixels, match: Pixels, inliers: Sequence[KeypointPair] = ()
+) -> bytes:
+    """A PNG of both frames side by side: inliers are joined by lines, or matching cells, or regions.
 
-    Without a second stage the regions that contribute to the score are outlined, too.
+    Where there are fewer than eight inliers, the cells are joined; without a second stage, the regions, and those that
+    contribute to the score are outlined.
 
     Args:
         query, match: uint8 [H, W, 3], BGR.
+        inliers: what geometric verification found.
     """
+    if len(inliers) >= LEAST_MATCHES:
+        lines = [Line(pair.query, pair.match, 0.0) for pair in inliers[:DRAWN]]
+        return side_by_side(query, match, lines, ([], []))
     sides = (shown.query_regions, shown.match_regions or [])
     outlines = ([], []) if shown.cells else (_outlines(sides[0]), _outlines(sides[1]))
     return side_by_side(query, match, _lines(shown), outlines)

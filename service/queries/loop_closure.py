@@ -12,6 +12,7 @@ from core import errors
 from core.places import Place, check_place_id
 from core.recognition.recognition import Answer, locate
 from core.recognition.selection import Selection
+from core.recognition.verification import Verifier, Verify
 from core.storage import Map
 from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
@@ -57,7 +58,13 @@ class Closure:
 
 
 def close_loop(
-    engine: Engine, map_: Map, frame: FrameToEnrol, encoded: Encoded, k: int, selection: Selection | None
+    engine: Engine,
+    map_: Map,
+    frame: FrameToEnrol,
+    encoded: Encoded,
+    k: int,
+    selection: Selection | None,
+    verify: Verify,
 ) -> Closure:
     """Locate a frame and, if the verdict is ``unknown``, enrol it; blocks, so call it in a thread.
 
@@ -68,6 +75,7 @@ def close_loop(
         encoded: the frame, encoded; it has regions.
         k: how many matches to list.
         selection: what is known of the place; None: nothing.
+        verify: when the geometry of the best candidates is verified.
 
     Raises:
         PlaceTaken: a place of the frame's id exists, and has another frame.
@@ -81,7 +89,8 @@ def close_loop(
             raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
             selection = replace(selection or Selection(), excluded=frame.id)
-        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection)
+        verifier = Verifier(verify, encoded.find_keypoints)
+        (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection, [verifier])
         if known is not None:
             return Closure(answer, map_.place(frame.id), created=False)
         if answer.judgement.verdict != "unknown":
@@ -134,15 +143,15 @@ async def query_or_enrol(
     fields = options.fields(metadata, engine.settings)
     mask = await camera_mask(map_, options.camera)
     with engine.queue.place():
-        encoded = await engine.encode_for(map_, data, deadline, mask)
+        encoded = await engine.encode_for(map_, data, deadline, mask, keypoints=map_.record.verification)
     enrolled: Place | None = None
     change: Literal["created", "unchanged"] | None = None
     if len(encoded.encoding.regions) == 0:
         answer = blank_answer(map_, encoded)
     else:
         frame = FrameToEnrol(options.id, fields, data, mask)
-        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection)
-        answer = answer_of(encoded, closure.answer)
+        closure = await in_thread(close_loop, engine, map_, frame, encoded, options.k, selection, options.verify)
+        answer = answer_of(map_, encoded, closure.answer)
         enrolled = closure.enrolled
         if enrolled is not None:
             change = "created" if closure.created else "unchanged"

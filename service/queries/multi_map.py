@@ -15,6 +15,7 @@ from core.judgement.verdict import Verdict
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.selection import Selection
+from core.recognition.verification import Verifier, Verify
 from core.storage import Map
 from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine, camera_mask
@@ -86,8 +87,12 @@ async def locate_in_maps(
     k: int,
     selection: Selection | None,
     deadline: RequestDeadline,
+    verify: Verify = "never",
 ) -> list[MapReport]:
     """Locate the frames of a rig in each of several maps; call it within ``queue.place``.
+
+    Args:
+        verify: when the geometry of the best candidates is verified; that of several frames never is.
 
     Returns:
         One report for each map, in the order of the ids.
@@ -104,7 +109,8 @@ async def locate_in_maps(
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
         except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, deadline)
+    encoded = await _encode(engine, maps, masks, frames, deadline, keep_views=verify != "never" and len(frames) == 1)
+    verifiers: dict[str, Verifier] = {}  # by mask: the keypoints of one frame are the same for every encoder
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
         if isinstance(outcome, Exception):
@@ -116,7 +122,10 @@ async def locate_in_maps(
         if seen and failure is None:
             encodings = [one.encoding for one in seen]
             try:
-                answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection)
+                looks = None
+                if verify != "never" and len(seen) == 1:
+                    looks = [verifiers.setdefault(_key(seen[0].mask), Verifier(verify, seen[0].find_keypoints))]
+                answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection, looks)
                 report = replace(report, answer=answer)
             except MAP_ERRORS as error:
                 report = replace(report, error=error)
@@ -130,6 +139,7 @@ async def _encode(
     masks: dict[str, list[Mask | None]],
     frames: Sequence[RigFrame],
     deadline: RequestDeadline,
+    keep_views: bool,
 ) -> dict[str, list[Encoded | Exception] | Exception]:
     """The encoded frames for each map, or errors; maps with the same encoder and mask share an encoding."""
     wanted: dict[str, dict[tuple[int, str], Mask | None]] = {}
@@ -144,7 +154,11 @@ async def _encode(
         keys = list(wanted[identity])
         try:
             outcomes = await engine.encode_all(
-                identity, [frames[index].data for index, _ in keys], deadline, list(wanted[identity].values())
+                identity,
+                [frames[index].data for index, _ in keys],
+                deadline,
+                list(wanted[identity].values()),
+                keep_views=keep_views,
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
         except MAP_ERRORS as error:
@@ -207,6 +221,6 @@ def match_log_odds(report: MapReport) -> list[float]:
     """
     answer = report.answer
     assert answer is not None
-    ordered = answer.candidates.ordered[: len(answer.matches)].astype(np.float64)
+    ordered = answer.candidates.values[: len(answer.matches)].astype(np.float64)
     steepness = decision_slope(answer.calibration)
     return (report.log_odds - steepness * (ordered[0] - ordered)).tolist() if len(ordered) else []

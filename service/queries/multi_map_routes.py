@@ -74,7 +74,7 @@ async def query_maps(
         map_ids = [map_id for map_id in await in_thread(_all_maps, engine) if principal.may_use(map_id)]
     principal.require(*map_ids)
     with engine.queue.place():
-        reports = await locate_in_maps(engine, map_ids, frames, options.k, selection, deadline)
+        reports = await locate_in_maps(engine, map_ids, frames, options.k, selection, deadline, options.verify)
     shown = _frame_reports(request, frames, reports)
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None

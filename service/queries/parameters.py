@@ -15,7 +15,7 @@ from core.recognition.selection import TRUST, Conditions, RecentFrames, Selectio
 from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
-from service.http.schemas import EncoderAssertion, Matches, validated
+from service.http.schemas import EncoderAssertion, Matches, Verification, validated
 from service.places.parameters import PlaceDescription
 
 MOST_NAMES = 100
@@ -256,6 +256,7 @@ class QueryParameters(LocateParameters):
     """The parameters of a query."""
 
     k: Matches = 5
+    verify: Verification = "auto"
     explain: bool = Field(default=False, description="Explain the score of the best match.")
     encoder: EncoderAssertion = None
 
@@ -266,6 +267,7 @@ class ClosureParameters(FilterParameters):
     id: str = Field(description="Id of the place that is created if the frame is unknown.", examples=["p9"])
     metadata: str | None = Field(default=None, description="A JSON object.", examples=['{"floor": 2}'])
     k: Matches = 5
+    verify: Verification = "auto"
     encoder: EncoderAssertion = None
 
 
@@ -285,6 +287,7 @@ class MultiMapParameters(LocateParameters):
         examples=['{"left": "side-camera"}'],
     )
     k: Matches = 5
+    verify: Verification = "auto"
 
     def map_ids(self) -> list[str] | None:
         """The ids of the maps that are named; None: all maps.

@@ -76,11 +76,11 @@ async def query(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
-    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask)
+    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask, options.verify)
     answer = counted_answer(engine, statistics, map_, recognized)
-    if options.explain and answer.matches:
-        encoded, best = await in_thread(scaled_for_drawing, recognized.encoded), answer.matches[0].place.id
-        answer.explanation = await explain_match(engine, pictures, map_, encoded, best, deadline)
+    if options.explain and recognized.answer is not None and recognized.answer.matches:
+        encoded = await in_thread(scaled_for_drawing, recognized.encoded)
+        answer.explanation = await explain_match(engine, pictures, map_, encoded, recognized.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
     return answer
@@ -116,7 +116,11 @@ async def query_batch(
     encoded: dict[int, Encoded] = {}
     with engine.queue.place(len(files)):
         outcomes = await engine.encode_all(
-            map_.record.encoder, [part.data for part in files], deadline, [mask] * len(files)
+            map_.record.encoder,
+            [part.data for part in files],
+            deadline,
+            [mask] * len(files),
+            keep_views=options.verify != "never",
         )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:
@@ -127,7 +131,7 @@ async def query_batch(
             except Exception as error:
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
-    recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection)
+    recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection, options.verify)
     for index, one in zip(encoded, recognized, strict=True):
         items[index].answer = counted_answer(engine, statistics, map_, one)
     request.state.noted = {"map": map_id, "frames": len(files)}

@@ -7,6 +7,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from core.judgement.verdict import Verdict
+from core.recognition.verification import VerificationState
 from service.errors.problems import Problem
 from service.http.schemas import IDENTITY_EXAMPLE, Milliseconds
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
@@ -45,6 +46,13 @@ class CellPair(BaseModel):
     gain: float = Field(description="What the pair adds to the score.")
 
 
+class KeypointPair(BaseModel):
+    """Two keypoints that match and fit one rigid scene: (x, y) of each in shares of its frame's width and height."""
+
+    query: tuple[float, float]
+    match: tuple[float, float]
+
+
 class ExplanationView(BaseModel):
     """The parts of a score, which is the sum of `words` and of the gains of all `cells`."""
 
@@ -63,13 +71,37 @@ class MatchExplanation(ExplanationView):
     """Why a query's best match scores as it does."""
 
     place: str = Field(description="Id of the best match.")
+    inliers: list[KeypointPair] = Field(
+        default_factory=list, description="What geometric verification found; empty if the match was not verified."
+    )
     match_picture: str = Field(
         description="The picture from which the regions of the match were extracted again: image, thumbnail (which is "
         "smaller than the enrolled frame, so they may differ a little), or none."
     )
     picture: str | None = Field(
-        description="Path of a PNG with both frames side by side, valid for some minutes; null if the map keeps no "
+        description="Path of a PNG with both frames side by side and lines between the inliers or, where there are "
+        "fewer than eight, between the cells; valid for some minutes; null if the map keeps no "
         "picture of the match."
+    )
+
+
+class ScoreParts(BaseModel):
+    """What a match's place in the ranking is made of: the score is the sum of `similarity` and `agreement`."""
+
+    similarity: float = Field(
+        description="J / V, or the cosine of descriptors that are normalized as a whole; weighted by 1 - `share` if "
+        "the encoder has a second stage (`agreement` in its definition)."
+    )
+    agreement: float = Field(
+        description="`share` times the agreement of cells; 0 for a place that the second stage has not examined."
+    )
+    inliers: int | None = Field(
+        description="Keypoints of both frames that match and fit one rigid scene; null if the match was not verified."
+    )
+    keypoints: int | None = Field(description="How many could: the keypoints of the frame that has fewer.")
+    evidence: float | None = Field(
+        description="How surprising so many inliers would be of unrelated frames: minus the logarithm of the number "
+        "of false alarms, at least 0."
     )
 
 
@@ -80,14 +112,28 @@ class Match(BaseModel):
     score: float = Field(
         description="J / V, or the cosine of descriptors that are normalized as a whole. If the encoder has a "
         "second stage (`agreement` in its definition), this is weighted by 1 - `share`, and `share` times the "
-        "agreement of cells is added to the scores of the best `candidates`."
+        "agreement of cells is added to the scores of the best `candidates`. Where matches were verified, the order is "
+        "that of the score plus 0.7 times the share of inliers."
     )
+    parts: ScoreParts | None = Field(default=None, description="Null where several frames were judged as one.")
     weight: float | None = Field(
         default=None,
         description="The weight of the priors, over 0 and at most 1: the odds of the match are multiplied by it, and "
         "the matches are ordered by the result. Null without soft parameters.",
     )
     place: PlaceView
+
+
+class VerificationView(BaseModel):
+    """Whether the geometry of the best candidates was verified."""
+
+    state: VerificationState = Field(
+        description="verified; not-needed: with `auto`, the scores settle the answer; no-keypoints: none of the "
+        "candidates has any, or the frame too few to say anything, so the scores decide alone; never: it was not "
+        "asked for."
+    )
+    candidates: int = Field(description="How many places were verified.")
+    keypoints: int | None = Field(description="Keypoints of the frame; null if they were not needed.")
 
 
 class EstimatedPose(BaseModel):
@@ -171,17 +217,27 @@ class QueryAnswer(BaseModel):
     )
     pose: EstimatedPose | None = Field(description="Null unless recognized, or if the place has no pose.")
     score: float | None = Field(description="Score of the best match (see its `score`); null if there is none.")
-    margin: float | None = Field(description="Best score minus that of the best rival; null without a rival.")
+    margin: float | None = Field(
+        description="Best score minus that of the best rival, with 0.7 times the shares of inliers where the best "
+        "match was verified; null without a rival."
+    )
     decision: float | None = Field(
         description="By how much the best match stands out from the rest of the map: the geometric mean of its score "
         "and its lead; less than 0 where it is behind what a small map is expected to hold."
     )
-    threshold: float = Field(description="The least decision value at which the best match can be recognized.")
+    threshold: float = Field(
+        description="The least decision value at which the best match can be recognized. A match that was verified is "
+        "recognized by its probability instead."
+    )
     reason: Reason | None = Field(default=None, description="Why there are no matches, if so.")
     matches: list[Match]
     rivals: list[RivalGroup] = Field(
         default_factory=list, description="Why the answer is ambiguous; empty for other verdicts."
     )
+    verification: VerificationView | None = Field(
+        default=None, description="Whether the geometry of the best candidates was verified; null without matches."
+    )
+    revision: int | None = Field(default=None, description="The map's revision.")
     explanation: MatchExplanation | None = Field(
         default=None, description="With `explain`: the explanation of the best match's score."
     )
