@@ -166,7 +166,8 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
         engine.metrics.observe_answer(report.map_id, "unknown", None)
         return MapAnswer(map=report.map_id, status=200, verdict="unknown", reason="no-regions", encoder=encoder)
     seen = next(one for one in report.frames if isinstance(one, Encoded) and len(one.encoding.regions))
-    answer = answer_of(seen, report.answer)
+    assert report.map_ is not None
+    answer = answer_of(report.map_, seen, report.answer)
     engine.metrics.observe_answer(report.map_id, answer.verdict, answer.score)
     engine.metrics.searches.observe(report.answer.search / 1e3)
     return MapAnswer(
@@ -179,6 +180,8 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
         decision=answer.decision,
         threshold=answer.threshold,
         reason=answer.reason,
+        verification=answer.verification,
+        revision=answer.revision,
         encoder=encoder,
     )
 
@@ -188,7 +191,7 @@ def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapRe
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
         return
-    answer = blank_answer(report.map_, seen) if report.answer is None else answer_of(seen, report.answer)
+    answer = blank_answer(report.map_, seen) if report.answer is None else answer_of(report.map_, seen, report.answer)
     count_for_map(engine, statistics, report.map_id, answer)
 
 

@@ -299,6 +299,8 @@ class MapAnswer(BaseModel):
     decision: float | None = None
     threshold: float | None = None
     reason: Reason | None = Field(default=None, description="Why there is nothing to compare, if so.")
+    verification: VerificationView | None = None
+    revision: int | None = None
     encoder: str | None = None
     problem: Problem | None = None
 

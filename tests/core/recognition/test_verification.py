@@ -60,9 +60,10 @@ def ask(map_: Map, encoder: Encoder, seed: int, verify: Verify, looked: list[int
 
 def test_never_is_the_answer_of_two_stages(lab: Map, encoder: Encoder) -> None:
     looked: list[int] = []
-    asked, plain = ask(lab, encoder, 3, "never", looked), locate(lab, encoder, [encoder.encode(seen_again(scene(3)))], 5)
-    assert asked.judgement == plain[0].judgement and not looked
-    assert asked.third_stage.state == plain[0].third_stage.state == "never"
+    asked = ask(lab, encoder, 3, "never", looked)
+    (plain,) = locate(lab, encoder, [encoder.encode(seen_again(scene(3)))], 5)
+    assert asked.judgement == plain.judgement and not looked
+    assert asked.third_stage.state == plain.third_stage.state == "never"
     assert asked.candidates.geometry is None and asked.judgement.evidence is None
 
 

@@ -1,0 +1,84 @@
+"""The job that finds the keypoints of places that have none, in the pictures that the map keeps of them.
+
+Places lack keypoints if they were enrolled by placerec 0.1.0, or while the map did not verify.  A thumbnail serves as
+well as an image, with fewer pixels.  Each commit stands by itself, so an attempt after a restart goes on with the places
+that are still without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any
+
+from core.errors import InvalidImage, StorageFailure, UnknownCamera
+from core.frames.images import Limits, decode
+from core.frames.masks import Mask
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
+from core.networks.xfeat import packaged_xfeat
+from core.storage import Map
+from service.engine.engine import Engine
+from service.jobs.context import JobContext, yield_to_requests
+
+KIND = "keypoints"
+
+PLACES_PER_COMMIT = 32
+"""How many places are read and committed together."""
+
+MOST_LISTED = 20
+"""How many of the places whose picture cannot be read the result lists at most."""
+
+_ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
+"""A picture that was accepted is read whatever today's limits are."""
+
+
+def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
+    """Find the keypoints of the places that have none and whose picture is kept.
+
+    Returns:
+        The result of the job.
+
+    Raises:
+        UnknownMap, MapQuarantined, StorageFull, StorageFailure: what was committed before stays.
+        JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
+    """
+    map_ = context.map(engine.atlas)
+    told: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
+    total = map_.count_places()
+    while places := map_.without_keypoints(told["after"], PLACES_PER_COMMIT):
+        made: list[tuple[str, bytes, Keypoints]] = []
+        for place in places:
+            yield_to_requests(engine, context)
+            try:
+                made.append((place.id, place.digest, _keypoints(map_, place.id, place.camera)))
+            except (InvalidImage, StorageFailure) as error:
+                told["unreadable"] += 1
+                told["named"] = [*told["named"], {"id": place.id, "detail": str(error)}][:MOST_LISTED]
+        with engine.writing(map_.record.id):
+            told["found"] += map_.add_keypoints(made)
+        told["after"] = places[-1].number
+        context.remember(told=told)
+        context.progress(told["found"] + told["unreadable"], total, "finding keypoints")
+        context.give_way()
+    left = map_.count_without_keypoints()
+    return {
+        "map": map_.record.id,
+        "places": map_.count_places(),
+        "found": told["found"],
+        "without": left,
+        "unreadable": {"count": told["unreadable"], "places": told["named"]},
+    }
+
+
+def _keypoints(map_: Map, place_id: str, camera: str | None) -> Keypoints:
+    """The keypoints in the picture that a map keeps of a place.
+
+    Raises:
+        InvalidImage: the picture cannot be read; it may have been forgotten meanwhile.
+        StorageFailure: it is damaged on disk.
+    """
+    mask: Mask | None = None
+    with suppress(UnknownCamera):  # it was forgotten since the place was enrolled
+        mask = map_.cameras.mask(camera)
+    return find_keypoints(packaged_xfeat(), decode(map_.picture(place_id) or b"", _ANY_SIZE), mask)
