@@ -20,7 +20,8 @@ from core.errors import NoRegions
 from core.frames.images import decode, encode_thumbnail
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge

@@ -24,7 +24,8 @@ from core.frames.containers import read_header
 from core.frames.images import Limits, decode
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
-from core.geometry.keypoints import Keypoints, View, keypoints_in
+from core.geometry.detection import View, keypoints_in
+from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.threads import cores, keep_to, use_threads

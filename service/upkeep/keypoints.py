@@ -17,7 +17,7 @@ from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.networks.xfeat import packaged_xfeat
-from core.storage import Map
+from core.storage import KeptFrame, Map
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, yield_to_requests
 
@@ -47,11 +47,11 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     told: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
     total = map_.count_places()
     while places := map_.without_keypoints(told["after"], PLACES_PER_COMMIT):
-        made: list[tuple[str, bytes, Keypoints]] = []
+        made: list[tuple[KeptFrame, Keypoints]] = []
         for place in places:
             yield_to_requests(engine, context)
             try:
-                made.append((place.id, place.digest, _keypoints(map_, place.id, place.camera)))
+                made.append((place, _keypoints(map_, place)))
             except (InvalidImage, StorageFailure) as error:
                 told["unreadable"] += 1
                 told["named"] = [*told["named"], {"id": place.id, "detail": str(error)}][:MOST_LISTED]
@@ -71,7 +71,7 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     }
 
 
-def _keypoints(map_: Map, place_id: str, camera: str | None) -> Keypoints:
+def _keypoints(map_: Map, place: KeptFrame) -> Keypoints:
     """The keypoints in the picture that a map keeps of a place.
 
     Raises:
@@ -80,5 +80,5 @@ def _keypoints(map_: Map, place_id: str, camera: str | None) -> Keypoints:
     """
     mask: Mask | None = None
     with suppress(UnknownCamera):  # it was forgotten since the place was enrolled
-        mask = map_.cameras.mask(camera)
-    return find_keypoints(packaged_xfeat(), decode(map_.picture(place_id) or b"", _ANY_SIZE), mask)
+        mask = map_.cameras.mask(place.camera)
+    return find_keypoints(packaged_xfeat(), decode(map_.picture(place.id) or b"", _ANY_SIZE), mask)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from core.frames.images import decode
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.judgement.geometry import WEIGHT
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
@@ -104,6 +105,7 @@ def test_places_without_keypoints_are_left_where_two_stages_put_them(atlas: Atla
     answer = ask(bare, encoder, 1, "always", looked)
     assert answer.third_stage.state == "no-keypoints" and not looked
     assert answer.judgement == ask(bare, encoder, 1, "never").judgement
+    bare.edit({"verification": True})
     pixels = decode(jpeg(3))
     described = describe(
         bare, "p3", PlaceFields(), None, hashlib.sha256(b"p3").digest(), pixels, encoder.encode(pixels),
