@@ -146,6 +146,7 @@ OPERATIONS: dict[str, Rule] = {
     "export_map": Rule("admin", "path"),  # it reads all of a map, with its pictures
     "import_map": Rule("admin", "named", changes=True),
     "rebuild_map": Rule("admin", "path", changes=True),
+    "fill_keypoints": Rule("admin", "path", changes=True),
     "merge_map": Rule("admin", "named", changes=True),  # it names the other map, too
     # Jobs: a job over several maps is shown to a key for all of them
     "list_jobs": Rule("query", "shown"),

@@ -33,7 +33,7 @@ from service.maps import storage_jobs
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import map_key
-from service.upkeep import merging, pruning, reencoding
+from service.upkeep import keypoints, merging, pruning, reencoding
 from service.upkeep.health import examine_health
 from service.upkeep.schemas import MapHealth, Merging, Pruning, Reencoding
 from service.worker_threads import in_thread
@@ -107,6 +107,16 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     searched exactly has no index to rebuild.
     """
     return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
+
+
+@router.post("/keypoints", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
+def fill_keypoints(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
+    """Find the keypoints of the places that have none, such as those enrolled before the map kept keypoints.
+
+    They are found in the pictures that the map keeps; of a place without a picture they cannot be found. Queries of
+    places that have theirs are verified meanwhile. If the map's setting `verification` is false, this finds nothing.
+    """
+    return submit(engine, jobs, response, keypoints.KIND, {}, engine.atlas.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))

@@ -1,4 +1,4 @@
-"""``placerec maps health``, ``re-encode``, ``rebuild``, ``prune`` and ``merge``: the upkeep of maps."""
+"""``placerec maps health``, ``re-encode``, ``rebuild``, ``keypoints``, ``prune`` and ``merge``: the upkeep of maps."""
 
 from __future__ import annotations
 
@@ -78,6 +78,13 @@ def rebuild(
 ) -> None:
     """Rebuild the search index of a large map from its descriptors, while it is searched."""
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+
+
+def keypoints(
+    map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
+) -> None:
+    """Find the keypoints of places that have none, in the pictures that the map keeps."""
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "keypoints"), {}, wait), as_json)
 
 
 def prune(

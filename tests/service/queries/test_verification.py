@@ -1,0 +1,139 @@
+"""Verification over HTTP: when candidates are verified, what answers say of it, and maps that lack keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.service.map_jobs import asked, finished
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.server import Server, assert_problem
+
+PLACES = 12
+
+
+@pytest.fixture(scope="module")
+def verified(server: Server) -> Iterator[str]:
+    """A map of places of their own, which keeps keypoints."""
+    server.create_map("verified", keep="image")
+    for seed in range(PLACES):
+        assert server.enrol("verified", f"p{seed}", jpeg(seed)).status_code == 201
+    yield "verified"
+
+
+def seen(seed: int) -> bytes:
+    return encoded(seen_again(scene(seed)))
+
+
+def parts(answer: dict[str, Any]) -> list[dict[str, Any]]:
+    return [match["parts"] for match in answer["matches"]]
+
+
+def test_always_tells_the_parts_of_each_match(server: Server, verified: str) -> None:
+    answer = server.query(verified, seen(3), verify="always", k=PLACES)
+    assert answer["verdict"] == "recognized" and answer["place"]["id"] == "p3"
+    assert answer["verification"]["state"] == "verified" and answer["verification"]["candidates"] == 10
+    assert answer["verification"]["keypoints"] > 100 and answer["milliseconds"]["verify"] > 0
+    for match in answer["matches"]:
+        told = match["parts"]
+        assert match["score"] == pytest.approx(told["similarity"] + told["agreement"], abs=1e-6)
+    best, *others = parts(answer)
+    assert 20 < best["inliers"] <= best["keypoints"] and best["evidence"] > 80
+    values = [
+        m["score"] + 0.7 * (m["parts"]["inliers"] or 0) / (m["parts"]["keypoints"] or 1) for m in answer["matches"]
+    ]
+    assert values == sorted(values, reverse=True)
+    assert [one["inliers"] is None for one in others].count(True) == PLACES - 10
+
+
+@pytest.mark.parametrize("verify", ["never", "auto", "always"])
+def test_the_same_frame_is_found_however_it_is_verified(server: Server, verified: str, verify: str) -> None:
+    answer = server.query(verified, seen(7), verify=verify)
+    assert answer["matches"][0]["place"]["id"] == "p7"
+    assert (answer["verification"]["state"] == "never") == (verify == "never")
+    assert answer["revision"] == 1
+
+
+def test_strangers_are_not_recognized_in_a_map_of_one_place(server: Server, map_id: str) -> None:
+    server.enrol(map_id, "only", jpeg(1))
+    for verify in ("auto", "always"):
+        assert server.query(map_id, seen(1), verify=verify)["place"]["id"] == "only"
+        for seed in range(100, 106):
+            assert server.query(map_id, jpeg(seed), verify=verify)["verdict"] == "unknown"
+
+
+def test_twins_are_ambiguous(server: Server, map_id: str) -> None:
+    for place in ("here", "there"):
+        server.enrol(map_id, place, jpeg(1) + (b"" if place == "here" else b"\0"))
+    answer = server.query(map_id, jpeg(1), verify="always")
+    assert answer["verdict"] == "ambiguous" and answer["place"] is None
+    assert {place for group in answer["rivals"] for place in group["places"]} <= {"here", "there"}
+
+
+def test_a_batch_is_verified_too(server: Server, verified: str) -> None:
+    files = {f"f{seed}": (f"f{seed}", seen(seed), "image/jpeg") for seed in (2, 5)}
+    response = server.client.post(f"/v1/maps/{verified}/query:batch", params={"verify": "always"}, files=files)
+    answers = [item["answer"] for item in response.json()["items"]]
+    assert [answer["place"]["id"] for answer in answers] == ["p2", "p5"]
+    assert all(answer["verification"]["state"] == "verified" for answer in answers)
+
+
+def test_several_maps_are_verified_for_one_frame(server: Server, verified: str) -> None:
+    params = {"maps": verified, "verify": "always"}
+    response = server.client.post("/v1/query", params=params, content=seen(4), headers={"Content-Type": "image/jpeg"})
+    (answer,) = response.json()["maps"]
+    assert answer["verification"]["state"] == "verified" and response.json()["place"]["id"] == "p4"
+
+
+def test_the_inliers_are_explained_and_drawn(server: Server, verified: str) -> None:
+    answer = server.query(verified, seen(3), verify="always", explain=True)
+    inliers = answer["explanation"]["inliers"]
+    assert len(inliers) == answer["matches"][0]["parts"]["inliers"]
+    assert all(0 <= share <= 1 for pair in inliers for end in (pair["query"], pair["match"]) for share in end)
+    picture = server.client.get(answer["explanation"]["picture"])
+    assert picture.status_code == 200 and picture.headers["content-type"] == "image/png"
+    assert server.query(verified, seen(3), verify="never", explain=True)["explanation"]["inliers"] == []
+
+
+def test_a_map_without_keypoints_says_so_and_answers_by_two_stages(server: Server) -> None:
+    server.create_map("bare", verification=False, keep="thumbnail")
+    for seed in range(3):
+        server.enrol("bare", f"p{seed}", jpeg(seed))
+    answers = {verify: server.query("bare", seen(1), verify=verify) for verify in ("never", "always")}
+    assert answers["always"]["verification"] == {"state": "no-keypoints", "candidates": 0, "keypoints": None}
+    for name in ("verdict", "probability", "score", "margin", "decision"):
+        assert answers["always"][name] == answers["never"][name]
+    result = finished(server, asked(server, "bare", "keypoints"))["result"]
+    assert result["found"] == 0  # the setting says that it keeps none
+    server.client.patch("/v1/maps/bare", json={"verification": True})
+    job = finished(server, asked(server, "bare", "keypoints"))
+    assert job["state"] == "succeeded" and job["result"]["found"] == 3 and job["result"]["without"] == 0
+    answer = server.query("bare", seen(1), verify="always")
+    assert answer["verification"]["state"] == "verified" and answer["place"]["id"] == "p1"
+    assert finished(server, asked(server, "bare", "keypoints"))["result"]["found"] == 0
+
+
+def test_a_loop_closure_is_verified_and_enrols_keypoints(server: Server, map_id: str) -> None:
+    def ask(seed: int, place: str) -> dict[str, Any]:
+        params = {"id": place, "verify": "always"}
+        headers = {"Content-Type": "image/jpeg"}
+        answer = server.client.post(
+            f"/v1/maps/{map_id}/query:enrol", params=params, content=seen(seed), headers=headers
+        )
+        found: dict[str, Any] = answer.json()
+        return found
+
+    assert ask(1, "first")["change"] == "created"
+    again = ask(1, "again")
+    assert again["change"] is None and again["verification"]["state"] == "verified"
+    assert again["place"]["id"] == "first"
+
+
+def test_a_blank_frame_and_a_wrong_word_are_answered_clearly(server: Server, verified: str) -> None:
+    assert server.query(verified, blank(), verify="always")["reason"] == "no-regions"
+    response = server.client.post(
+        f"/v1/maps/{verified}/query?verify=sometimes", content=seen(1), headers={"Content-Type": "image/jpeg"}
+    )
+    assert_problem(response, 422, "invalid-request")
