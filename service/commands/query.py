@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -52,6 +52,10 @@ def query(
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
+    verify: Annotated[
+        Literal["auto", "always", "never"],
+        typer.Option(help="Compare keypoints with the best candidates; auto: where the scores leave doubt."),
+    ] = "auto",
     url: Url = None,
     data_dir: DataDir = None,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a line for each frame.")] = False,
@@ -70,7 +74,7 @@ def query(
         "camera": camera,
     }
     known |= {"radius": radius, **_position(near, geographic)}
-    parameters = {"k": k, **{name: value for name, value in known.items() if value is not None}}
+    parameters = {"k": k, "verify": verify, **{name: value for name, value in known.items() if value is not None}}
     failures = run(_query(Target(url, data_dir), map_id, images, parameters, as_json))
     if failures:
         raise typer.Exit(1)

@@ -22,6 +22,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "keep": "thumbnail",
     "same_place_radius": 5.0,
     "same_place_frames": 3,
+    "verification": True,
     "calibration": {
         "source": "encoder-default",
         "threshold": 0.09,
@@ -44,7 +45,8 @@ MAP_EXAMPLE: dict[str, Any] = {
         "bytes_per_place": 68742,
         "descriptors": 7245776,
         "index": 0,
-        "database": 384512,
+        "database": 4731904,
+        "keypoints": {"places": 111, "bytes": 4348980},
     },
     "places": 111,
     "revision": 1,
@@ -70,6 +72,7 @@ class MapView(BaseModel):
     same_place_frames: int = Field(
         description="The same for places without poses: their distance in frames of one sequence."
     )
+    verification: bool = Field(description="Whether keypoints are kept of each frame, by which answers are verified.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
@@ -138,6 +141,7 @@ class MapChanges(BaseModel):
     keep: Keep | None = None
     same_place_radius: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
     same_place_frames: int | None = Field(strict=True, default=None, ge=0, le=2**31)
+    verification: bool | None = Field(strict=True, default=None)
     index: TierSetting | None = Field(
         default=None,
         description=f"auto, exact or compact (auto from {COMPACT_FROM} places on); inverted is compact.",

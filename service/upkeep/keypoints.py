@@ -61,12 +61,13 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         context.remember(told=told)
         context.progress(told["found"] + told["unreadable"], total, "finding keypoints")
         context.give_way()
-    left = map_.count_without_keypoints()
+    status, count = map_.storage_status(), map_.count_places()
+    assert status.keypoints is not None  # the map is open
     return {
         "map": map_.record.id,
-        "places": map_.count_places(),
+        "places": count,
         "found": told["found"],
-        "without": left,
+        "without": max(0, count - status.keypoints.places),
         "unreadable": {"count": told["unreadable"], "places": told["named"]},
     }
 

@@ -34,6 +34,12 @@ Frames = Annotated[
     int | None,
     typer.Option(min=0, help="Without poses: places within so many frames of a sequence count as the same place."),
 ]
+Verification = Annotated[
+    bool | None,
+    typer.Option(
+        "--verification/--no-verification", help="Keep keypoints of each frame, by which answers are verified."
+    ),
+]
 
 
 @maps.command("list")
@@ -71,12 +77,13 @@ def create_map(
     keep: Keep = None,
     same_place_radius: Radius = None,
     same_place_frames: Frames = None,
+    verification: Verification = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
     """Create a map. Its encoder cannot be changed later."""
-    given = _given(description, keep, same_place_radius, same_place_frames)
+    given = _given(description, keep, same_place_radius, same_place_frames, verification)
     body = {"id": map_id, **given, **({} if encoder is None else {"encoder": encoder})}
     _show_map(ask(Target(url, data_dir), "POST", path_of("maps"), json=body).json(), as_json)
 
@@ -88,6 +95,7 @@ def edit_map(
     keep: Keep = None,
     same_place_radius: Radius = None,
     same_place_frames: Frames = None,
+    verification: Verification = None,
     threshold: Annotated[float | None, typer.Option(help="Least decision value of a recognized place.")] = None,
     margin: Annotated[float | None, typer.Option(min=0, help="Least lead over the best rival.")] = None,
     default_calibration: Annotated[
@@ -98,7 +106,7 @@ def edit_map(
     as_json: AsJson = False,
 ) -> None:
     """Change settings of a map; the others stay as they are."""
-    changes = _given(description, keep, same_place_radius, same_place_frames)
+    changes = _given(description, keep, same_place_radius, same_place_frames, verification)
     calibration = {"threshold": threshold, "margin": margin}
     calibration = {name: value for name, value in calibration.items() if value is not None}
     if calibration and default_calibration:
@@ -144,12 +152,15 @@ def verify_map(map_id: MapId, url: Url = None, data_dir: DataDir = None, as_json
         output.print(f"The map {map_id} is not damaged: {report['places']} places were checked.", highlight=False)
 
 
-def _given(description: str | None, keep: str | None, radius: float | None, frames: int | None) -> dict[str, Any]:
+def _given(
+    description: str | None, keep: str | None, radius: float | None, frames: int | None, verification: bool | None
+) -> dict[str, Any]:
     settings = {
         "description": description,
         "keep": keep,
         "same_place_radius": radius,
         "same_place_frames": frames,
+        "verification": verification,
     }
     return {name: value for name, value in settings.items() if value is not None}
 

@@ -107,9 +107,10 @@ def test_a_map_without_keypoints_says_so_and_answers_by_two_stages(server: Serve
         assert answers["always"][name] == answers["never"][name]
     result = finished(server, asked(server, "bare", "keypoints"))["result"]
     assert result["found"] == 0  # the setting says that it keeps none
-    server.client.patch("/v1/maps/bare", json={"verification": True})
+    edited = server.client.patch("/v1/maps/bare", json={"verification": True})
+    assert edited.status_code == 200, edited.text
     job = finished(server, asked(server, "bare", "keypoints"))
-    assert job["state"] == "succeeded" and job["result"]["found"] == 3 and job["result"]["without"] == 0
+    assert job["state"] == "succeeded" and job["result"]["found"] == 3 and job["result"]["without"] == 0, job["result"]
     answer = server.query("bare", seen(1), verify="always")
     assert answer["verification"]["state"] == "verified" and answer["place"]["id"] == "p1"
     assert finished(server, asked(server, "bare", "keypoints"))["result"]["found"] == 0
@@ -132,7 +133,7 @@ def test_a_loop_closure_is_verified_and_enrols_keypoints(server: Server, map_id:
 
 
 def test_a_blank_frame_and_a_wrong_word_are_answered_clearly(server: Server, verified: str) -> None:
-    assert server.query(verified, blank(), verify="always")["reason"] == "no-regions"
+    assert server.query(verified, encoded(blank()), verify="always")["reason"] == "no-regions"
     response = server.client.post(
         f"/v1/maps/{verified}/query?verify=sometimes", content=seen(1), headers={"Content-Type": "image/jpeg"}
     )
