@@ -41,6 +41,12 @@ class MapSettings(BaseModel):
     same_place_frames: Annotated[int, Field(strict=True, ge=0, le=2**31)] = Field(
         default=3, description="Without poses: places so many frames apart in their sequence are the same place."
     )
+    verification: bool = Field(
+        default=True,
+        strict=True,
+        description="Whether keypoints are kept of each frame, by which answers are verified. A change applies to "
+        "frames enrolled from then on.",
+    )
     index: TierSetting = Field(
         default="auto",
         description="How the map is searched: every place compared (exact), by codes (compact; inverted, a former "

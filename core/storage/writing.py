@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 from datetime import UTC, datetime
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,13 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
-from core.places import Place, PlaceFields, check_place_id
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, check_place_id, microseconds
 from core.storage.database import ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
-from core.storage.opening import OpenMap, location_of
+from core.storage.opening import OpenMap
 from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
 from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
@@ -58,7 +59,20 @@ def check_enrolment(item: Enrolment, dimension: int, local_shape: tuple[int, int
 
 
 def _location(stored: StoredPlace) -> Location:
-    return location_of(stored.place.pose, stored.sequence, stored.ordinal, stored.place.timestamp)
+    """Where a place is as the snapshot holds it."""
+    pose, moment = stored.place.pose, stored.place.timestamp
+    kind = NO_POSE if pose is None else METRIC if pose.kind() == "metric" else GEOGRAPHIC
+    x, y, z = (0.0, 0.0, 0.0) if pose is None else pose.position().tolist()
+    return Location(
+        kind,
+        (x, y, z),
+        stored.sequence,
+        stored.ordinal,
+        nan if pose is None or pose.heading is None else pose.heading,
+        NO_TIME if moment is None else microseconds(moment),
+        stored.track,
+        stored.station,
+    )
 
 
 def record_appended(

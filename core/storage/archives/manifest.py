@@ -1,6 +1,6 @@
 """The manifest of an export file: its first part, by which all others are checked.
 
-The file is a plain tar (ustar).  Its members, in this order, in version 1:
+The file is a plain tar (ustar).  Its members, in this order:
 
     manifest.json               format, version, the map's record, and size and SHA-256 of each part
     manifest.sha256             its SHA-256, as sha256sum writes it
@@ -13,6 +13,8 @@ The file is a plain tar (ustar).  Its members, in this order, in version 1:
     places-000002.jsonl …       and so on
 
 The bytes of a file follow from its manifest and its parts, so the SHA-256 of the manifest identifies the whole file.
+
+In version 1 the map's record does not say whether keypoints are kept.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from core.places import check_map_id
 from core.storage.records import MapRecord, validation_message
 
 FORMAT = "placerec map"
-VERSION = 1
+VERSION = 2
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
 GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"))
@@ -174,7 +176,7 @@ def read_manifest(text: bytes) -> Manifest:
     return READERS[version](value)
 
 
-def _read_first(value: dict[str, Any]) -> Manifest:
+def _read(value: dict[str, Any]) -> Manifest:
     inner: Any = value
     for name, kind in (("map", ArchivedRecord), ("calibration", Calibration), ("curve", Curve)):
         inner = inner.get(name) if isinstance(inner, dict) else None
@@ -205,5 +207,5 @@ def _read_first(value: dict[str, Any]) -> Manifest:
     return manifest
 
 
-READERS = {1: _read_first}
+READERS = {1: _read, 2: _read}
 """The reader of each version; versions that were released stay."""

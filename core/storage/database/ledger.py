@@ -42,6 +42,7 @@ class StoredPlace:
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
     ordinal: its position in its sequence.
+    track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     """
 
     number: int
@@ -49,6 +50,8 @@ class StoredPlace:
     digest: bytes
     sequence: int
     ordinal: int
+    track: int | None
+    station: int | None
     place: Place
 
 
@@ -88,9 +91,8 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
         )
     except ValueError as error:
         raise Damage(f"map.sqlite: place {columns['id']!r} is invalid") from error
-    return StoredPlace(
-        columns["number"], columns["row"], columns["digest"], columns["sequence"], columns["ordinal"], place
-    )
+    numbers = {name: columns[name] for name in ("number", "row", "digest", "sequence", "ordinal", "track", "station")}
+    return StoredPlace(**numbers, place=place)
 
 
 def moment_text(moment: datetime) -> str:
@@ -427,6 +429,7 @@ def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
     if not isinstance(rows_per_segment, int):
         raise ValueError("it does not say how many rows a segment has")
     del columns["only"]
+    columns["verification"] = bool(columns["verification"])
     if columns["calibration"] is not None:
         columns["calibration"] = json.loads(columns["calibration"])
     return MapRecord.model_validate(columns), rows_per_segment

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from core.errors import ArchiveTooNew, InvalidArchive
 from core.storage.archives.lines import CameraLine, PlaceLine, read_line
-from core.storage.archives.manifest import MOST_MANIFEST_BYTES, group_names, read_manifest
+from core.storage.archives.manifest import MOST_MANIFEST_BYTES, VERSION, group_names, read_manifest
 from core.storage.archives.reading import Archive, check
 from core.storage.archives.tar_layout import BLOCK, header
 from tests.core.storage.archives.files import Parts, grown, named, parts_of, sealed, taped
@@ -239,8 +239,8 @@ def test_a_manifest_as_long_as_they_come(content: bytes) -> None:
 
 def test_a_later_version_is_told_from_damage(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "sent.tar"
-    path.write_bytes(manifest_with(version=2, novel={"field": 1})(content))
-    with pytest.raises(ArchiveTooNew, match="format 2, this one knows 1"), Archive(path):
+    path.write_bytes(manifest_with(version=VERSION + 1, novel={"field": 1})(content))
+    with pytest.raises(ArchiveTooNew, match=f"format {VERSION + 1}, this one knows {VERSION}"), Archive(path):
         pass
 
 
