@@ -28,6 +28,7 @@ from core.places import Place, PlaceFields
 from core.storage.archives.exporter import Exporter
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
+from core.storage.counterparts import Counterparts
 from core.storage.database import keypoints, ledger
 from core.storage.database.connections import DatabaseClosed
 from core.storage.database.ledger import SegmentEntry, segment_entries
@@ -118,6 +119,7 @@ class Map:
         self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
+        self.counterparts = Counterparts(self._reading, self._writing)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
         self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 

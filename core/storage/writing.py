@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
 from core.geometry.keypoints import Keypoints
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, check_place_id, microseconds
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, check_place_id, microseconds
 from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
 from core.storage.files import segment_files as descriptors
@@ -201,6 +201,15 @@ class Write:
         now_stored = ledger.set_fields(self.connection, stored, fields, self._now)
         self._moved[stored.row] = _location(now_stored)
         return now_stored.place, "updated"
+
+    def set_counterpart(
+        self, stored: StoredPlace, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
+    ) -> None:
+        """Set the station of a place, None for its own, its pose and the place from which it got the pose."""
+        at = None if track is None or station is None else (track, station)
+        at = None if at == (stored.sequence, stored.ordinal) else at
+        now_stored = ledger.set_counterpart(self.connection, stored, at, pose, pose_of, self._now)
+        self._moved[stored.row] = _location(now_stored)
 
     def forget(self, stored: StoredPlace) -> None:
         """Delete a place."""
