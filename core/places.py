@@ -150,6 +150,7 @@ class Place(PlaceFields):
     """One enrolled reference frame."""
 
     id: str
+    pose_of: str | None = Field(default=None, description="The place whose pose it got from an alignment.")
     regions: int = Field(ge=0, description="Regions of interest found in the frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
     created_at: Timestamp

@@ -25,7 +25,11 @@ from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
+<<<<<<< HEAD
 from service.upkeep import keypoints, merging, pruning, reencoding
+=======
+from service.upkeep import alignment, merging, pruning, reencoding
+>>>>>>> storage16
 from service.worker_threads import in_thread
 
 DISK_CHECK_SECONDS = 1.0
@@ -72,6 +76,7 @@ class Runtime:
         engine, staging, register = self.engine, self.staging, self.jobs.register
         register(reencoding.KIND, partial(reencoding.reencode, engine))
         register(pruning.KIND, partial(pruning.prune, engine))
+        register(alignment.KIND, partial(alignment.align, engine))
         register(merging.KIND, partial(merging.merge, engine))
         register(keypoints.KIND, partial(keypoints.fill_keypoints, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))

@@ -274,8 +274,9 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
     ready = [(p, name) for p, name in due if p.id in found and found[p.id][1] == p.row < snapshot.rows]
     rows = np.array([place.row for place, _ in ready], np.int64)
     descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
+    keypoints = other.keypoints_at([place.row for place, _ in ready])
     items = []
-    for (place, name), descriptor, cells in zip(ready, descriptors, local, strict=True):
+    for (place, name), descriptor, cells, of_frame in zip(ready, descriptors, local, keypoints, strict=True):
         stored = found[place.id][0]
         fields = {field: getattr(stored, field) for field in PlaceFields.model_fields}
         if stored.sequence is not None:
@@ -292,6 +293,7 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             local=cells,
             thumbnail=picture if stored.picture == "thumbnail" else None,
             image=picture if stored.picture == "image" else None,
+            keypoints=of_frame,
         )
         ordinal = ends.get(fields["sequence"] or "", 0) + place.ordinal
         items.append((item, History(stored.picture, ordinal, stored.created_at, stored.updated_at)))

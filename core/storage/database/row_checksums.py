@@ -26,7 +26,7 @@ _FIRST: Mapping[str, Sequence[str]] = {
 }  # fmt: skip
 
 ADDED: Sequence[Mapping[str, Sequence[str]]] = (
-    {"map": ("verification",), "places": ("track", "station"), "cameras": ("intrinsics",)},
+    {"map": ("verification",), "places": ("track", "station", "pose_of"), "cameras": ("intrinsics",)},
 )
 """The columns that each migration of the tables added to those of the first release."""
 

@@ -138,6 +138,8 @@ MIGRATIONS: Sequence[Migration] = (
         # NULL: those of the place itself.  The sequence may be gone, whose code is never used again.
         "ALTER TABLE places ADD COLUMN track INTEGER",
         "ALTER TABLE places ADD COLUMN station INTEGER",
+        # The id of the place whose pose the place got with its station; NULL: the pose is its own.
+        "ALTER TABLE places ADD COLUMN pose_of TEXT",
         "CREATE INDEX places_at_station ON places (track, station) WHERE track IS NOT NULL",
         "ALTER TABLE cameras ADD COLUMN intrinsics TEXT",
         # Apart from the places, for the same reason as pictures.  The checksum covers the digest of the frame, too.

@@ -22,6 +22,7 @@ from tests.core.storage.frames import DIMENSION, ENCODER, frame
 
 Made = Callable[[bytes], bytes]
 PLACES, FRAMES, PICTURES = "places-000001.jsonl", "descriptors-000001.bin", "pictures-000001.bin"
+KEYPOINTS = "keypoints-000001.bin"
 CAMERAS, SEQUENCES = "cameras.jsonl", "sequences.jsonl"
 
 
@@ -113,6 +114,21 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a picture of no kind": (line(PLACES, 5, picture={**KEPT, "kind": "none"}), "picture"),
     "pictures left over": (raw(PICTURES, lambda d: d + b"more"), "longer"),
     "pictures too few": (raw(PICTURES, lambda d: d[:-1]), "shorter"),
+    "keypoints of other numbers": (place(keypoints=5), "keypoints of place 'p1' cannot be taken|shorter"),
+    "keypoints too many": (place(keypoints=577), "keypoints"),
+    "keypoints below 0": (place(keypoints=-1), "keypoints"),
+    "keypoints that are true": (place(keypoints=True), "keypoints"),
+    "keypoints not listed": (place(keypoints=None), "cannot be taken|longer"),
+    "keypoints left over": (raw(KEYPOINTS, lambda d: d + b"more"), "longer"),
+    "keypoints too few": (raw(KEYPOINTS, lambda d: d[:-1]), "shorter"),
+    "keypoints of no frame": (raw(KEYPOINTS, lambda d: bytes(4) + d[4:]), "keypoints of place 'p0' cannot be taken"),
+    "keypoints without descriptors": (raw(KEYPOINTS, lambda d: d[:12] + bytes(len(d) - 12)), "lacks a descriptor"),
+    "endless keypoints": (raw(KEYPOINTS, lambda d: d + bytes(400_000)), "more bytes than the keypoints of 9 places"),
+    "a track not listed": (place(track="sunday", station=1), "does not list"),
+    "a track without a station": (place(track="monday"), "needs a station"),
+    "a station without a track": (place(station=1), "needs a station"),
+    "a track below 0": (place(track=-1, station=1), "track"),
+    "a station too far": (place(track=0, station=1 << 63), "station"),
     "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), ", not 9 times"),
     "descriptors too few": (raw(FRAMES, lambda d: d[:-47]), ", not 9 times"),
     "a descriptor of zeros": (descriptor(), "cannot be compared"),

@@ -49,12 +49,23 @@ def test_what_comes_back_is_what_was_there(
         np.testing.assert_array_equal(ours.locals_at(row), theirs.locals_at(other_row))
         assert copy.digest(place.id) == source.digest(place.id)
         assert copy.picture(place.id) == source.picture(place.id)
+        (ours_of,), (theirs_of,) = source.keypoints_at(row.tolist()), copy.keypoints_at(other_row.tolist())
+        assert (ours_of and ours_of.record()) == (theirs_of and theirs_of.record())
+        assert (ours_of is None) == (place.id == "roof")
     assert copy.verify().ok
     # Written again it is the same file, to the last bit: nothing was lost, nothing added, no order changed.
     assert exported(copy, tmp_path / "again") == path.read_bytes()
     copy.enrol([frame("new", local_shape=copy.record.local_shape)])
     assert copy.verify().ok
     other.close()
+
+
+def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
+    with full._writing() as write:
+        write.connection.execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE place = 1")
+    with pytest.raises(StorageFailure, match="The keypoints kept of place 'p0' do not match their checksum"):
+        full.exporter.write(tmp_path / "kept.tar")
+    assert not (tmp_path / "kept.tar").exists()
 
 
 def test_the_same_content_is_the_same_file(full: Map, tmp_path: Path) -> None:
@@ -103,7 +114,7 @@ def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 4)
     grouped = exported(full, tmp_path / "grouped")
     manifest, parts = parts_of(grouped)
-    assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 6 + [1] * 3
+    assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 8 + [1] * 4
     joined = b"".join(data for name, data in parts.items() if name.startswith("descriptors-"))
     assert joined == parts_of(whole)[1]["descriptors-000001.bin"]
     path = tmp_path / "grouped.tar"
@@ -234,6 +245,6 @@ def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: p
 
 def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
-    with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
+    with pytest.raises(StorageFailure, match="too many places for one file: 6 parts"):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []

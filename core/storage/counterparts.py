@@ -1,0 +1,65 @@
+"""The stations at which places of other traverses show the same, as alignment found them, and the poses handed over."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from core.storage.cameras import Access
+from core.storage.database import ledger
+from core.storage.writing import Write
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """What changes in a map with what an alignment found; everything is named by its row.
+
+    stations: the new track and station of places (``Whereabouts``).
+    poses: for places that get a pose, the place whose pose it is; None for those that lose the pose that they got.
+    """
+
+    stations: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    poses: Mapping[int, int | None] = field(default_factory=dict)
+
+
+class Counterparts:
+    """Reads and writes where the places of one map have counterparts.  Any thread may use it.
+
+    Every method may raise what ``reading`` and ``writing`` raise.
+
+    Args:
+        reading, writing: open a connection to the map's database, and begin a write to the map.
+    """
+
+    def __init__(self, reading: Access[sqlite3.Connection], writing: Access[Write]) -> None:
+        self._reading, self._writing = reading, writing
+
+    def handed_over(self) -> dict[int, str]:
+        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+        with self._reading() as connection:
+            return dict(connection.execute("SELECT row, pose_of FROM places WHERE pose_of IS NOT NULL").fetchall())
+
+    def store(self, change: Correspondence) -> None:
+        """Store stations and poses, all of them in one COMMIT or, if this raises, none.
+
+        Rows whose place is gone are left out.  Hold the map's writes (``Transfer.paused_writes``) from the decision
+        on if none may be.
+        """
+        rows = sorted({*change.stations, *change.poses})
+        if not rows:
+            return
+        with self._writing() as write:
+            givers = {giver for giver in change.poses.values() if giver is not None}
+            found = ledger.stored_at(write.connection, [*rows, *givers])
+            for row in rows:
+                if (stored := found.get(row)) is None:
+                    continue
+                track, station = change.stations.get(row, (stored.track, stored.station))
+                pose, pose_of = stored.place.pose, stored.place.pose_of
+                if row in change.poses:
+                    giver = change.poses[row]
+                    source = None if giver is None else found.get(giver)
+                    pose = None if source is None else source.place.pose
+                    pose_of = None if source is None else source.place.id
+                write.set_counterpart(stored, track, station, pose, pose_of)
