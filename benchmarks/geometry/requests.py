@@ -2,9 +2,10 @@
 
     python -m benchmarks.geometry.requests --data ../shared/datasets [--rounds 1]
 
-Each traverse's references are enrolled as one sequence, with and without keypoints, and its queries are asked one after
+Each traverse's references are enrolled as one sequence, with and without keypoints, and its queries are asked one
 after the other, each in all three ways.  ``auto`` may take 1.5 times as long as ``never`` on average, ``always`` 60 ms
 more.
+"""
 
 from __future__ import annotations
 

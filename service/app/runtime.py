@@ -25,11 +25,7 @@ from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
-<<<<<<< HEAD
-from service.upkeep import keypoints, merging, pruning, reencoding
-=======
-from service.upkeep import alignment, merging, pruning, reencoding
->>>>>>> storage16
+from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.worker_threads import in_thread
 
 DISK_CHECK_SECONDS = 1.0

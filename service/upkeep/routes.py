@@ -34,11 +34,7 @@ from service.maps import storage_jobs
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import map_key
-<<<<<<< HEAD
-from service.upkeep import keypoints, merging, pruning, reencoding
-=======
-from service.upkeep import alignment, merging, pruning, reencoding
->>>>>>> storage16
+from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.upkeep.health import examine_health
 from service.upkeep.schemas import Aligning, MapHealth, Merging, Pruning, Reencoding
 from service.worker_threads import in_thread

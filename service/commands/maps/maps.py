@@ -10,11 +10,7 @@ from service.commands.connection.client import AsJson, DataDir, MapId, Target, U
 from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
 from service.commands.maps.backup import export, import_
 from service.commands.maps.places import places, sequences
-<<<<<<< HEAD
-from service.commands.maps.upkeep import health, keypoints, merge, prune, rebuild, reencode
-=======
-from service.commands.maps.upkeep import align, health, merge, prune, rebuild, reencode
->>>>>>> storage16
+from service.commands.maps.upkeep import align, health, keypoints, merge, prune, rebuild, reencode
 
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
 maps.add_typer(places, name="places")

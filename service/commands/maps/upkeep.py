@@ -1,8 +1,6 @@
-<<<<<<< HEAD
-"""``placerec maps health``, ``re-encode``, ``rebuild``, ``keypoints``, ``prune`` and ``merge``: the upkeep of maps."""
-=======
-"""``placerec maps health``, ``re-encode``, ``rebuild``, ``align``, ``prune`` and ``merge``: the upkeep of maps."""
->>>>>>> storage16
+"""The upkeep of maps: ``placerec maps health``, ``re-encode``, ``rebuild``, ``keypoints``, ``align``, ``prune`` and
+``merge``.
+"""
 
 from __future__ import annotations
 
@@ -84,13 +82,13 @@ def rebuild(
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
 
 
-<<<<<<< HEAD
 def keypoints(
     map_id: MapId, wait: Wait = True, url: Url = None, data_dir: DataDir = None, as_json: AsJson = False
 ) -> None:
     """Find the keypoints of places that have none, in the pictures that the map keeps."""
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "keypoints"), {}, wait), as_json)
-=======
+
+
 def align(
     map_id: MapId,
     sequence: Annotated[str, typer.Option(help="The traverse to align.", show_default=False)],
@@ -115,7 +113,6 @@ def align(
         raise typer.BadParameter("--undo cannot be combined with --with")
     body = {"sequence": sequence, "with": [] if undo else with_ or None, "poses": poses, "dry_run": dry_run}
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "align"), body, wait), as_json)
->>>>>>> storage16
 
 
 def prune(
