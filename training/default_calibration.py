@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from core.judgement.calibration import FALSE_ACCEPTS, LOST_BY_MARGIN
 from core.judgement.curves import auc_roc
+from core.judgement.geometry import TERMS
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import reliability
 from core.judgement.trials import Trial, Trials, gathered, joined
@@ -144,10 +145,10 @@ def probability_quality(t: Trials, calibration: Calibration) -> dict[str, float]
 
 
 def for_small_maps(encoder: Encoder, datasets: Path, calibration: Calibration) -> Calibration:
-    """The calibration with what it needs in maps of a few places (``map_sizes.py``)."""
+    """The calibration with what it needs in maps of a few places, and for geometric evidence (``map_sizes.py``)."""
     traverses = list(fitting_traverses(encoder, datasets))
     environment = fit_environment(encoder, datasets, traverses)
-    found = calibration.model_copy(update={"environment": environment})
+    found = calibration.model_copy(update={"environment": environment, "geometry": TERMS})
     return found.model_copy(update={"curve": fit_small_maps(found, traverses)})
 
 

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from core.errors import CalibrationImpossible
 from core.judgement.curves import auc_pr, auc_roc, falling
+from core.judgement.geometry import TERMS
 from core.judgement.probability import Curve, fit_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.trials import Flags, Trial, Trials, Values, gathered, joined
@@ -82,6 +83,7 @@ def fit_encoder_calibration(unknown: Scores, known: Scores, neighbours: int, sou
         background_deviation=max(SMALLEST_DEVIATION, float(unrelated.std())),
         decision="leading",
         frames=n,
+        geometry=TERMS,
     )
     same_place = Neighborhood(radius=0.0, frames=neighbours)
     strangers = gathered(
@@ -189,7 +191,9 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
     """Fit a calibration to the trials on one map.
 
     Args:
-        trials: judged with ``base``, whose background and kind of decision value are kept.
+        trials: judged with ``base``, whose background and kind of decision value are kept, and whose terms of geometric
+            evidence, which were not measured on this map.  Curve, margin and threshold are of two stages; what is
+            reported of trials that were verified is of three.
         target: what the threshold is to achieve.
         source: recorded in the calibration.
 

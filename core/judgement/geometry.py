@@ -10,7 +10,8 @@ and the evidence of the best match joins the log odds L of the first two stages 
     log odds = support · L + slope · ln(1 + e) + intercept.
 
 Evidence needs no other place to be compared with, so it says in a map of one place what it says in a large one.  Where
-two stages say next to nothing, as in a small map, the evidence decides; where a picture can give no evidence, they do.
+two stages say next to nothing, as in a small map, the evidence decides.  As keypoints are the same for every encoder,
+and L is a log odds whatever the encoder's scores are, so are the three numbers.
 
 A rival takes away from the certainty of an answer as far as it fits as well: its lead is measured in the final order.
 Two places of one picture are so ``ambiguous``, however much evidence both have, and a best match that fits, of whose
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["WEIGHT", "Geometry", "GeometryTerms", "final_order", "final_values"]
+__all__ = ["TERMS", "WEIGHT", "Geometry", "GeometryTerms", "final_order", "final_values"]
 
 Values = NDArray[np.float64]
 
@@ -63,24 +64,22 @@ class Geometry:
 
 
 class GeometryTerms(BaseModel):
-    """How evidence joins the log odds of the first two stages (see the module); the same for every encoder.
-
-    ``margin`` is the lead in the final order under which an answer is ambiguous.  A match that was verified is believed
-    from the probability ``threshold`` on, rivals left out of account.
-    """
+    """How evidence joins the log odds of the first two stages (see the module)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     support: float = Field(ge=0, allow_inf_nan=False, description="Weight of the log odds of the first two stages.")
     slope: float = Field(gt=0, allow_inf_nan=False, description="Log odds gained by an evidence e times greater.")
     intercept: float = Field(allow_inf_nan=False, description="Log odds where neither says anything.")
-    margin: float = Field(ge=0, allow_inf_nan=False, description="Least lead in the final order.")
-    threshold: float = Field(gt=0, lt=1, description="Probability from which on a verified match is believed.")
 
     def log_odds(self, two_stages: ArrayLike, evidence: ArrayLike) -> Values:
         """The log odds of three stages, from those of two and from the evidence; all of one shape."""
         before, found = np.asarray(two_stages, np.float64), np.asarray(evidence, np.float64)
         return np.asarray(self.support * before + self.slope * np.log1p(found) + self.intercept, np.float64)
+
+
+TERMS = GeometryTerms(support=0.5, slope=1.925, intercept=-7.533)
+"""Fitted to maps of 1 to 100 frames of camvid, and of half of them (``python -m training.map_sizes``)."""
 
 
 def final_values(scores: NDArray[np.floating], share: Values) -> Values:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.judgement.verdict import Calibration, Judgement, probability_of
+from core.judgement.verdict import Calibration, Judgement, probability_of, stands_out
 
-_NUMBERS = ("decision", "margin", "known", "right", "imagined")
+_NUMBERS = ("decision", "margin", "known", "right", "imagined", "evidence")
 
 Flags = NDArray[np.bool_]
 Values = NDArray[np.float64]
@@ -27,6 +27,7 @@ class Trials:
     frame: int64 [n], the number of the query's frame, in the order in which the frames were taken.  A frame that is a
         query of a map with its place and of a map without it has the same number in both.
     imagined: float64 [n], the share of the background that was imagined; zeros if left out.
+    evidence: float64 [n], of the best match; NaN where it was not verified, and everywhere if left out.
     """
 
     decision: Values
@@ -35,10 +36,12 @@ class Trials:
     right: Flags
     frame: NDArray[np.int64]
     imagined: Values = field(default_factory=lambda: np.empty(0))
+    evidence: Values = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        if len(self.imagined) < len(self.decision):
-            object.__setattr__(self, "imagined", np.zeros(len(self.decision)))
+        for name, value in (("imagined", 0.0), ("evidence", np.nan)):
+            if len(getattr(self, name)) < len(self.decision):
+                object.__setattr__(self, name, np.full(len(self.decision), value))
 
     def __len__(self) -> int:
         return len(self.decision)
@@ -49,12 +52,19 @@ class Trials:
 
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
-        return (self.decision >= calibration.threshold) & (self.margin >= calibration.margin)
+        believed = [stands_out(d, calibration, share, found) for d, _, share, found in self._rows()]
+        return np.array(believed, np.bool_) & (self.margin >= calibration.margin)
 
     def probabilities(self, calibration: Calibration) -> Values:
         """The probability that each is right, by a calibration with a curve, float64 [n]."""
-        rows = zip(self.decision.tolist(), self.margin.tolist(), self.imagined.tolist(), strict=True)
-        return np.array([probability_of(d, margin, calibration, share) for d, margin, share in rows], np.float64)
+        stated = [probability_of(d, margin, calibration, share, found) for d, margin, share, found in self._rows()]
+        return np.array(stated, np.float64)
+
+    def _rows(self) -> Iterator[tuple[float, float, float, float | None]]:
+        """Decision value, margin, imagined share and evidence of each."""
+        columns = (self.decision, self.margin, self.imagined, self.evidence)
+        for decision, margin, share, found in zip(*(column.tolist() for column in columns), strict=True):
+            yield decision, margin, share, None if np.isnan(found) else found
 
 
 @dataclass(frozen=True)
@@ -77,11 +87,12 @@ def gathered(trials: Iterable[Trial]) -> Trials:
             one.right,
             one.frame,
             one.judgement.imagined,
+            np.nan if one.judgement.evidence is None else one.judgement.evidence,
         )
         for one in trials
         if one.judgement.decision is not None
     ]
-    decision, margin, known, right, frame, imagined = zip(*rows, strict=True) if rows else ((),) * 6
+    decision, margin, known, right, frame, imagined, found = zip(*rows, strict=True) if rows else ((),) * 7
     return Trials(
         np.array(decision, np.float64),
         np.array(margin, np.float64),
@@ -89,6 +100,7 @@ def gathered(trials: Iterable[Trial]) -> Trials:
         np.array(right, np.bool_),
         np.array(frame, np.int64),
         np.array(imagined, np.float64),
+        np.array(found, np.float64),
     )
 
 

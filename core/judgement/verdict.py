@@ -56,8 +56,12 @@ corridor and lip6 enrolled twice, and without sequences, 1.5 to 3 change no shar
 MOST_RIVALS = 8
 """So many rivals, each with its neighbours, are looked at; they are the best ones."""
 
-HOPELESS, CERTAIN = 0.05, 0.95
-"""Between these probabilities two stages leave doubt."""
+MOSTLY_IMAGINED = 0.5
+"""A map of which more of the background than this is imagined has few places."""
+
+DOUBT = (0.2, 0.5)
+"""Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, asked of the whole other
+traverse, two stages leave 0.26 and 0.12 there."""
 
 
 class Calibration(BaseModel):
@@ -126,7 +130,7 @@ class Judgement:
 
     score: of the best match.
     decision: the decision value.
-    margin: the lead over the best rival, in the order of the ranking: of scores, or of three stages.
+    margin: the lead over the best rival; in the order of three stages if both were verified, else in scores.
     rival: the position of the best rival in the ranking.
     probability: that the best match is right; None for an empty map, and for a calibration without a curve.
     imagined: the share of the background that was imagined, from 0 to 1.
@@ -184,33 +188,29 @@ def probability_of(
     odds = log_odds_of(decision, calibration, imagined, evidence)
     if odds is None:
         return None
-    clear, least = 1.0, least_margin(calibration, evidence)
+    clear = 1.0
     if margin is not None:
-        clear = min(1.0, max(0.0, margin) / least) if least else float(margin > 0)
+        clear = min(1.0, max(0.0, margin) / calibration.margin) if calibration.margin else float(margin > 0)
     return float(sigmoid(np.array([odds]))[0]) * (1 + clear) / 2
-
-
-def least_margin(calibration: Calibration, evidence: float | None) -> float:
-    """The lead under which an answer is ambiguous, given the evidence of the best match; None: it was not verified."""
-    return calibration.margin if evidence is None or calibration.geometry is None else calibration.geometry.margin
 
 
 def stands_out(decision: float, calibration: Calibration, imagined: float = 0.0, evidence: float | None = None) -> bool:
     """Whether a best match is believed if its lead is large enough.
 
-    By the decision value alone, or by the probability of three stages where it was verified.  The arguments are those
-    of :func:`log_odds_of`.
+    By the decision value; or, if it was verified, by the probability of three stages, which has to be a half at least
+    and that of two stages at the threshold.  The arguments are those of :func:`log_odds_of`.
     """
     if evidence is None or calibration.geometry is None or calibration.curve is None:
         return decision >= calibration.threshold
     odds = log_odds_of(decision, calibration, imagined, evidence)
-    return odds is not None and float(sigmoid(np.array([odds]))[0]) >= calibration.geometry.threshold
+    return odds is not None and odds >= max(0.0, float(calibration.curve.log_odds(calibration.threshold)))
 
 
 def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
     """Whether ``verify=auto`` verifies candidates after this judgement, because it leaves doubt.
 
-    It is asked after two stages, and again after the best match alone was verified, whose evidence may settle it.
+    It is asked after two stages, and again after their best match alone was verified, whose evidence may settle it.  In
+    a map of a few places two stages always leave doubt.
 
     Args:
         judgement: of two stages; or of three, after the best match was verified.
@@ -221,11 +221,10 @@ def worth_verifying(judgement: Judgement, calibration: Calibration) -> bool:
     """
     if calibration.geometry is None or judgement.probability is None:
         return False
+    doubtful = DOUBT[0] < judgement.probability < DOUBT[1]
     if judgement.evidence is not None:
-        return judgement.verdict != "recognized"
-    if judgement.imagined > 0 or judgement.verdict == "ambiguous":
-        return True
-    return HOPELESS < judgement.probability < CERTAIN
+        return doubtful
+    return doubtful or judgement.verdict == "ambiguous" or judgement.imagined > MOSTLY_IMAGINED
 
 
 def judge(
@@ -262,14 +261,15 @@ def judge(
     best, others, evidence = float(scores[0]), ranking.others, ranking.evidence
     behind = ranking.background()
     decision = behind.decision(best)
-    rival = int(others[0]) if len(others) else None
-    margin = None if rival is None else float(ranking.values[0]) - float(ranking.values[rival])
+    leads = ranking.leads(others)
+    rival = int(others[leads.argmin()]) if len(others) else None
+    margin = None if rival is None else float(leads.min())
     verdict: Verdict = "recognized"
     rivals: tuple[Rivals, ...] = ()
     if not stands_out(decision, calibration, behind.imagined, evidence):
         rivals = ranking.explaining_rivals(likeness)
         verdict = "ambiguous" if rivals else "unknown"
-    elif margin is not None and margin < ranking.least_margin:
+    elif margin is not None and margin < calibration.margin:
         heads = ranking.heads()
         rivals = ranking.grouped(heads, ranking.alike(heads, likeness))
         verdict = "ambiguous"
@@ -281,22 +281,20 @@ def judge(
 class _Ranking:
     """A ranking, and which of its places are other than the best match.
 
-    values: float [n], by which the places are ordered, best first: the scores, or those of three stages.
     others: int64 [m], positions of the other places.
     compared: int64 [k], those of them whose scores are compared with the best.
     apart: bool [n], the places that cannot overlap with the best match.
-    evidence: of the best match; None if it was not verified.
+    geometry: what verification found of the n places; None if none was verified.
     """
 
     scores: NDArray[np.float32]
-    values: NDArray[np.floating]
     whereabouts: Whereabouts
     calibration: Calibration
     neighborhood: Neighborhood
     others: Positions
     compared: Positions
     apart: NDArray[np.bool_]
-    evidence: float | None
+    geometry: Geometry | None
 
     @classmethod
     def of(
@@ -315,14 +313,24 @@ class _Ranking:
         apart = np.ones(len(scores), np.bool_)
         if len(others) < FULL:  # nothing is estimated otherwise
             apart = ~whereabouts.near(0, neighborhood.times(GUARD_FACTOR))
-        values: NDArray[np.floating] = scores if geometry is None else final_values(scores, geometry.share)
-        evidence = None if geometry is None else geometry.best
-        return cls(scores, values, whereabouts, calibration, neighborhood, others, compared, apart, evidence)
+        return cls(scores, whereabouts, calibration, neighborhood, others, compared, apart, geometry)
 
     @property
-    def least_margin(self) -> float:
-        """The lead under which the answer is ambiguous."""
-        return least_margin(self.calibration, self.evidence)
+    def evidence(self) -> float | None:
+        """Of the best match; None if it was not verified."""
+        return None if self.geometry is None else self.geometry.best
+
+    def leads(self, places: Positions) -> NDArray[np.float64]:
+        """By how much the best match is ahead of some places, int64 [k]; float64 [k].
+
+        Two places that were verified are compared in the order of three stages, others in the scores of two.
+        """
+        ahead = float(self.scores[0]) - self.scores[places].astype(np.float64)
+        if self.geometry is None or self.evidence is None:
+            return ahead
+        values = final_values(self.scores, self.geometry.share)
+        verified = ~np.isnan(self.geometry.evidence[places])
+        return np.where(verified, values[0] - values[places], ahead)
 
     def background(self, left_out: NDArray[np.bool_] | None = None) -> Background:
         """The background without some places, bool [n]."""
@@ -373,6 +381,6 @@ class _Ranking:
 
     def grouped(self, heads: Positions, alike: NDArray[np.bool_]) -> tuple[Rivals, ...]:
         """The rivals that show the same place as the best match, and each other one that scores nearly as well."""
-        near = self.values[0] - self.values[heads] < self.least_margin
+        near = self.leads(heads) < self.calibration.margin
         same = (Rivals(tuple(heads[alike].tolist()), True),) if alike.any() else ()
         return same + tuple(Rivals((head,), False) for head in heads[near & ~alike].tolist())
