@@ -224,7 +224,7 @@ def _places_before(context: JobContext, map_: Map) -> list[Outline]:
 
 
 def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
-    """Copy the places that are missing, and then those that changed in the other map meanwhile."""
+    """Copy the places that are missing, then those that changed in the other map meanwhile, and their stations."""
     for _ in range(ROUNDS):
         context.check_cancelled()
         here = {place.id: place.digest for place in map_.transfer.outline()}
@@ -232,7 +232,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
         coming = [(place, name) for place, name in plan.coming if name in context.notes["coming"]]
         due = [(place, name) for place, name in coming if here.get(name) != place.digest]
         if not due:
-            return
+            break
         names = context.notes["report"]["renamed"]
         for camera in other.cameras.all():
             name = names["cameras"].get(camera.name, camera.name)
@@ -246,6 +246,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
                 free = _still_free(context, map_, due[first : first + PLACES_PER_COMMIT])
                 _copy(context, map_, other, snapshot, free)
             context.progress(len(coming) - len(due) + min(first + PLACES_PER_COMMIT, len(due)), len(coming))
+    map_.counterparts.copy(other.counterparts, {place.id: name for place, name in coming})
 
 
 def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str]]) -> list[tuple[Outline, str]]:

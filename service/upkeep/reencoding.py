@@ -206,6 +206,8 @@ class _Reencoding:
         for camera in self.source.cameras.all():
             if camera.name not in masks or masks[camera.name] != camera.mask:
                 self.made.cameras.put(camera.name, camera.mask)
+        names = {place.id: place.id for place in self.made.transfer.outline()}
+        self.made.counterparts.copy(self.source.counterparts, names)
         named = [{"id": place.id, "detail": why} for place, why in list(self.left_out.values())[:MOST_LISTED]]
         result = {
             "map": self.target,

@@ -242,6 +242,7 @@ class _Building:
             "ordinal": line.ordinal,
             "track": self._track(line),
             "station": line.station,
+            "pose_of": line.pose_of,
             "created_at": moment_text(line.created_at),
             "updated_at": moment_text(line.updated_at),
         }

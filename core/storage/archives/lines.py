@@ -63,12 +63,14 @@ class PlaceLine(_Line):
 
     track, station: the sequence and the ordinal at which another traverse shows the same; None: its own.  A sequence
         that is gone has no name any more, but a number, by which the places on its track are told from others.
+    pose_of: the place whose pose it got from an alignment.
     digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
     keypoints: how many its frame has, whose record is the next one in the keypoints of its group; None: none are kept.
     """
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
     pose: Pose | None
+    pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None = None
     timestamp: Timestamp | None
     sequence: Sequence | None
     ordinal: Number
@@ -84,9 +86,11 @@ class PlaceLine(_Line):
     updated_at: Timestamp
 
     @model_validator(mode="after")
-    def _track_with_station(self) -> Self:
+    def _whole(self) -> Self:
         if (self.track is None) != (self.station is None):
             raise ValueError("a track needs a station, and a station a track")
+        if self.pose_of is not None and self.pose is None:
+            raise ValueError("a place without a pose has no pose of another")
         return self
 
     def fields(self) -> PlaceFields:
@@ -153,7 +157,8 @@ _POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 _PLACES = (
     "SELECT p.id, p.x, p.y, p.z, p.latitude, p.longitude, p.heading, p.timestamp, s.name, p.ordinal, p.camera,"
     " p.metadata, p.regions, lower(hex(p.digest)), p.picture, length(k.bytes), lower(hex(k.digest)),"
-    " p.created_at, p.updated_at, p.number, p.row, p.checksum, p.track, p.station, t.name, length(f.record)"
+    " p.created_at, p.updated_at, p.number, p.row, p.checksum, p.track, p.station, t.name, length(f.record),"
+    " p.pose_of"
     " FROM places p JOIN sequences s ON s.code = p.sequence LEFT JOIN pictures k ON k.place = p.number"
     " LEFT JOIN sequences t ON t.code = p.track LEFT JOIN keypoints f ON f.place = p.number"
     " ORDER BY p.number"
@@ -183,6 +188,7 @@ class StoredLine:
             {
                 "id": values[0],
                 "pose": pose or None,
+                "pose_of": values[26],
                 "timestamp": values[7],
                 "sequence": values[8],
                 "ordinal": values[9],

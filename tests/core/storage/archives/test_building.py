@@ -127,6 +127,8 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a track not listed": (place(track="sunday", station=1), "does not list"),
     "a track without a station": (place(track="monday"), "needs a station"),
     "a station without a track": (place(station=1), "needs a station"),
+    "a pose of nobody": (place(pose_of="../p1"), "pose_of"),
+    "a pose of another that is none": (place(pose=None, pose_of="p0"), "has no pose of another"),
     "a track below 0": (place(track=-1, station=1), "track"),
     "a station too far": (place(track=0, station=1 << 63), "station"),
     "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), ", not 9 times"),
@@ -323,8 +325,10 @@ def test_a_full_disk_leaves_nothing(content: bytes, tmp_path: Path, monkeypatch:
 
 
 def test_lines_are_what_a_person_can_read(content: bytes) -> None:
-    start = content.index(b'{"id":"roof"')
-    shown = json.loads(content[start : content.index(b"\n", start)])
+    lines = {line["id"]: line for line in map(json.loads, parts_of(content)[1][PLACES].splitlines())}
+    shown = lines["roof"]
+    assert (shown["track"], shown["station"]) == (lines["q1"]["track"], 1) == (0, 1), "its sequence is gone"
+    assert (lines["q0"]["track"], lines["q0"]["station"], lines["q0"]["pose_of"]) == ("monday", 2, "p2")
     assert shown["pose"] == {"latitude": 48.8, "longitude": 2.3, "heading": 10.0}
     assert shown["sequence"] == "Ünter den Linden"
 

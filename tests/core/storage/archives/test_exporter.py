@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.places import Neighborhood
 from core.storage import Atlas, Map, MapSettings
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
@@ -24,6 +25,14 @@ from tests.core.storage.test_opening import flip
 
 def listed(map_: Map) -> list[object]:
     return [map_.places(None, 100), map_.sequences(None, 100), map_.cameras.all(), map_.transfer.sequence_ends()]
+
+
+def same_place(map_: Map, place_id: str) -> list[str]:
+    """The ids of the places that are the same place, sorted."""
+    (row,), snapshot = map_.rows_of([place_id]), map_.snapshot()
+    assert row is not None
+    near = np.flatnonzero(snapshot.whereabouts.near(row, Neighborhood(0.5, 1)) & snapshot.alive)
+    return sorted(place.id for place in map_.places_at(near.tolist()) if place is not None)
 
 
 @pytest.mark.parametrize("kind", ["of everything", "compressed", "without local descriptors"])
@@ -52,6 +61,9 @@ def test_what_comes_back_is_what_was_there(
         (ours_of,), (theirs_of,) = source.keypoints_at(row.tolist()), copy.keypoints_at(other_row.tolist())
         assert (ours_of and ours_of.record()) == (theirs_of and theirs_of.record())
         assert (ours_of is None) == (place.id == "roof")
+        assert same_place(copy, place.id) == same_place(source, place.id)
+    if kind == "of everything":
+        assert same_place(copy, "q1") == ["q1", "roof"] and same_place(copy, "q0") == ["p1", "p2", "p3", "q0"]
     assert copy.verify().ok
     # Written again it is the same file, to the last bit: nothing was lost, nothing added, no order changed.
     assert exported(copy, tmp_path / "again") == path.read_bytes()
