@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Annotated, Any, Literal
@@ -149,6 +150,7 @@ class Place(PlaceFields):
     """One enrolled reference frame."""
 
     id: str
+    pose_of: str | None = Field(default=None, description="The place whose pose it got from an alignment.")
     regions: int = Field(ge=0, description="Regions of interest found in the frame.")
     picture: Literal["none", "thumbnail", "image"] = Field(description="What is kept of the frame.")
     created_at: Timestamp
@@ -177,8 +179,10 @@ class Whereabouts:
     ordinal: int64 [n], order of enrolment within the sequence.
     heading: float32 [n], degrees in [0, 360), in the convention of the pose's kind; NaN where it is not known.
     timestamp: int64 [n], microseconds since 1970 UTC; NO_TIME where it is not known.
+    track, station: int32 [n] and int64 [n], the sequence and the ordinal at which another traverse shows the same, as
+        alignment found; the place's own where nothing is known.
 
-    Heading and timestamp may be left out if none is known.
+    Heading and timestamp may be left out if none is known, track and station if all are the places' own.
     """
 
     kind: NDArray[np.int8]
@@ -187,12 +191,17 @@ class Whereabouts:
     ordinal: NDArray[np.int64]
     heading: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
     timestamp: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    track: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+    station: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     def __post_init__(self) -> None:
         if len(self.heading) < len(self.kind):
             object.__setattr__(self, "heading", np.full(len(self.kind), np.nan, np.float32))
         if len(self.timestamp) < len(self.kind):
             object.__setattr__(self, "timestamp", np.full(len(self.kind), NO_TIME, np.int64))
+        if len(self.track) < len(self.kind):
+            object.__setattr__(self, "track", self.sequence.copy())
+            object.__setattr__(self, "station", self.ordinal.copy())
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -207,23 +216,24 @@ class Whereabouts:
     def take(self, rows: ArrayLike) -> Whereabouts:
         """The places ``rows`` (integers or a mask) in that order."""
         chosen = np.asarray(rows)
-        return Whereabouts(
-            self.kind[chosen],
-            self.position[chosen],
-            self.sequence[chosen],
-            self.ordinal[chosen],
-            self.heading[chosen],
-            self.timestamp[chosen],
-        )
+        return Whereabouts(**{name: column[chosen] for name, column in vars(self).items()})
+
+    @classmethod
+    def joined(cls, parts: Iterable[Whereabouts]) -> Whereabouts:
+        """The places of several parts, in their order; of no parts none."""
+        columns = [vars(part) for part in (cls.along_sequence([]), *parts)]
+        return cls(**{name: np.concatenate([part[name] for part in columns]) for name in columns[0]})
 
     def near(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
         """Which of the places are the same place as ``row``, itself included; bool [n].
 
-        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart.  A
-        place with neither a pose nor a sequence is a place of its own.
+        Two poses of one kind are compared by distance; other places must be of one sequence and few frames apart, or
+        at few stations of one track.  A place with neither a pose nor a sequence nor a track is a place of its own.
         """
-        near = (self.sequence == self.sequence[row]) & (self.sequence != NO_SEQUENCE)
-        near &= np.abs(self.ordinal - self.ordinal[row]) <= neighborhood.frames
+        near = np.zeros(len(self), np.bool_)
+        for sequence, ordinal in ((self.sequence, self.ordinal), (self.track, self.station)):
+            if sequence[row] != NO_SEQUENCE:
+                near |= (sequence == sequence[row]) & (np.abs(ordinal - ordinal[row]) <= neighborhood.frames)
         kind = self.kind[row]
         if kind != NO_POSE:
             x, y, z = (self.position - self.position[row]).T

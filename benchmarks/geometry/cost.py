@@ -23,7 +23,8 @@ from core.evaluation.samples import sample_frame
 from core.frames.images import decode
 from core.frames.preprocessing import Pixels, second_look
 from core.frames.traverses import SUPPORTED_SUFFIXES
-from core.geometry.keypoints import ROW, find_keypoints, shown_size
+from core.geometry.detection import find_keypoints, shown_size
+from core.geometry.keypoints import MOST, record_bytes
 from core.geometry.verification import fitting, mutual_matches, verify
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.networks.xfeat import load_xfeat
@@ -98,7 +99,8 @@ def main(
     bars = {"all in": verdict(times["all in"][0], MILLISECONDS)}
     rows: list[tuple[object, ...]] = [(name, *spent, bars.get(name, "")) for name, spent in times.items()]
     rows.append(("frames a second, with keypoints", *enrolled, verdict(enrolled[0], FRAMES, at_least=True)))
-    rows.append(("KB a place", ROW.itemsize / 1000, "", "", verdict(ROW.itemsize / 1000, 40)))
+    kilobytes = record_bytes(MOST) / 1000
+    rows.append(("KB a place", kilobytes, "", "", verdict(kilobytes, 40)))
     title = f"{used} threads; {len(matches)} matches with the first candidate"
     figures = {"milliseconds": times, "frames_a_second": enrolled, "matches": len(matches)}
     report("geometry_cost", title, ["", "median ms", "least", "of the processor", ""], rows, figures)

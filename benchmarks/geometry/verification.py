@@ -26,7 +26,8 @@ from sklearn.linear_model import LogisticRegression
 
 from benchmarks.report import report
 from core.frames.preprocessing import Pixels
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.geometry.verification import verify
 from core.judgement.curves import auc_pr, auc_roc, pr_curve
 from core.judgement.reliability import reliability

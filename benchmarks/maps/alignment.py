@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.maps.map_sizes import traverses
 from benchmarks.report import report
-from core.judgement.alignment import shared_stretches
+from core.judgement.alignment import of_matrix, shared_stretches
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.threads import share_cores
 from training.calibration_quality import widened
@@ -32,7 +32,7 @@ NEAR, FAR = 3, 12
 
 def paired(scores: Scores) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The frames that are paired, int64 [n] each."""
-    found = shared_stretches(scores)
+    found = shared_stretches(of_matrix(scores), *scores.shape)
     nothing = np.empty(0, np.int64)
     return np.concatenate([nothing, *(one.first for one in found)]), np.concatenate(
         [nothing, *(one.second for one in found)]
@@ -54,7 +54,7 @@ def nothing_shared(scores: Scores, truth: Truth, pieces: int) -> list[bool]:
         start = int(generator.integers(0, len(truth) - length))
         asked = slice(start, start + length)
         others = longest_run(np.logical_not(np.any(wide[asked], axis=0)))
-        found.append(bool(shared_stretches(scores[asked][:, others])))
+        found.append(bool(len(paired(scores[asked][:, others])[0])))
     return found
 
 

@@ -1,33 +1,26 @@
-"""The keypoints of a frame: found by XFeat, chosen, and quantized so that a place can keep them.
+"""The keypoints of a frame, quantized, and the record in which a place keeps them.
 
-A pixel is a keypoint where the network's heat has a local maximum.  The best are those with the highest product of
-heat and reliability (Potje et al., 2024, section 3).  Positions are shares of the frame's width and height, so that
-they mean the same whatever size the network saw; :meth:`Keypoints.pixels` gives them in pixels of the frame.
+Positions are shares of the frame's width and height, so that they mean the same whatever size the network saw;
+:meth:`Keypoints.pixels` gives them in pixels of the frame.
+
+A record is the frame's width and height in pixels and the number of keypoints n, each four bytes, then the positions,
+two bytes each of x and y, and then the descriptors, 64 bytes each: 12 + 68 n bytes, least significant byte first.
 """
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn import functional as F
 
 from core.errors import InvalidKeypoints
-from core.frames.masks import Mask
-from core.frames.preprocessing import Pixels
-from core.networks.xfeat import CELL, LENGTH, MULTIPLE, XFeat
 
 MOST = 576
 """Keypoints of a frame at most: with them, a place takes less than 40 KB."""
-LONGEST_SIDE = 480
-"""Pixels of the longer side of what the network sees; a smaller frame is enlarged, so that it gives keypoints, too."""
-LEAST_HEAT = 0.05
-"""The heat from which on a pixel is a keypoint: the authors' choice."""
-NEIGHBORHOOD = 5
-"""Pixels a side of the square in which a keypoint has the highest heat: the authors' choice."""
+LENGTH = 64
+"""Values of a descriptor: those of XFeat."""
 
 SHARES = 1 << 16
 """Steps by which a position is kept, over the whole width or height."""
@@ -35,16 +28,18 @@ RESOLUTION = 254.0
 """Steps of 1 / RESOLUTION quantize the values of descriptors; values of half a unit and more, which are rare, become
 127."""
 
-ROW = np.dtype(
-    [
-        ("width", "<u4"),
-        ("height", "<u4"),
-        ("count", "<u2"),
-        ("positions", "<u2", (MOST, 2)),
-        ("descriptors", "i1", (MOST, LENGTH)),
-    ]
-)
-"""Keypoints as a place keeps them, of one length for every frame: zeros follow the first ``count``."""
+_HEADER = struct.Struct("<III")
+_EACH = 4 + LENGTH
+
+
+def record_bytes(count: int) -> int:
+    """Bytes of the record of so many keypoints."""
+    return _HEADER.size + _EACH * count
+
+
+def count_of(size: int) -> int:
+    """How many keypoints a record of so many bytes has."""
+    return (size - _HEADER.size) // _EACH
 
 
 @dataclass(frozen=True)
@@ -72,7 +67,11 @@ class Keypoints:
             and self.positions.dtype == np.uint16
             and self.descriptors.dtype == np.int8
         )
-        if not right or count > MOST or min(self.width, self.height) < 1:
+        if (
+            not right
+            or count > MOST
+            or not (0 < min(self.width, self.height) <= max(self.width, self.height) < 1 << 32)
+        ):
             raise InvalidKeypoints(
                 f"{list(self.positions.shape)} positions and {list(self.descriptors.shape)} descriptors of a frame of "
                 f"{self.width} x {self.height} pixels are no keypoints."
@@ -87,74 +86,26 @@ class Keypoints:
         """Positions in pixels of the frame, float64 [n, 2], x and y from its upper left corner."""
         return (self.positions + 0.5) * np.array([self.width / SHARES, self.height / SHARES])
 
-    def row(self) -> NDArray[np.void]:
-        """The keypoints as one record of the type ROW."""
-        made = np.zeros((), ROW)
-        made["width"], made["height"], made["count"] = self.width, self.height, len(self)
-        made["positions"][: len(self)] = self.positions
-        made["descriptors"][: len(self)] = self.descriptors
-        return made[()]
+    def record(self) -> bytes:
+        """The record of the keypoints."""
+        header = _HEADER.pack(self.width, self.height, len(self))
+        return header + self.positions.astype("<u2").tobytes() + self.descriptors.tobytes()
 
 
-def keypoints_of(row: NDArray[np.void]) -> Keypoints:
-    """The keypoints that :meth:`Keypoints.row` has put into a record.
+def keypoints_of(record: bytes) -> Keypoints:
+    """The keypoints that :meth:`Keypoints.record` has put into a record, whose memory they share.
 
     Raises:
-        InvalidKeypoints: the record is of another type, or cannot have been made so.
+        InvalidKeypoints: the record cannot have been made so.
     """
-    if row.dtype != ROW or row.shape != ():
-        raise InvalidKeypoints(f"a record of {row.dtype.itemsize} bytes holds no keypoints; {ROW.itemsize} are needed.")
-    count = int(row["count"])
-    if count > MOST:
-        raise InvalidKeypoints(f"a record says that it holds {count} keypoints; it has room for {MOST}.")
-    if row["positions"][count:].any() or row["descriptors"][count:].any():
-        raise InvalidKeypoints(f"a record of {count} keypoints holds something behind them.")
-    descriptors = np.array(row["descriptors"][:count])
-    if count and not descriptors.any(axis=1).all():
-        raise InvalidKeypoints(f"a record of {count} keypoints lacks a descriptor.")
-    return Keypoints(int(row["width"]), int(row["height"]), np.array(row["positions"][:count]), descriptors)
-
-
-def shown_size(width: int, height: int) -> tuple[int, int]:
-    """Width and height at which the network sees a frame: the longer side LONGEST_SIDE, both multiples of MULTIPLE."""
-    scale = LONGEST_SIDE / max(width, height)
-    columns, rows = (max(1, round(side * scale / MULTIPLE)) * MULTIPLE for side in (width, height))
-    return columns, rows
-
-
-def find_keypoints(network: XFeat, pixels: Pixels, mask: Mask | None = None) -> Keypoints:
-    """The keypoints of a frame; a blank frame has none.
-
-    Args:
-        pixels: uint8 [H, W, 3], BGR, of any size.
-        mask: hides a part of the frame, in which there are no keypoints then.
-    """
-    height, width = pixels.shape[:2]
-    columns, rows = shown_size(width, height)
-    interpolation = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
-    maps = network(np.asarray(cv2.resize(pixels, (columns, rows), interpolation=interpolation), np.uint8))
-    highest = cv2.dilate(maps.heat, np.ones((NEIGHBORHOOD, NEIGHBORHOOD), np.uint8))
-    found = (maps.heat == highest) & (maps.heat > LEAST_HEAT)
-    if mask is not None:
-        found &= ~mask.covered(rows, columns)
-    y, x = np.nonzero(found)
-    reliability = cv2.resize(maps.reliability, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    best = np.argsort(-maps.heat[y, x] * reliability[y, x], kind="stable")[:MOST]
-    x, y = x[best], y[best]
-    centres = np.stack([(x + 0.5) / columns, (y + 0.5) / rows], axis=1)
-    positions = np.minimum(centres * SHARES, SHARES - 1).astype(np.uint16)
-    return Keypoints(width, height, positions, _descriptors_at(maps.descriptors, x, y))
-
-
-def _descriptors_at(maps: NDArray[np.float32], x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Descriptors at pixels, interpolated between cells by cubic convolution and quantized; int8 [n, 64].
-
-    As in the authors' code the first pixel and the last one lie on the borders of the map.
-    """
-    rows, columns = maps.shape[0] * CELL, maps.shape[1] * CELL
-    where = np.stack([2 * x / (columns - 1) - 1, 2 * y / (rows - 1) - 1], axis=1).astype(np.float32)
-    cells, grid = torch.from_numpy(maps).permute(2, 0, 1)[None], torch.from_numpy(where)[None, None]
-    with torch.inference_mode():
-        sampled = F.grid_sample(cells, grid, mode="bicubic", align_corners=False)[0, :, 0].T
-        steps = (F.normalize(sampled, dim=1) * RESOLUTION).round().clamp(-127, 127)
-        return steps.to(torch.int8).contiguous().numpy()
+    if len(record) < _HEADER.size:
+        raise InvalidKeypoints(f"A record of {len(record)} bytes holds no keypoints.")
+    width, height, count = _HEADER.unpack_from(record)
+    if len(record) != record_bytes(count):
+        raise InvalidKeypoints(f"A record of {len(record)} bytes cannot hold {count} keypoints.")
+    positions = np.frombuffer(record, "<u2", 2 * count, _HEADER.size).astype(np.uint16, copy=False)
+    descriptors = np.frombuffer(record, np.int8, LENGTH * count, _HEADER.size + 4 * count)
+    made = Keypoints(width, height, positions.reshape(count, 2), descriptors.reshape(count, LENGTH))
+    if count and not made.descriptors.any(axis=1).all():
+        raise InvalidKeypoints(f"A record of {count} keypoints lacks a descriptor.")
+    return made

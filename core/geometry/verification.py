@@ -26,7 +26,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from core.geometry.keypoints import LONGEST_SIDE, RESOLUTION, Keypoints
+from core.geometry.detection import LONGEST_SIDE
+from core.geometry.keypoints import RESOLUTION, Keypoints
 from core.threads import each
 
 LEAST_COSINE = 0.75

@@ -14,16 +14,26 @@ straight lines instead, which holds for stretches of one pace only.
 
 Some path is always the best.  How good it is by chance is told by the same scores with the second traverse turned
 around: nobody sees its places in that order, but they resemble one another as before.
+
+Memory does not grow with the product of the lengths: scores are computed in tiles, of each frame the ``MOST_PAIRS``
+best pairs are kept while all others count as ordinary ones, and of a long traverse ``TOGETHER`` frames are matched at a
+time.  Time does grow with the product, by an inner product of two descriptors for each pair of frames.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Values = NDArray[np.float64]
+Frames = NDArray[np.int64]
+
+Scores = Callable[[Frames], Callable[[Frames], NDArray[np.floating]]]
+"""The scores of some frames of the first traverse, int64 [q]: a function that returns float [q, r], finite, for frames
+of the second, int64 [r]."""
 
 ORDINARY = 1.5
 """Deviations above the ordinary score from which on a pair of frames speaks for a path."""
@@ -44,7 +54,19 @@ BY_CHANCE = 2.0
 """A path has at least so many times the sum of the best path through the second traverse turned around."""
 
 MOST_PATHS = 64
-"""At most so many paths are looked for."""
+"""At most so many paths are looked for among the frames that are matched together."""
+
+TOGETHER = 1024
+"""So many frames of the first traverse are matched at a time, at most; a path ends with them."""
+
+TILE = 512
+"""So many frames of the second traverse are scored at a time."""
+
+MOST_PAIRS = 512
+"""Of each frame of the first traverse so many pairs are kept, at most."""
+
+SAMPLE = 1024
+"""The median of a row and the spread are estimated from so many frames of the second traverse, at most."""
 
 
 @dataclass(frozen=True)
@@ -56,65 +78,166 @@ class SharedStretch:
     gain: the mean gain of its pairs, in standard deviations.
     """
 
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    first: Frames
+    second: Frames
     gain: float
 
+    @property
+    def total(self) -> float:
+        """The sum of its gains: how much speaks for it."""
+        return self.gain * len(self.first)
 
-def shared_stretches(scores: NDArray[np.floating]) -> list[SharedStretch]:
-    """The stretches that two traverses share, best first; none if they share nothing.
+
+def shared_stretches(
+    scores: Scores, first: int, second: int, advance: Callable[[int], None] = lambda pairs: None
+) -> list[SharedStretch]:
+    """The stretches that two traverses share, best first; none if they share nothing or have fewer than ten frames.
 
     Args:
-        scores: float [Q, R], finite: of each frame of the first traverse against each of the second, in the order in
-            which they were taken.
+        scores: of frames of the first traverse against frames of the second; frames are numbered from 0 in the order
+            in which they were taken.
+        first, second: how many frames the traverses have.
+        advance: is told how many pairs of frames were scored since it was last called; what it raises ends the search.
     """
-    if min(scores.shape) < LEAST_FRAMES:
+    if min(first, second) < LEAST_FRAMES:
         return []
-    gains = np.minimum(comparable(scores), LARGEST) - ORDINARY
-    least = BY_CHANCE * best_path(gains[:, ::-1])[1]
     found: list[SharedStretch] = []
-    for _ in range(MOST_PATHS):
-        path, total = best_path(gains)
-        if len(path) < LEAST_FRAMES or total < least:
-            break
-        found.append(SharedStretch(path[:, 0], path[:, 1], total / len(path)))
-        gains[path[:, 0]] = -np.inf
-    return found
+    for rows in np.array_split(np.arange(first), -(-first // TOGETHER)):
+        pairs = best_pairs(scores(rows), len(rows), second, advance)
+        found += [replace(one, first=rows[one.first]) for one in _stretches(pairs)]
+    return sorted(found, key=lambda one: -one.total)
 
 
-def comparable(scores: NDArray[np.floating]) -> Values:
-    """Scores without what is ordinary for their row and their column, in standard deviations; float64 [Q, R]."""
-    centred = np.asarray(scores, np.float64) - np.median(scores, axis=1, keepdims=True)
+def of_matrix(scores: NDArray[np.floating]) -> Scores:
+    """The scores of two traverses that are all known, float [Q, R]."""
+    return lambda rows: lambda columns: scores[np.ix_(rows, columns)]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The pairs of Q frames with R others that speak for a path most.
+
+    columns: int64 [Q, K], the other frame of each pair, ascending in each row.
+    gains: float64 [Q, K]; a pair that is not there has a gain of -ORDINARY, that of an ordinary score.
+    others: R.
+    free: bool [Q], the rows that paths may pass.
+    """
+
+    columns: Frames
+    gains: Values
+    others: int
+    free: NDArray[np.bool_]
+
+    def turned_around(self) -> Pairs:
+        """The same pairs with the others in the opposite order."""
+        return replace(self, columns=self.others - 1 - self.columns[:, ::-1], gains=self.gains[:, ::-1])
+
+    def without(self, rows: Frames) -> Pairs:
+        """The pairs without those of some rows."""
+        free = self.free.copy()
+        free[rows] = False
+        return replace(self, free=free)
+
+
+def best_pairs(
+    scores: Callable[[Frames], NDArray[np.floating]],
+    rows: int,
+    others: int,
+    advance: Callable[[int], None] = lambda pairs: None,
+) -> Pairs:
+    """Of each of some rows the best pairs by comparable scores.
+
+    Args:
+        scores: of the rows at some columns, int64 [r]: float [rows, r].
+        others: the number of columns.
+        advance: as of :func:`shared_stretches`.
+    """
+    sample = np.unique(np.linspace(0, others - 1, min(others, SAMPLE)).astype(np.int64))
+    sampled = np.asarray(scores(sample), np.float32)
+    ordinary = np.median(sampled, axis=1, keepdims=True)
+    centred = sampled - ordinary
     centred -= np.median(centred, axis=0, keepdims=True)
     spread = 1.4826 * float(np.median(np.abs(centred)))  # of a normal distribution, its standard deviation
-    return centred / spread if spread > 0 else centred
+    columns = np.empty((rows, 0), np.int64)
+    gains = np.empty((rows, 0), np.float64)
+    for start in range(0, others, TILE):
+        tile = np.arange(start, min(start + TILE, others))
+        found = np.asarray(scores(tile), np.float32) - ordinary
+        found -= np.median(found, axis=0, keepdims=True)
+        found = np.minimum(found / spread if spread > 0 else found, LARGEST) - ORDINARY
+        columns = np.concatenate([columns, np.broadcast_to(tile, found.shape)], axis=1)
+        gains = np.concatenate([gains, found], axis=1)
+        if gains.shape[1] > MOST_PAIRS:
+            best = np.sort(np.argpartition(-gains, MOST_PAIRS, axis=1)[:, :MOST_PAIRS], axis=1)
+            columns = np.take_along_axis(columns, best, axis=1)
+            gains = np.take_along_axis(gains, best, axis=1)
+        advance(found.size)
+    return Pairs(columns, gains, others, np.ones(rows, np.bool_))
 
 
-def best_path(gains: Values) -> tuple[NDArray[np.int64], float]:
+def _stretches(pairs: Pairs) -> Iterator[SharedStretch]:
+    """The paths that are better than by chance, best first."""
+    least = BY_CHANCE * best_path(pairs.turned_around())[1]
+    for _ in range(MOST_PATHS):
+        path, total = best_path(pairs)
+        if len(path) < LEAST_FRAMES or total < least:
+            break
+        yield SharedStretch(path[:, 0], path[:, 1], total / len(path))
+        pairs = pairs.without(path[:, 0])
+
+
+def best_path(pairs: Pairs) -> tuple[Frames, float]:
     """The path with the largest sum of gains, int64 [n, 2] of row and column, and the sum; empty if all are losses.
 
-    Args:
-        gains: float64 [Q, R]; rows of -inf are passed by no path.
+    A path goes through columns where its sum is positive; of each row only these are remembered.
     """
-    rows, columns = gains.shape
-    totals, steps = np.zeros((rows, columns)), np.full((rows, columns), -1, np.int8)
-    before = np.full(columns, -np.inf)
-    for row in range(rows):
-        reached = np.full((LARGEST_STEP + 1, columns), -np.inf)
-        for step in range(LARGEST_STEP + 1):
-            reached[step, step:] = before[: columns - step] - UNEVEN * abs(step - 1)
-        best = reached.argmax(axis=0)
-        value = reached[best, np.arange(columns)]
-        goes_on = value > 0
-        totals[row] = np.maximum(gains[row] + np.where(goes_on, value, 0), 0)
-        steps[row] = np.where(goes_on, best, -1)
-        before = np.where(totals[row] > 0, totals[row], -np.inf)
-    row, column = (int(index) for index in np.unravel_index(int(totals.argmax()), totals.shape))
-    total, path = float(totals[row, column]), []
-    while total > 0:
+    columns, totals = np.empty(0, np.int64), np.empty(0)
+    reached: list[tuple[Frames, NDArray[np.int8]]] = []
+    best, end = 0.0, (-1, -1)
+    for row in range(len(pairs.columns)):
+        columns, totals, steps = _row(pairs, row, columns, totals)
+        reached.append((columns, steps))
+        if len(totals) and totals.max() > best:
+            best, end = float(totals.max()), (row, int(columns[totals.argmax()]))
+    path = []
+    row, column = end
+    while row >= 0:
         path.append((row, column))
-        step = int(steps[row, column])
-        if step < 0:
+        columns, steps = reached[row]
+        step = int(steps[np.searchsorted(columns, column)])
+        if step == _BEGINS:
             break
         row, column = row - 1, column - step
-    return np.array(path[::-1], np.int64).reshape(-1, 2), total
+    return np.array(path[::-1], np.int64).reshape(-1, 2), best
+
+
+_BEGINS = -1
+"""The step of a path's first pair."""
+
+
+def _row(pairs: Pairs, row: int, before: Frames, totals: Values) -> tuple[Frames, Values, NDArray[np.int8]]:
+    """The columns of a row at which a path may be, its sum, and by which step it came, given those of the row before.
+
+    Returns:
+        Columns int64 [k], ascending, sums float64 [k] over 0, and steps int8 [k].
+    """
+    if not pairs.free[row]:
+        return np.empty(0, np.int64), np.empty(0), np.empty(0, np.int8)
+    own = pairs.columns[row]
+    columns = np.concatenate([own, *(before + step for step in range(LARGEST_STEP + 1))])
+    sums = np.concatenate([
+        np.zeros(len(own)), *(totals - UNEVEN * abs(step - 1) for step in range(LARGEST_STEP + 1))
+    ])  # fmt: skip
+    steps = np.repeat(
+        np.arange(_BEGINS, LARGEST_STEP + 1, dtype=np.int8), [len(own)] + [len(before)] * (LARGEST_STEP + 1)
+    )
+    there = (sums >= 0) & (columns < pairs.others)
+    columns, sums, steps = columns[there], sums[there], steps[there]
+    order = np.lexsort((-sums, columns))
+    order = order[np.diff(columns[order], prepend=-1) > 0]  # the best way to each column
+    columns, sums, steps = columns[order], sums[order], steps[order]
+    gains = np.full(len(columns), -ORDINARY)
+    gains[np.searchsorted(columns, own)] = pairs.gains[row]
+    sums += gains
+    good = sums > 0
+    return columns[good], sums[good], steps[good]

@@ -92,7 +92,8 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
     rows, first = np.unique(
         np.concatenate([view.rows[part] for view, part in zip(views, listed, strict=True)]), return_index=True
     )
-    places = joined([view.whereabouts.take(part) for view, part in zip(views, listed, strict=True)]).take(first)
+    parts = [view.whereabouts.take(part) for view, part in zip(views, listed, strict=True)]
+    places = Whereabouts.joined(parts).take(first)
     scores = np.full((len(views), len(rows)), -np.inf)
     for camera, (view, part) in enumerate(zip(views, listed, strict=True)):
         scores[camera, np.searchsorted(rows, view.rows[part])] = view.scores[part]
@@ -122,16 +123,6 @@ def fuse(views: Sequence[View], calibration: Calibration, neighborhood: Neighbor
     found = scores.max(axis=0)[order].astype(np.float32)
     judgement = _judged(of_place[order], found, near[order[0]][order], calibration, steepness)
     return Fused(judgement, rows[order], places.take(order), found, total[order], prior[order])
-
-
-def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
-    """Several whereabouts, at least one, joined into one."""
-    return Whereabouts(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("kind", "position", "sequence", "ordinal", "heading", "timestamp")
-        )
-    )
 
 
 def _camera_log_odds(

@@ -88,7 +88,8 @@ class Cameras:
             if name not in known and len(known) >= MOST_CAMERAS:
                 raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
             write.connection.execute(
-                "INSERT OR REPLACE INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)",
+                "INSERT INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)"
+                " ON CONFLICT (name) DO UPDATE SET mask = excluded.mask, updated_at = excluded.updated_at",
                 (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
             )
             row_checksums.write_checksums(write.connection, "cameras", "name = ?", name)
@@ -124,8 +125,10 @@ class Cameras:
 
 def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
     found = {}
-    for name, mask, moment, seal in connection.execute("SELECT name, mask, updated_at, seal FROM cameras").fetchall():
-        if not row_checksums.is_sound((name, mask, moment), seal):
+    columns = ", ".join(row_checksums.CHECKED["cameras"])
+    for *sealed, seal in connection.execute(f"SELECT {columns}, seal FROM cameras").fetchall():
+        name, mask, moment, _ = sealed
+        if not row_checksums.is_sound(sealed, seal):
             raise Damage(f"map.sqlite: camera {name!r} does not match its checksum")
         kept = None if mask is None else Mask.model_validate_json(mask)
         found[name] = CameraRecord(name=name, mask=kept, updated_at=moment)

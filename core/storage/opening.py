@@ -10,8 +10,6 @@ import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime
-from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,7 @@ from core.disk.sqlite_file import transaction
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.index.table import LARGEST_BLOCK
-from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Pose, Whereabouts, microseconds
+from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, Database, connect
@@ -43,7 +41,7 @@ from core.storage.files.segment_files import Layout
 from core.storage.records import MapRecord, validation_message
 from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
-from core.storage.search.segment import Held, Location, Segment
+from core.storage.search.segment import Held, Segment
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import Tier, holds_for, tier_for
 
@@ -63,17 +61,6 @@ class OpenMap:
     row_reader: RowReader
     files: IndexFiles
     removed_segments: RemovedSegments
-
-
-def location_of(pose: Pose | None, sequence: int, ordinal: int, moment: datetime | None = None) -> Location:
-    """The pose, sequence and time of a place as the snapshot holds them."""
-    timestamp = NO_TIME if moment is None else microseconds(moment)
-    if pose is None:
-        return Location(NO_POSE, (0.0, 0.0, 0.0), sequence, ordinal, timestamp=timestamp)
-    x, y, z = pose.position().tolist()
-    kind = METRIC if pose.kind() == "metric" else GEOGRAPHIC
-    heading = nan if pose.heading is None else pose.heading
-    return Location(kind, (x, y, z), sequence, ordinal, heading, timestamp)
 
 
 def create_folder(folder: Path, record: MapRecord, rows_per_segment: int) -> None:

@@ -14,6 +14,8 @@ from core.upkeep.hubness import NONE
 MOST_NEIGHBOURS = 32
 """A place is compared with at most this many of its nearest: where a robot stood still, there are too many pairs."""
 
+_STEPS = MOST_NEIGHBOURS // 2
+
 
 def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[np.int64]:
     """Pairs of frames of the same place (``Whereabouts.near``), each once, the lower first: int64 [m, 2]."""
@@ -31,23 +33,30 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
         second = found.reshape(-1)
         there = apart.reshape(-1) <= neighborhood.radius
         pairs.append(np.stack([members[first[there]], members[second[there]]], axis=1))
-    pairs += _along_sequences(where, neighborhood.frames)
+    pairs += _along(where, where.sequence, where.ordinal, neighborhood.frames, min(neighborhood.frames, _STEPS))
+    if (where.track != where.sequence).any():
+        # Several traverses may have a frame at each station.
+        pairs += _along(where, where.track, where.station, neighborhood.frames, _STEPS)
     ordered = np.sort(np.concatenate(pairs), axis=1)
     return np.unique(ordered[ordered[:, 0] != ordered[:, 1]], axis=0)
 
 
-def _along_sequences(where: Whereabouts, frames: int) -> list[NDArray[np.int64]]:
-    """Pairs of one sequence, at most ``frames`` apart, that do not both have poses of one kind."""
+def _along(
+    where: Whereabouts, sequence: NDArray[np.int32], ordinal: NDArray[np.int64], frames: int, steps: int
+) -> list[NDArray[np.int64]]:
+    """Pairs of one sequence, at most ``frames`` apart, that do not both have poses of one kind.
+
+    Args:
+        sequence, ordinal: of the places, or their tracks and stations.
+        steps: a place is compared with so many places behind it.
+    """
     pairs = []
-    reach = min(frames, MOST_NEIGHBOURS // 2)
-    order = np.lexsort((where.ordinal, where.sequence))
-    for step in range(1, reach + 1):
+    order = np.lexsort((ordinal, sequence))
+    for step in range(1, steps + 1):
         first, second = order[:-step], order[step:]
-        near = (where.sequence[first] == where.sequence[second]) & (
-            np.abs(where.ordinal[second] - where.ordinal[first]) <= frames
-        )
+        near = (sequence[first] == sequence[second]) & (np.abs(ordinal[second] - ordinal[first]) <= frames)
         posed = (where.kind[first] == where.kind[second]) & (where.kind[first] != NO_POSE)
-        chosen = near & ~posed & (where.sequence[first] != NO_SEQUENCE)
+        chosen = near & ~posed & (sequence[first] != NO_SEQUENCE)
         pairs.append(np.stack([first[chosen], second[chosen]], axis=1))
     return pairs
 

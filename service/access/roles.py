@@ -138,6 +138,7 @@ OPERATIONS: dict[str, Rule] = {
     "delete_session": Rule("query", "path"),
     "send_frame": Rule("query", "path"),
     "stream_frames": Rule("query", "path"),
+    "align_map": Rule("enrol", "path", changes=True),  # it changes of places what an edit of each could change
     # Upkeep: it changes the answers to all robots, or takes long
     "calibrate_map": Rule("admin", "path", changes=True),
     "check_health": Rule("enrol", "path"),

@@ -25,7 +25,7 @@ from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
-from service.upkeep import merging, pruning, reencoding
+from service.upkeep import alignment, merging, pruning, reencoding
 from service.worker_threads import in_thread
 
 DISK_CHECK_SECONDS = 1.0
@@ -72,6 +72,7 @@ class Runtime:
         engine, staging, register = self.engine, self.staging, self.jobs.register
         register(reencoding.KIND, partial(reencoding.reencode, engine))
         register(pruning.KIND, partial(pruning.prune, engine))
+        register(alignment.KIND, partial(alignment.align, engine))
         register(merging.KIND, partial(merging.merge, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
         register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))

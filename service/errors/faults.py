@@ -118,6 +118,10 @@ class NothingToMeasure(Fault):
     """The map has no frames with which the recall could be measured."""
 
 
+class TooFewFrames(Fault):
+    """The traverse is too short for sequence matching."""
+
+
 class TooManyWatchers(Fault):
     """Too many clients follow jobs."""
 

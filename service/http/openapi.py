@@ -168,6 +168,7 @@ LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
                 "check_health",
                 "reencode_map",
                 "prune_map",
+                "align_map",
                 "calibrate_map",
             ),
             _MADE_MAP,
@@ -185,6 +186,7 @@ LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
     "delete_session": {"204": {"read_session": _SAME_SESSION}},
     "reencode_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
     "prune_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
+    "align_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
     "merge_map": {"202": dict.fromkeys(("read_job", "cancel_job"), _MADE_JOB)},
     "cancel_job": {"200": {"read_job": _JOB}},
 }

@@ -14,6 +14,7 @@ from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 PLACE_EXAMPLE: dict[str, Any] = {
     "id": "p7",
     "pose": {"x": 1.5, "y": 2.0, "heading": 90.0},
+    "pose_of": None,
     "timestamp": "2026-11-20T10:00:00Z",
     "sequence": "monday",
     "camera": None,
@@ -35,6 +36,7 @@ class PlaceView(BaseModel):
 
     id: str
     pose: ShownPose | None
+    pose_of: str | None = Field(description="The place whose pose it got from an alignment; null: the pose is its own.")
     timestamp: Timestamp | None = Field(description="When the frame was taken.")
     sequence: str | None = Field(description="The traverse that it belongs to.")
     camera: str | None = Field(description="The camera whose mask was applied to the frame.")

@@ -1,4 +1,4 @@
-"""Routes that re-encode, rebuild, examine, prune and merge maps."""
+"""Routes that re-encode, rebuild, examine, align, prune and merge maps."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from service.errors.faults import (
     InvalidRequest,
     JobQueueFull,
     MergeConflict,
+    TooFewFrames,
     TooManyMaps,
     UnsupportedMediaType,
 )
@@ -33,9 +34,9 @@ from service.maps import storage_jobs
 from service.maps.limits import check_new_map
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import map_key
-from service.upkeep import merging, pruning, reencoding
+from service.upkeep import alignment, merging, pruning, reencoding
 from service.upkeep.health import examine_health
-from service.upkeep.schemas import MapHealth, Merging, Pruning, Reencoding
+from service.upkeep.schemas import Aligning, MapHealth, Merging, Pruning, Reencoding
 from service.worker_threads import in_thread
 
 router = APIRouter(
@@ -131,6 +132,26 @@ async def check_health(
     counted = await in_thread(statistics.read, map_key(map_))
     examine = partial(examine_health, map_, encoder, counted, options.seconds, options.limit)
     return await to_thread.run_sync(examine, limiter=one_at_a_time)
+
+
+@router.post(
+    "/align",
+    status_code=202,
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(*JOB_PROBLEMS, errors.UnknownSequence, TooFewFrames),
+)
+def align_map(map_id: MapId, options: Aligning, engine: EngineDep, jobs: JobsDep, response: Response) -> JobView:
+    """Find which frames of a traverse show the places of others; from then on these are the same places.
+
+    Several traverses of one environment without poses show every place several times, and the frames of one are
+    rivals of the others', so that answers are ambiguous. Sequence matching of the stored descriptors tells which
+    frames correspond; the result of the job names, for each of the other traverses, the frames paired, the stretches
+    that are shared, and the poses handed over. Traverses that share nothing are reported, and nothing is stored.
+    Everything is stored in one commit. With `"dry_run": true` nothing is stored.
+    """
+    map_ = engine.atlas.get(map_id)
+    alignment.check_request(map_, options.sequence, options.others)
+    return submit(engine, jobs, response, alignment.KIND, options.model_dump(by_alias=True), map_)
 
 
 @router.post(

@@ -57,6 +57,31 @@ class Pruning(BaseModel):
     sample: int = Field(strict=True, default=500, ge=10, le=10_000, description="How many queries are asked at most.")
 
 
+class Aligning(BaseModel):
+    """Which traverse is aligned with which others."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        populate_by_name=True,
+        json_schema_extra={"examples": [{"sequence": "tuesday"}, {"sequence": "tuesday", "with": ["monday"]}]},
+    )
+
+    sequence: Sequence = Field(description="The traverse to align.")
+    others: list[Sequence] | None = Field(
+        alias="with",
+        default=None,
+        max_length=1000,
+        description="The traverses to align it with; all others if left out. What an earlier alignment of the traverse "
+        "found is replaced. With an empty list it is only forgotten, with the poses that were handed over.",
+    )
+    poses: bool = Field(
+        strict=True,
+        default=True,
+        description="Give each frame without a pose that of its counterpart; the place then says so in `pose_of`.",
+    )
+    dry_run: bool = Field(strict=True, default=False, description="Only report what would be stored.")
+
+
 class Merging(BaseModel):
     """Which map is merged into this one, and how conflicts are solved."""
 

@@ -13,7 +13,10 @@ from core.disk.files import Damage
 from core.places import EARTH_RADIUS, GEOGRAPHIC, METRIC, NO_POSE, Pose, Whereabouts
 
 _AT_ONCE = 65_536
-_NUMBERS = "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading"
+_NUMBERS = (
+    "row, checksum, sequence, ordinal, x, y, z, latitude, longitude, heading,"
+    " coalesce(track, sequence), coalesce(station, ordinal)"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +43,10 @@ def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
         ValueError: a pose is invalid.
     """
     cursor = connection.execute(f"SELECT {_NUMBERS}, substr(timestamp, 1, 26) FROM places")
-    numbers, moments = [np.empty((0, 10))], [np.empty(0, "datetime64[us]")]
+    numbers, moments = [np.empty((0, 12))], [np.empty(0, "datetime64[us]")]
     while part := cursor.fetchmany(_AT_ONCE):
-        numbers.append(np.array([values[:10] for values in part], dtype=np.float64))
-        moments.append(np.array([values[10] for values in part], dtype="datetime64[us]"))
+        numbers.append(np.array([values[:12] for values in part], dtype=np.float64))
+        moments.append(np.array([values[12] for values in part], dtype="datetime64[us]"))
     found = np.concatenate(numbers)
     row = found[:, 0].astype(np.int64)
     if len(row) and row.max() >= rows:
@@ -58,6 +61,8 @@ def read_columns(connection: sqlite3.Connection, rows: int) -> Columns:
         found[:, 3].astype(np.int64),
         found[:, 9].astype(np.float32),
         np.concatenate(moments).astype(np.int64),
+        found[:, 10].astype(np.int32),
+        found[:, 11].astype(np.int64),
     )
     return Columns(row, found[:, 1].astype(np.uint32), whereabouts)
 

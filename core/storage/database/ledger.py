@@ -42,6 +42,7 @@ class StoredPlace:
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
     ordinal: its position in its sequence.
+    track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     """
 
     number: int
@@ -49,6 +50,8 @@ class StoredPlace:
     digest: bytes
     sequence: int
     ordinal: int
+    track: int | None
+    station: int | None
     place: Place
 
 
@@ -76,6 +79,7 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
     try:
         place = Place(
             id=columns["id"],
+            pose_of=columns["pose_of"],
             regions=columns["regions"],
             picture=columns["picture"],
             pose=Pose(**pose) if pose else None,
@@ -88,9 +92,8 @@ def _stored(values: tuple[Any, ...]) -> StoredPlace:
         )
     except ValueError as error:
         raise Damage(f"map.sqlite: place {columns['id']!r} is invalid") from error
-    return StoredPlace(
-        columns["number"], columns["row"], columns["digest"], columns["sequence"], columns["ordinal"], place
-    )
+    numbers = {name: columns[name] for name in ("number", "row", "digest", "sequence", "ordinal", "track", "station")}
+    return StoredPlace(**numbers, place=place)
 
 
 def moment_text(moment: datetime) -> str:
@@ -172,9 +175,14 @@ def places_after(connection: sqlite3.Connection, after: int, limit: int, sequenc
 
 def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int, Place]:
     """The places whose descriptors are in ``rows`` now."""
+    return {row: stored.place for row, stored in stored_at(connection, rows).items()}
+
+
+def stored_at(connection: sqlite3.Connection, rows: list[int]) -> dict[int, StoredPlace]:
+    """The places whose descriptors are in ``rows`` now, as they are stored."""
     query = _PLACE + "WHERE p.row IN (SELECT value FROM json_each(?))"
     found = (_stored(values) for values in connection.execute(query, (json.dumps(rows),)).fetchall())
-    return {stored.row: stored.place for stored in found}
+    return {stored.row: stored for stored in found}
 
 
 def rows_of_places(connection: sqlite3.Connection, place_ids: list[str]) -> dict[str, int]:
@@ -230,6 +238,14 @@ def _sequence_code(connection: sqlite3.Connection, name: str | None) -> int:
         return int(found[0])
     code = connection.execute("INSERT INTO sequences (name, next_ordinal) VALUES (?, 0)", (name,)).lastrowid
     assert code is not None
+    return code
+
+
+def new_track(connection: sqlite3.Connection) -> int:
+    """The code of a track whose sequence is gone: no sequence has it or will ever get it."""
+    code = connection.execute("INSERT INTO sequences (name, next_ordinal) VALUES (NULL, 0)").lastrowid
+    assert code is not None
+    connection.execute("DELETE FROM sequences WHERE code = ?", (code,))
     return code
 
 
@@ -316,6 +332,9 @@ def replace_descriptor(
         digest=item.digest,
         regions=item.regions,
         picture=picture,
+        track=None,
+        station=None,
+        pose_of=None,
     )
 
 
@@ -325,9 +344,34 @@ def set_fields(connection: sqlite3.Connection, stored: StoredPlace, fields: Plac
     if fields.sequence != stored.place.sequence:
         columns["sequence"] = _sequence_code(connection, fields.sequence)
         columns["ordinal"] = _next_ordinal(connection, columns["sequence"])
+    if fields.pose != stored.place.pose:
+        columns["pose_of"] = None
     _set(connection, stored.number, updated_at=moment_text(now), **columns)
     if "sequence" in columns:
         _drop_if_empty(connection, stored.sequence)
+    return expect(connection, stored.place.id)
+
+
+def set_counterpart(
+    connection: sqlite3.Connection,
+    stored: StoredPlace,
+    station: tuple[int, int] | None,
+    pose: Pose | None,
+    pose_of: str | None,
+    now: datetime,
+) -> StoredPlace:
+    """Set where another traverse shows what a place shows, and the pose that it got with that.
+
+    Args:
+        station: the code of the sequence and the ordinal in it; None: the place's own.
+        pose_of: the id of the place whose pose it is; None: the pose is the place's own, or it has none.
+    """
+    track, at = (None, None) if station is None else station
+    columns: dict[str, Any] = {"track": track, "station": at, "pose_of": pose_of}
+    if pose != stored.place.pose:
+        columns |= {name: getattr(pose, name) if pose else None for name in _POSE}
+        columns["updated_at"] = moment_text(now)
+    _set(connection, stored.number, **columns)
     return expect(connection, stored.place.id)
 
 
@@ -427,6 +471,7 @@ def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
     if not isinstance(rows_per_segment, int):
         raise ValueError("it does not say how many rows a segment has")
     del columns["only"]
+    columns["verification"] = bool(columns["verification"])
     if columns["calibration"] is not None:
         columns["calibration"] = json.loads(columns["calibration"])
     return MapRecord.model_validate(columns), rows_per_segment

@@ -2,7 +2,7 @@
 
 SQLite has no checksums of its own and does not notice a flipped bit in a pose or in a place's metadata.  The column
 ``seal`` of a row is the CRC-32 of its columns that are listed here; a row without one is not checked.  A migration that
-adds a column has to list it here and to write the checksums of all rows again.
+adds a column has to list it in ``ADDED`` and to write the checksums of all rows again (:func:`sealing`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-CHECKED: Mapping[str, Sequence[str]] = {
+_FIRST: Mapping[str, Sequence[str]] = {
     "map": (
         "id", "encoder", "dimension", "rows_per_segment", "description", "keep", "same_place_radius",
         "same_place_frames", "calibration", "revision", "created_at", "updated_at", "local_cells", "local_values",
@@ -24,6 +24,19 @@ CHECKED: Mapping[str, Sequence[str]] = {
     ),
     "cameras": ("name", "mask", "updated_at"),
 }  # fmt: skip
+
+ADDED: Sequence[Mapping[str, Sequence[str]]] = (
+    {"map": ("verification",), "places": ("track", "station", "pose_of"), "cameras": ("intrinsics",)},
+)
+"""The columns that each migration of the tables added to those of the first release."""
+
+
+def _columns(table: str, migrations: int) -> Sequence[str]:
+    """The columns of a table that the checksums of its rows cover after so many migrations, in this order."""
+    return [*_FIRST[table], *(column for added in ADDED[:migrations] for column in added.get(table, ()))]
+
+
+CHECKED: Mapping[str, Sequence[str]] = {table: _columns(table, len(ADDED)) for table in _FIRST}
 """The columns of each table that its rows' checksums cover, in this order."""
 
 _NAMES = {"map": "id", "places": "id", "cameras": "name"}
@@ -45,10 +58,24 @@ def register(connection: sqlite3.Connection) -> None:
     connection.create_function(_FUNCTION, -1, checksum_of, deterministic=True)
 
 
-def expression(table: str) -> str:
-    """The SQL expression of a row's checksum."""
-    columns = ", ".join(f'"{column}"' for column in CHECKED[table])
+def expression(table: str, migrations: int = len(ADDED)) -> str:
+    """The SQL expression of a row's checksum, in tables to which so many migrations were applied."""
+    columns = ", ".join(f'"{column}"' for column in _columns(table, migrations))
     return f"{_FUNCTION}({columns})"
+
+
+def sealing(migration: int) -> list[str]:
+    """The last statements of a migration, which write the checksums of all rows again with the columns that it added.
+
+    A row that does not match its checksum keeps it, and so does not match it afterwards either.
+
+    Args:
+        migration: its number, counted from 0.
+    """
+    return [
+        f"UPDATE {table} SET seal = {expression(table, migration + 1)} WHERE seal = {expression(table, migration)}"
+        for table in ADDED[migration]
+    ]
 
 
 def write_checksums(connection: sqlite3.Connection, table: str, condition: str = "true", *values: Any) -> None:

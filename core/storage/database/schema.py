@@ -131,7 +131,26 @@ _TABLES: Migration = (
     f"CREATE TRIGGER place_values_gone AFTER DELETE ON places BEGIN {_DELETE_VALUES}; END",
 )
 
-MIGRATIONS: Sequence[Migration] = ()
+MIGRATIONS: Sequence[Migration] = (
+    (
+        "ALTER TABLE map ADD COLUMN verification INTEGER NOT NULL DEFAULT 1 CHECK (verification IN (0, 1))",
+        # The sequence and the ordinal at which another traverse shows what this place shows (:class:`Whereabouts`);
+        # NULL: those of the place itself.  The sequence may be gone, whose code is never used again.
+        "ALTER TABLE places ADD COLUMN track INTEGER",
+        "ALTER TABLE places ADD COLUMN station INTEGER",
+        # The id of the place whose pose the place got with its station; NULL: the pose is its own.
+        "ALTER TABLE places ADD COLUMN pose_of TEXT",
+        "CREATE INDEX places_at_station ON places (track, station) WHERE track IS NOT NULL",
+        "ALTER TABLE cameras ADD COLUMN intrinsics TEXT",
+        # Apart from the places, for the same reason as pictures.  The checksum covers the digest of the frame, too.
+        """CREATE TABLE keypoints (
+            place INTEGER PRIMARY KEY REFERENCES places (number) ON DELETE CASCADE,
+            checksum INTEGER NOT NULL,
+            record BLOB NOT NULL
+        ) STRICT""",
+        *row_checksums.sealing(0),
+    ),
+)
 """The steps from ``FIRST_VERSION`` to the newest version; new files get them, too."""
 
 

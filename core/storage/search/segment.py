@@ -20,7 +20,7 @@ _SMALLEST_TAIL = 8
 
 @dataclass(frozen=True)
 class Location:
-    """Where one place is; the fields are those of :class:`Whereabouts`."""
+    """Where one place is; the fields are those of :class:`Whereabouts`, of which None is a track of its own."""
 
     kind: int
     position: tuple[float, float, float]
@@ -28,6 +28,8 @@ class Location:
     ordinal: int
     heading: float = nan
     timestamp: int = NO_TIME
+    track: int | None = None
+    station: int | None = None
 
 
 def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
@@ -39,20 +41,8 @@ def whereabouts_of(locations: Sequence[Location]) -> Whereabouts:
         np.array([location.ordinal for location in locations], dtype=np.int64),
         np.array([location.heading for location in locations], dtype=np.float32),
         np.array([location.timestamp for location in locations], dtype=np.int64),
-    )
-
-
-def joined(parts: Sequence[Whereabouts]) -> Whereabouts:
-    """Concatenate whereabouts."""
-    if not parts:
-        return whereabouts_of([])
-    return Whereabouts(
-        np.concatenate([part.kind for part in parts]),
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.sequence for part in parts]),
-        np.concatenate([part.ordinal for part in parts]),
-        np.concatenate([part.heading for part in parts]),
-        np.concatenate([part.timestamp for part in parts]),
+        np.array([one.sequence if one.track is None else one.track for one in locations], dtype=np.int32),
+        np.array([one.ordinal if one.station is None else one.station for one in locations], dtype=np.int64),
     )
 
 
@@ -159,7 +149,7 @@ class Segment:
         return replace(
             self,
             held=None if self.held is None else self.held.appended(len(self), descriptors, local, largest),
-            whereabouts=joined([self.whereabouts, whereabouts_of(locations)]),
+            whereabouts=Whereabouts.joined([self.whereabouts, whereabouts_of(locations)]),
             alive=np.concatenate([self.alive, np.ones(len(descriptors), dtype=np.bool_)]),
             checksums=np.concatenate([self.checksums, np.array(checksums, dtype=np.uint32)]),
         )
@@ -168,11 +158,9 @@ class Segment:
         """With other locations of some of the map's rows."""
         old = self.whereabouts
         new = old.take(np.arange(len(old)))
-        for row, location in locations.items():
-            offset = row - self.first_row
-            new.kind[offset], new.position[offset] = location.kind, location.position
-            new.sequence[offset], new.ordinal[offset] = location.sequence, location.ordinal
-            new.heading[offset], new.timestamp[offset] = location.heading, location.timestamp
+        offsets = np.array(list(locations), np.int64) - self.first_row
+        for name, column in vars(whereabouts_of(list(locations.values()))).items():
+            getattr(new, name)[offsets] = column
         return replace(self, whereabouts=new)
 
     def without(self, rows: Sequence[int]) -> Segment:

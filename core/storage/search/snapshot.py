@@ -30,7 +30,7 @@ from core.places import Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
-from core.storage.search.segment import Held, Location, Segment, joined, whereabouts_of
+from core.storage.search.segment import Held, Location, Segment, whereabouts_of
 from core.threads import cores, in_turns, keep_to
 
 __all__ = ["SHORTLIST", "Location", "Ranking", "Segment", "Snapshot"]
@@ -103,7 +103,7 @@ class Snapshot:
     @cached_property
     def whereabouts(self) -> Whereabouts:
         """The whereabouts of all rows, including dead ones; index it by the rows that :meth:`search` returns."""
-        return joined([segment.whereabouts for segment in self.segments])
+        return Whereabouts.joined([segment.whereabouts for segment in self.segments])
 
     def whereabouts_at(self, rows: NDArray[np.int64]) -> Whereabouts:
         """The same as ``whereabouts.take(rows)``, without concatenating all segments of a large map."""
@@ -114,7 +114,7 @@ class Snapshot:
             self.segments[number].whereabouts.take(offsets[numbers == number]) for number in np.unique(numbers).tolist()
         ]
         by_segment = np.argsort(numbers, kind="stable")
-        return joined(parts).take(np.argsort(by_segment))
+        return Whereabouts.joined(parts).take(np.argsort(by_segment))
 
     @cached_property
     def alive(self) -> NDArray[np.bool_]:

@@ -10,7 +10,7 @@ from service.commands.connection.client import AsJson, DataDir, MapId, Target, U
 from service.commands.console import Commands, Failure, number, output, remark, show, show_json, table
 from service.commands.maps.backup import export, import_
 from service.commands.maps.places import places, sequences
-from service.commands.maps.upkeep import health, merge, prune, rebuild, reencode
+from service.commands.maps.upkeep import align, health, merge, prune, rebuild, reencode
 
 maps = typer.Typer(cls=Commands, help="Create, look after and delete maps.", no_args_is_help=True)
 maps.add_typer(places, name="places")
@@ -18,6 +18,7 @@ maps.add_typer(sequences, name="sequences")
 for name, command in (
     ("health", health),
     ("re-encode", reencode),
+    ("align", align),
     ("prune", prune),
     ("rebuild", rebuild),
     ("merge", merge),

@@ -1,4 +1,4 @@
-"""``placerec maps health``, ``re-encode``, ``rebuild``, ``prune`` and ``merge``: the upkeep of maps."""
+"""``placerec maps health``, ``re-encode``, ``rebuild``, ``align``, ``prune`` and ``merge``: the upkeep of maps."""
 
 from __future__ import annotations
 
@@ -78,6 +78,32 @@ def rebuild(
 ) -> None:
     """Rebuild the search index of a large map from its descriptors, while it is searched."""
     show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "rebuild"), {}, wait), as_json)
+
+
+def align(
+    map_id: MapId,
+    sequence: Annotated[str, typer.Option(help="The traverse to align.", show_default=False)],
+    with_: Annotated[
+        list[str] | None,
+        typer.Option("--with", help="A traverse to align it with; can be repeated. Default: all others."),
+    ] = None,
+    poses: Annotated[
+        bool, typer.Option("--poses/--no-poses", help="Give frames without a pose that of their counterpart.")
+    ] = True,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only report what would be stored.")] = False,
+    undo: Annotated[
+        bool, typer.Option("--undo", help="Instead: forget the counterparts of the traverse, and poses it was given.")
+    ] = False,
+    wait: Wait = True,
+    url: Url = None,
+    data_dir: DataDir = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find which frames of a traverse show the places of others; these are then the same places, not rivals."""
+    if undo and with_:
+        raise typer.BadParameter("--undo cannot be combined with --with")
+    body = {"sequence": sequence, "with": [] if undo else with_ or None, "poses": poses, "dry_run": dry_run}
+    show_outcome(submit(Target(url, data_dir), path_of("maps", map_id, "align"), body, wait), as_json)
 
 
 def prune(

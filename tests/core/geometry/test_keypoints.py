@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from core.errors import InvalidKeypoints
 from core.evaluation.samples import sample_frame
 from core.frames.masks import Mask
-from core.geometry.keypoints import MOST, RESOLUTION, ROW, SHARES, Keypoints, find_keypoints, keypoints_of, shown_size
-from core.networks.xfeat import LENGTH, XFeat, load_xfeat
+from core.geometry.detection import find_keypoints, shown_size
+from core.geometry.keypoints import LENGTH, MOST, RESOLUTION, SHARES, Keypoints, keypoints_of, record_bytes
+from core.networks.xfeat import XFeat, load_xfeat
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def found(network: XFeat) -> Keypoints:
 
 
 def test_a_place_takes_at_most_40_kb() -> None:
-    assert ROW.itemsize <= 40_000
+    assert record_bytes(MOST) <= 40_000
 
 
 def test_a_frame_has_keypoints_with_descriptors_of_unit_length(found: Keypoints) -> None:
@@ -75,7 +76,7 @@ def test_the_network_sees_a_side_of_480(network: XFeat, width: int, height: int,
 def test_a_blank_frame_has_none(network: XFeat, level: int) -> None:
     made = find_keypoints(network, np.full((120, 160, 3), level, np.uint8))
     assert len(made) == 0 and made.descriptors.shape == (0, LENGTH)
-    assert len(keypoints_of(made.row())) == 0
+    assert len(keypoints_of(made.record())) == 0
 
 
 def test_a_mask_hides_keypoints(network: XFeat) -> None:
@@ -89,48 +90,48 @@ def test_the_same_frame_gives_the_same_keypoints(network: XFeat, found: Keypoint
     assert np.array_equal(again.positions, found.positions) and np.array_equal(again.descriptors, found.descriptors)
 
 
-def test_a_row_gives_back_what_was_put_into_it(found: Keypoints) -> None:
-    read = keypoints_of(np.frombuffer(found.row().tobytes(), ROW)[0])
+def test_a_record_gives_back_what_was_put_into_it(found: Keypoints) -> None:
+    record = found.record()
+    assert len(record) == record_bytes(len(found))
+    read = keypoints_of(record)
     assert (read.width, read.height) == (found.width, found.height)
     assert np.array_equal(read.positions, found.positions) and np.array_equal(read.descriptors, found.descriptors)
 
 
-Change = Callable[[NDArray[np.void]], None]
-
-
-def put(field: str, value: int, where: tuple[int, ...] | None = None) -> Change:
-    def change(row: NDArray[np.void]) -> None:
-        if where is None:
-            row[field] = value
-        else:
-            row[field][where] = value
+def put(offset: int, *values: int) -> Callable[[bytearray], object]:
+    def change(record: bytearray) -> None:
+        record[offset : offset + len(values)] = bytes(values)
 
     return change
 
 
-DAMAGES = {
-    "too many": put("count", MOST + 1),
-    "fewer than there are": put("count", 3),
-    "more than there are": put("count", 12),
-    "no width": put("width", 0),
-    "no height": put("height", 0),
-    "something behind": put("descriptors", 1, (MOST - 1, 5)),
+DAMAGES: dict[str, Callable[[bytearray], object]] = {
+    "nothing": bytearray.clear,
+    "a part of the header": lambda record: record.__delitem__(slice(11, None)),
+    "too many": put(8, 0, 3),
+    "fewer than there are": put(8, 3),
+    "more than there are": put(8, 12),
+    "no width": put(0, 0, 0, 0, 0),
+    "no height": put(4, 0, 0, 0, 0),
+    "a byte less": bytearray.pop,
+    "a byte more": lambda record: record.append(1),
+    "no descriptor": put(12 + 40 + 3 * LENGTH, *[0] * LENGTH),
 }
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_a_damaged_row_is_refused(found: Keypoints, damage: Change) -> None:
+def test_a_damaged_record_is_refused(found: Keypoints, damage: Callable[[bytearray], object]) -> None:
     few = Keypoints(found.width, found.height, found.positions[:10], found.descriptors[:10])
-    row = np.array(few.row())
-    assert len(keypoints_of(row)) == 10
-    damage(row)
+    record = bytearray(few.record())
+    assert len(keypoints_of(bytes(record))) == 10
+    damage(record)
     with pytest.raises(InvalidKeypoints):
-        keypoints_of(row)
+        keypoints_of(bytes(record))
 
 
-def test_a_record_of_another_type_is_refused() -> None:
-    with pytest.raises(InvalidKeypoints, match="bytes"):
-        keypoints_of(np.zeros((), np.dtype([("count", "<u2")])))
+def test_more_keypoints_than_a_frame_has_are_refused() -> None:
+    with pytest.raises(InvalidKeypoints):
+        keypoints_of(bytes([1, 0, 0, 0] * 2 + [65, 2, 0, 0]) + b"\1" * (68 * (MOST + 1)))
 
 
 @pytest.mark.parametrize(

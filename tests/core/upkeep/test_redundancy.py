@@ -24,15 +24,24 @@ def where(kinds: list[int], x: list[float], sequences: list[int] | None = None) 
 @settings(deadline=None)  # the first example imports SciPy
 @given(
     st.lists(
-        st.tuples(st.sampled_from([NO_POSE, METRIC, GEOGRAPHIC]), st.integers(0, 40), st.integers(-1, 1)), max_size=25
+        st.tuples(
+            st.sampled_from([NO_POSE, METRIC, GEOGRAPHIC]),
+            st.integers(0, 40),
+            st.integers(-1, 1),
+            st.none() | st.tuples(st.integers(0, 2), st.integers(0, 5)),
+        ),
+        max_size=MOST_NEIGHBOURS // 2,
     ),
     st.integers(0, 10),
     st.integers(0, 4),
 )
 def test_pairs_are_those_that_the_verdict_takes_for_one_place(
-    places: list[tuple[int, int, int]], radius: int, frames: int
+    places: list[tuple[int, int, int, tuple[int, int] | None]], radius: int, frames: int
 ) -> None:
     there = where([p[0] for p in places], [float(p[1]) for p in places], [p[2] for p in places])
+    for row, place in enumerate(places):
+        if place[3] is not None:
+            there.track[row], there.station[row] = place[3]
     neighborhood = Neighborhood(float(radius), frames)
     expected = {
         (i, j) for i in range(len(places)) for j in np.flatnonzero(there.near(i, neighborhood)).tolist() if i < j

@@ -7,6 +7,7 @@ import pytest
 
 from core.disk.files import Damage
 from core.errors import DataDirectoryTooNew, DataDirectoryTooOld
+from core.storage.database import row_checksums
 from core.storage.database.schema import FIRST_VERSION, MIGRATIONS, check_schema, migrate
 
 NEWEST = FIRST_VERSION + len(MIGRATIONS)
@@ -48,6 +49,24 @@ def test_an_older_file_becomes_newer_and_keeps_what_it_holds(connection: sqlite3
     assert version(connection) == FIRST_VERSION + len(LATER)
     assert connection.execute("SELECT id, regions, floor FROM places").fetchall() == [("p", 3, 1)]
     check_schema(connection, LATER)
+
+
+def test_a_file_of_the_first_release_gets_checksums_of_the_new_columns(connection: sqlite3.Connection) -> None:
+    migrate(connection, (), create=True)
+    assert version(connection) == FIRST_VERSION
+    for number in range(2):
+        connection.execute(PLACE.replace("'p', 0", f"'p{number}', {number}"))
+    connection.execute("INSERT INTO cameras (name, updated_at) VALUES ('front', 'now')")
+    for table in ("places", "cameras"):
+        connection.execute(f"UPDATE {table} SET seal = {row_checksums.expression(table, 0)}")
+    connection.execute("UPDATE places SET regions = 4 WHERE id = 'p1'")  # the disk flips a bit
+    migrate(connection)
+    assert row_checksums.mismatched(connection, "places") == ["p1"], "what was damaged is not sealed again"
+    assert row_checksums.mismatched(connection, "cameras") == []
+    assert connection.execute("SELECT track, station FROM places").fetchall() == [(None, None)] * 2
+    for table, column, value in (("places", "station", 3), ("cameras", "intrinsics", "{}")):
+        connection.execute(f"UPDATE {table} SET {column} = ?", (value,))
+        assert row_checksums.mismatched(connection, table), f"{column} is not covered"
 
 
 def test_a_migration_that_fails_leaves_the_file_as_it_was(connection: sqlite3.Connection) -> None:

@@ -1,0 +1,70 @@
+"""Finding the keypoints of a frame by XFeat.
+
+A pixel is a keypoint where the network's heat has a local maximum.  The best are those with the highest product of
+heat and reliability (Potje et al., 2024, section 3).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional as F
+
+from core.frames.masks import Mask
+from core.frames.preprocessing import Pixels
+from core.geometry.keypoints import MOST, RESOLUTION, SHARES, Keypoints
+from core.networks.xfeat import CELL, MULTIPLE, XFeat
+
+LONGEST_SIDE = 480
+"""Pixels of the longer side of what the network sees; a smaller frame is enlarged, so that it gives keypoints, too."""
+LEAST_HEAT = 0.05
+"""The heat from which on a pixel is a keypoint: the authors' choice."""
+NEIGHBORHOOD = 5
+"""Pixels a side of the square in which a keypoint has the highest heat: the authors' choice."""
+
+
+def shown_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height at which the network sees a frame: the longer side LONGEST_SIDE, both multiples of MULTIPLE."""
+    scale = LONGEST_SIDE / max(width, height)
+    columns, rows = (max(1, round(side * scale / MULTIPLE)) * MULTIPLE for side in (width, height))
+    return columns, rows
+
+
+def find_keypoints(network: XFeat, pixels: Pixels, mask: Mask | None = None) -> Keypoints:
+    """The keypoints of a frame; a blank frame has none.
+
+    Args:
+        pixels: uint8 [H, W, 3], BGR, of any size.
+        mask: hides a part of the frame, in which there are no keypoints then.
+    """
+    height, width = pixels.shape[:2]
+    columns, rows = shown_size(width, height)
+    interpolation = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
+    maps = network(np.asarray(cv2.resize(pixels, (columns, rows), interpolation=interpolation), np.uint8))
+    highest = cv2.dilate(maps.heat, np.ones((NEIGHBORHOOD, NEIGHBORHOOD), np.uint8))
+    found = (maps.heat == highest) & (maps.heat > LEAST_HEAT)
+    if mask is not None:
+        found &= ~mask.covered(rows, columns)
+    y, x = np.nonzero(found)
+    reliability = cv2.resize(maps.reliability, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    best = np.argsort(-maps.heat[y, x] * reliability[y, x], kind="stable")[:MOST]
+    x, y = x[best], y[best]
+    centres = np.stack([(x + 0.5) / columns, (y + 0.5) / rows], axis=1)
+    positions = np.minimum(centres * SHARES, SHARES - 1).astype(np.uint16)
+    return Keypoints(width, height, positions, _descriptors_at(maps.descriptors, x, y))
+
+
+def _descriptors_at(maps: NDArray[np.float32], x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Descriptors at pixels, interpolated between cells by cubic convolution and quantized; int8 [n, 64].
+
+    As in the authors' code the first pixel and the last one lie on the borders of the map.
+    """
+    rows, columns = maps.shape[0] * CELL, maps.shape[1] * CELL
+    where = np.stack([2 * x / (columns - 1) - 1, 2 * y / (rows - 1) - 1], axis=1).astype(np.float32)
+    cells, grid = torch.from_numpy(maps).permute(2, 0, 1)[None], torch.from_numpy(where)[None, None]
+    with torch.inference_mode():
+        sampled = F.grid_sample(cells, grid, mode="bicubic", align_corners=False)[0, :, 0].T
+        steps = (F.normalize(sampled, dim=1) * RESOLUTION).round().clamp(-127, 127)
+        return steps.to(torch.int8).contiguous().numpy()

@@ -1,0 +1,65 @@
+"""Which places are the same: by poses, by sequences, and by the tracks on which alignment put them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from core.places import METRIC, NO_SEQUENCE, Neighborhood, Whereabouts
+
+NEARBY = Neighborhood(5.0, 1)
+# Traverse 0 has four frames.  Of traverse 1 the second and third show what stations 1 and 2 of traverse 0 show, and a
+# frame without a sequence shows station 2.
+ORDINALS = [0, 1, 2, 3, 0, 1, 2, 9]
+SEQUENCES = [0, 0, 0, 0, 1, 1, 1, NO_SEQUENCE]
+TRACKS = [0, 0, 0, 0, 1, 0, 0, 0]
+STATIONS = [0, 1, 2, 3, 0, 1, 2, 2]
+
+
+def aligned() -> Whereabouts:
+    count = len(ORDINALS)
+    return Whereabouts(
+        np.zeros(count, np.int8),
+        np.zeros((count, 3)),
+        np.array(SEQUENCES, np.int32),
+        np.array(ORDINALS, np.int64),
+        track=np.array(TRACKS, np.int32),
+        station=np.array(STATIONS, np.int64),
+    )
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"),
+    [
+        (0, [0, 1, 5]),
+        (2, [1, 2, 3, 5, 6, 7]),
+        (4, [4, 5]),  # has no counterpart: only its own sequence
+        (5, [0, 1, 2, 4, 5, 6, 7]),
+        (7, [1, 2, 3, 5, 6, 7]),
+    ],
+)
+def test_places_at_one_station_are_the_same(row: int, expected: list[int]) -> None:
+    assert np.flatnonzero(aligned().near(row, NEARBY)).tolist() == expected
+
+
+def test_poses_decide_before_tracks_do() -> None:
+    where = aligned()
+    where.kind[[1, 5]] = METRIC
+    where.position[5, 0] = 50.0
+    assert not where.near(1, NEARBY)[5]
+
+
+def test_tracks_are_the_places_own_unless_alignment_knows_others() -> None:
+    where = Whereabouts.along_sequence([3, 1])
+    assert (where.track.tolist(), where.station.tolist()) == ([0, 0], [3, 1])
+    where.track[0] = 7
+    assert where.sequence.tolist() == [0, 0]
+
+
+def test_parts_are_taken_and_joined_with_all_columns() -> None:
+    where = aligned()
+    again = Whereabouts.joined([where.take([0, 1, 2]), where.take(np.arange(len(where)) >= 3)])
+    for name, column in vars(where).items():
+        np.testing.assert_array_equal(getattr(again, name), column)
+        assert getattr(again, name).dtype == column.dtype
+    assert len(Whereabouts.joined([])) == 0
