@@ -26,6 +26,13 @@ PACES = tuple(round(0.5 + 0.1 * step, 1) for step in range(11))
 """Velocities of the paths, as multiples of the usual advance."""
 
 
+SHARE = 0.25
+"""Weight of a frame's evidence: the frames of a path lead to the same mistakes, and nothing else softens their sum."""
+
+BEST = 2.0
+"""Not being in the map counts this much more than in the filter, as it is compared with the best of many paths."""
+
+
 class PathSearch:
     """The evidence of a run's last frames, and the best paths through it.
 
@@ -73,7 +80,7 @@ class PathSearch:
                 add_along(places, gains, shift, graph.first, graph.last, totals)
             np.maximum(best, totals, out=best)
         unknown = sum(seen.unknown for seen in self._seen)
-        return _normalised(best, unknown)
+        return _normalised(np.float32(SHARE) * best, SHARE * BEST * unknown)
 
 
 def _normalised(likelihoods: NDArray[np.float32], unknown: float) -> Belief:

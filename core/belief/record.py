@@ -12,8 +12,11 @@ import numpy as np
 from core.belief.evidence import Evidence
 from core.belief.motion import Odometry
 from core.belief.run import RunState
+from core.belief.view import HEIGHT, WIDTH, View
 
-FORMAT = 1
+FORMAT = 2
+"""Format 1, of version 0.1, knows nothing of views; it is read as if there had been none."""
+
 _PREFIX = struct.Struct("<II")  # checksum of all that follows it, length of the head
 
 
@@ -33,11 +36,17 @@ def to_bytes(state: RunState) -> bytes:
         "reach": state.reach,
         "places": len(state.rows),
         "seen": [[len(seen.rows), seen.unknown] for seen in state.seen],
+        "view": 0 if state.view is None else len(state.view.levels),
+        "blind": state.blind,
+        "constant": state.constant,
+        "pending_reach": state.pending_reach,
     }
     text = json.dumps(head, separators=(",", ":")).encode()
     arrays = [state.rows.astype("<i8"), state.masses.astype("<f4")]
     for seen in state.seen:
         arrays += [seen.rows.astype("<i8"), seen.gains.astype("<f4")]
+    if state.view is not None:
+        arrays.append(state.view.levels)
     rest = struct.pack("<I", len(text)) + text + b"".join(array.tobytes() for array in arrays)
     return struct.pack("<I", zlib.crc32(rest)) + rest
 
@@ -53,7 +62,7 @@ def from_bytes(data: bytes) -> RunState:
         if zlib.crc32(data[4:]) != checksum:
             raise DamagedRecord("the checksum is wrong")
         head: dict[str, Any] = json.loads(data[_PREFIX.size : _PREFIX.size + length])
-        if head["format"] != FORMAT:
+        if head["format"] not in (1, FORMAT):
             raise DamagedRecord("it is of another format")
         position = _PREFIX.size + length
 
@@ -65,6 +74,9 @@ def from_bytes(data: bytes) -> RunState:
 
         rows, masses = array("<i8", head["places"]), array("<f4", head["places"])
         seen = tuple(Evidence(array("<i8", count), array("<f4", count), unknown) for count, unknown in head["seen"])
+        levels = array("u1", head.get("view", 0))
+        if len(levels) not in (0, WIDTH * HEIGHT):
+            raise DamagedRecord("the view has another size")
         return RunState(
             rows.astype(np.int64),
             masses.astype(np.float32),
@@ -74,6 +86,10 @@ def from_bytes(data: bytes) -> RunState:
             Odometry(*head["odometry"]),
             head["reach"],
             seen,
+            View(levels) if len(levels) else None,
+            head.get("blind", 0),
+            head.get("constant", 0),
+            head.get("pending_reach", 0.0),
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise DamagedRecord(str(error)) from error

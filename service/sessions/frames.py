@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 
-from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, evidence
+from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
@@ -70,8 +70,9 @@ async def process_frame(
         recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask)
         single = counted_answer(engine, statistics, map_, recognized)
         try:
+            view = await in_thread(view_of, recognized.encoded.pixels, mask)
             return await in_thread(
-                _advance, sessions, map_, session, run, recognized.answer, single, options, request_id, began
+                _advance, sessions, map_, session, run, recognized.answer, view, single, options, request_id, began
             )
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
@@ -118,6 +119,7 @@ def _advance(
     session: Session,
     run: Run,
     answered: Answer | None,
+    view: View,
     single: QueryAnswer,
     options: FrameParameters,
     request_id: str | None,
@@ -126,7 +128,7 @@ def _advance(
     """Update the belief, save the session, and answer."""
     started = time.perf_counter()
     step, motion = _step(session, run, options)
-    run.advance(_evidence(map_, answered), step)
+    run.advance(_evidence(map_, answered), step, view)
     alive = alive_rows(map_)
     found = run.estimate(options.k, alive)
     earlier = run.earlier(options.k, alive)
@@ -146,6 +148,7 @@ def _advance(
             candidates=_believed(map_, earlier.candidates),
         ),
         motion=motion,
+        view=run.sight,
         restored=session.restored,
         frames_lost=lost,
         saved=True,

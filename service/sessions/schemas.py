@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from core.belief import Odometry, RunOptions, Stride
+from core.belief import Odometry, RunOptions, Sight, Stride
 from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
 from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters
@@ -200,6 +200,7 @@ class SessionAnswer(BeliefView):
                     "candidates": [{"rank": 1, "probability": 0.97, "place": PLACE_EXAMPLE}],
                     "earlier": None,
                     "motion": "odometry",
+                    "view": None,
                     "repeated": False,
                     "restored": False,
                     "frames_lost": None,
@@ -216,6 +217,13 @@ class SessionAnswer(BeliefView):
     frames: int = Field(description="How many frames the session has processed.")
     earlier: EarlierBelief | None = Field(description="With a lag, once there are enough frames.")
     motion: Motion = Field(description="How the robot's motion since the last frame was known.")
+    view: Sight | None = Field(
+        default=None,
+        description="Why the frame does not count. covered: it shows hardly anything, as behind a covered lens. "
+        "constant: it shows the same as the last frame that counted; without odometry the robot is taken to stand. "
+        "After three covered frames the verdict is unknown, as after three constant ones that do not fit the map. "
+        "Null: the frame counts.",
+    )
     repeated: bool = Field(default=False, description="The frame was sent again, and counts once.")
     restored: bool = Field(description="The session was restored after a restart of the service.")
     frames_lost: int | None = Field(

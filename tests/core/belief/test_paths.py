@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from core.belief import Evidence, Stride
-from core.belief.paths import PACES, PathSearch
+from core.belief.paths import BEST, PACES, SHARE, PathSearch
 from tests.core.belief.maps import graph_of, walk
 
 
@@ -29,9 +29,11 @@ def test_each_place_has_its_best_path(stride: Stride) -> None:
                     total += float(frame.gains[frame.rows == place].sum())
             best[end] = max(best[end], total)
     belief = search.belief(graph, stride)
+    best *= SHARE
     expected = np.exp(best) / np.exp(best).sum()
     np.testing.assert_allclose(belief.given, expected, atol=1e-5)
-    assert belief.unknown == pytest.approx(np.exp(3) / (np.exp(3) + np.exp(best.max())), abs=1e-5)
+    outside = np.exp(3 * SHARE * BEST)
+    assert belief.unknown == pytest.approx(outside / (outside + np.exp(best.max())), abs=1e-5)
 
 
 def test_frames_that_did_not_arrive_keep_their_time() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import zlib
 
 import numpy as np
 import pytest
@@ -17,16 +19,18 @@ from core.belief import (
     RunOptions,
     Step,
     Stride,
+    View,
     from_bytes,
     place_graph,
     to_bytes,
 )
 from core.belief.run import LOST_AFTER
+from core.belief.view import HEIGHT, WIDTH
 from core.places import Neighborhood
 from tests.core.belief.maps import graph_of, posed, shows, walk
 
 BAYES, PATH = RunOptions(), RunOptions(filter="path")
-NOWHERE = 0.56
+NOWHERE = 1.0
 
 
 def alive(graph: PlaceGraph) -> np.ndarray:
@@ -37,7 +41,7 @@ def seen_at(row: int, places: int, random: np.random.Generator) -> Evidence:
     """A frame taken at a row: that speaks for it a little more than for a few others."""
     others = random.choice(places, 6, replace=False)
     others = others[others != row]
-    gains = np.append(random.uniform(0.1, 0.9, len(others)), 1.5).astype(np.float32)
+    gains = np.append(random.uniform(0.3, 2.2, len(others)), 3.7).astype(np.float32)
     return Evidence(np.append(others, row).astype(np.int64), gains, NOWHERE)
 
 
@@ -64,7 +68,7 @@ def test_what_is_not_in_the_map_is_unknown_after_a_few_frames(options: RunOption
     verdicts = []
     for _ in range(30):
         rows = random.choice(300, 6, replace=False)
-        run.advance(Evidence(rows, random.uniform(0.1, 0.9, 6).astype(np.float32), NOWHERE), Step())
+        run.advance(Evidence(rows, random.uniform(0.3, 2.2, 6).astype(np.float32), NOWHERE), Step())
         verdicts.append(run.estimate(1, alive(graph)).verdict)
     assert verdicts[15:] == ["unknown"] * 15
     assert run.lost and run.unrecognized is not None and run.unrecognized >= LOST_AFTER
@@ -155,11 +159,11 @@ def test_a_run_is_taken_up_where_it_was(options: RunOptions) -> None:
     assert (again.frames, again.unrecognized) == (run.frames, run.unrecognized)
     for one in (run, again):
         assert one.look(1, alive(graph)).verdict == "recognized"
-    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=1e-4)
+    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=2e-3)
     following = seen_at(720, 2000, random)
     for one in (run, again):
         one.advance(following, Step())
-    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=1e-3)
+    np.testing.assert_allclose(again.belief.given, run.belief.given, atol=2e-3)
     assert again.belief.unknown == pytest.approx(run.belief.unknown, abs=1e-4)
 
 
@@ -181,3 +185,98 @@ def test_the_place_of_some_frames_ago_is_told_better_later() -> None:
     told = run.earlier(2, alive(graph))
     assert told is not None and told.candidates[0].row in (10, 11, 12)
     assert verdicts[1] == "ambiguous" and told.verdict == "recognized"
+
+
+def view(number: int) -> View:
+    """What the robot sees at a row: unlike what it sees anywhere else."""
+    return View(np.random.default_rng(number).integers(0, 256, WIDTH * HEIGHT).astype(np.uint8))
+
+
+BLACK = View(np.zeros(WIDTH * HEIGHT, np.uint8))
+
+
+@pytest.mark.parametrize("outside", [False, True])
+def test_a_robot_that_was_carried_off_is_missed_within_three_frames(outside: bool) -> None:
+    random, graph = np.random.default_rng(7), graph_of(walk(400), Neighborhood(5, 3))
+    run = Run(BAYES, graph)
+    for row in range(50, 80):
+        run.advance(seen_at(row, 400, random), Step(), view(row))
+    assert run.look(1, alive(graph)).verdict == "recognized"
+    for row in range(300, 303):
+        frame = shows(*random.choice(400, 6, False), gain=1, unknown=NOWHERE + 0.1)
+        run.advance(frame if outside else seen_at(row, 400, random), Step(), view(row))
+    told = run.look(1, alive(graph))
+    assert told.verdict != "recognized" or abs(told.candidates[0].row - 302) <= 3
+
+
+@pytest.mark.parametrize("odometry", [None, Odometry(0.0)])
+def test_a_robot_that_stands_becomes_no_surer(odometry: Odometry | None) -> None:
+    graph = graph_of(posed([(float(i), 0.0) for i in range(60)]))
+    once, standing = Run(BAYES, graph), Run(BAYES, graph)
+    for run in (once, standing):
+        for row in range(10, 14):
+            run.advance(shows(row, row + 30, gain=2), Step(), view(row))
+    before = standing.look(1, alive(graph))
+    for _ in range(300):
+        standing.advance(shows(13, gain=2), Step(odometry=odometry), view(13))
+        assert standing.sight == "constant"
+    after = standing.look(1, alive(graph))
+    assert before.verdict == after.verdict == "ambiguous" and before.candidates[0].row == after.candidates[0].row
+    assert after.candidates[0].probability == pytest.approx(before.candidates[0].probability, abs=1e-3)
+    for run in (once, standing):
+        run.advance(shows(14, gain=2), Step(), view(14))
+    assert standing.sight is None
+    np.testing.assert_allclose(standing.belief.given, once.belief.given, atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [BAYES, PATH])
+@pytest.mark.parametrize(
+    ("seen", "shown", "sight"),
+    [
+        (NOTHING, BLACK, "covered"),
+        (Evidence(np.array([3]), np.array([0.2], np.float32), NOWHERE), BLACK, "covered"),
+        (Evidence(np.array([3]), np.array([0.2], np.float32), NOWHERE), view(129), "constant"),
+    ],
+)
+def test_a_covered_camera_is_unknown_and_says_so(options: RunOptions, seen: Evidence, shown: View, sight: str) -> None:
+    random, graph = np.random.default_rng(5), graph_of(walk(300), Neighborhood(5, 3))
+    run = Run(options, graph)
+    for row in range(100, 130):
+        run.advance(seen_at(row, 300, random), Step(), view(row))
+    verdicts = []
+    for _ in range(30):
+        run.advance(seen, Step(), shown)
+        assert run.sight == sight
+        verdicts.append(run.estimate(1, alive(graph)).verdict)
+    assert verdicts[3:] == ["unknown"] * 27 and run.lost
+    if sight == "constant":
+        run.advance(seen_at(130, 300, random), Step(), view(130))
+        assert run.sight is None and run.blind == 0
+        told = run.look(1, alive(graph))
+        assert told.verdict == "recognized" and abs(told.candidates[0].row - 130) <= 3, "the place was not forgotten"
+
+
+def test_a_slow_robot_advances_while_its_view_seems_the_same() -> None:
+    graph = graph_of(walk(40))
+    slow = Run(RunOptions(stride=Stride(0.1)), graph)
+    slow.advance(shows(10), Step(), view(0))
+    for _ in range(9):
+        slow.advance(shows(10), Step(), view(0))
+    slow.advance(shows(), Step(), view(1))
+    assert slow.belief.given[11] > slow.belief.given[10], "after ten frames it is about one place farther"
+
+
+def test_records_of_the_first_format_are_read() -> None:
+    run = Run(BAYES, graph_of(walk(10)))
+    run.advance(shows(3), Step(), view(3))
+    state = run.state()
+    assert from_bytes(to_bytes(state)).view is not None
+    data = to_bytes(state)
+    length = int.from_bytes(data[4:8], "little")
+    head = json.loads(data[8 : 8 + length])
+    head = {key: value for key, value in head.items() if key not in ("view", "blind", "constant", "pending_reach")}
+    text = json.dumps(head | {"format": 1}).encode()
+    rest = len(text).to_bytes(4, "little") + text + data[8 + length : -WIDTH * HEIGHT]
+    old = from_bytes(zlib.crc32(rest).to_bytes(4, "little") + rest)
+    assert (old.view, old.blind, old.constant) == (None, 0, 0)
+    assert Run.restored(BAYES, run.graph, old).look(1, alive(run.graph)).candidates[0].row == 3
