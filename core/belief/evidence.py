@@ -63,7 +63,7 @@ NOTHING = Evidence(np.empty(0, np.int64), np.empty(0, np.float32), 0.0)
 
 def evidence(
     rows: NDArray[np.int64],
-    scores: NDArray[np.float32],
+    scores: NDArray[np.floating],
     whereabouts: Whereabouts,
     calibration: Calibration,
     neighborhood: Neighborhood,
@@ -72,7 +72,8 @@ def evidence(
     """The evidence of a search.
 
     Args:
-        rows, scores: int64 [n] and float32 [n], best first; the best LISTED suffice.
+        rows, scores: int64 [n] and float [n], best first; the best LISTED suffice.  Of places that were verified the
+            scores are those of three stages (``core.judgement.geometry.final_values``).
         whereabouts: of the same n places.
         calibration: by which the frame is judged.
         neighborhood: which places are the same place.

@@ -28,7 +28,7 @@ NEIGHBORHOOD = 5
 
 
 @dataclass(frozen=True)
-class View:
+class ScaledFrame:
     """A frame as the network sees it.
 
     pixels: uint8 [rows, columns, 3], BGR; the size is that of :func:`shown_size`.
@@ -42,8 +42,8 @@ class View:
     mask: Mask | None = None
 
     @classmethod
-    def of(cls, pixels: Pixels, mask: Mask | None = None) -> View:
-        """The view of a frame, uint8 [H, W, 3], BGR, of any size."""
+    def of(cls, pixels: Pixels, mask: Mask | None = None) -> ScaledFrame:
+        """A frame of any size, uint8 [H, W, 3], BGR, scaled."""
         height, width = pixels.shape[:2]
         columns, rows = shown_size(width, height)
         interpolation = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
@@ -65,24 +65,24 @@ def find_keypoints(network: XFeat, pixels: Pixels, mask: Mask | None = None) -> 
         pixels: uint8 [H, W, 3], BGR, of any size.
         mask: hides a part of the frame, in which there are no keypoints then.
     """
-    return keypoints_in(network, View.of(pixels, mask))
+    return keypoints_in(network, ScaledFrame.of(pixels, mask))
 
 
-def keypoints_in(network: XFeat, view: View) -> Keypoints:
-    """The keypoints of the frame of a view; a blank frame has none."""
-    rows, columns = view.pixels.shape[:2]
-    maps = network(view.pixels)
+def keypoints_in(network: XFeat, scaled: ScaledFrame) -> Keypoints:
+    """The keypoints of a scaled frame; a blank frame has none."""
+    rows, columns = scaled.pixels.shape[:2]
+    maps = network(scaled.pixels)
     highest = cv2.dilate(maps.heat, np.ones((NEIGHBORHOOD, NEIGHBORHOOD), np.uint8))
     found = (maps.heat == highest) & (maps.heat > LEAST_HEAT)
-    if view.mask is not None:
-        found &= ~view.mask.covered(rows, columns)
+    if scaled.mask is not None:
+        found &= ~scaled.mask.covered(rows, columns)
     y, x = np.nonzero(found)
     reliability = cv2.resize(maps.reliability, (columns, rows), interpolation=cv2.INTER_LINEAR)
     best = np.argsort(-maps.heat[y, x] * reliability[y, x], kind="stable")[:MOST]
     x, y = x[best], y[best]
     centres = np.stack([(x + 0.5) / columns, (y + 0.5) / rows], axis=1)
     positions = np.minimum(centres * SHARES, SHARES - 1).astype(np.uint16)
-    return Keypoints(view.width, view.height, positions, _descriptors_at(maps.descriptors, x, y))
+    return Keypoints(scaled.width, scaled.height, positions, _descriptors_at(maps.descriptors, x, y))
 
 
 def _descriptors_at(maps: NDArray[np.float32], x: NDArray[np.int64], y: NDArray[np.int64]) -> NDArray[np.int8]:

@@ -24,7 +24,7 @@ from core.frames.containers import read_header
 from core.frames.images import Limits, decode
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
-from core.geometry.detection import View, keypoints_in
+from core.geometry.detection import ScaledFrame, keypoints_in
 from core.geometry.keypoints import Keypoints
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
@@ -59,24 +59,24 @@ class Encoded:
     mask: Mask | None = None
     keypoints: Keypoints | None = None
     search_result: Any = None
-    _view: View | None = None
+    _scaled: ScaledFrame | None = None
 
     @property
-    def view(self) -> View:
+    def scaled(self) -> ScaledFrame:
         """The frame as keypoints are found in it."""
-        return self._view or View.of(self.pixels, self.mask)
+        return self._scaled or ScaledFrame.of(self.pixels, self.mask)
 
     def find_keypoints(self) -> Keypoints:
         """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
-        return self.keypoints or keypoints_in(packaged_xfeat(), self.view)
+        return self.keypoints or keypoints_in(packaged_xfeat(), self.scaled)
 
-    def without_pixels(self, keep_view: bool = False) -> Encoded:
+    def without_pixels(self, keep_scaled: bool = False) -> Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.
 
         Args:
-            keep_view: keep what keypoints are found in, at most 0.7 MB.
+            keep_scaled: keep what keypoints are found in, at most 0.7 MB.
         """
-        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8), _view=self.view if keep_view else None)
+        return replace(self, pixels=np.zeros((0, 0, 3), np.uint8), _scaled=self.scaled if keep_scaled else None)
 
 
 AfterEncoding = Callable[[Encoded], object]
@@ -212,7 +212,7 @@ class EncoderThreads:
             encoding = frame.encoder.encode(pixels, frame.mask)
             encoded_at = time.perf_counter()
             wanted = frame.keypoints and len(encoding.regions) > 0
-            keypoints = keypoints_in(packaged_xfeat(), View.of(pixels, frame.mask)) if wanted else None
+            keypoints = keypoints_in(packaged_xfeat(), ScaledFrame.of(pixels, frame.mask)) if wanted else None
         except Exception as error:
             if not isinstance(error, InvalidImage | DeadlineExceeded):
                 log.exception("a frame could not be encoded")

@@ -280,13 +280,13 @@ class Engine:
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
         keypoints: bool = False,
-        keep_views: bool = False,
+        keep_scaled: bool = False,
     ) -> list[Encoded | Exception]:
         """Encode many frames: each frame, without its pixels, or the error that kept it from being encoded.
 
         Args:
             keypoints: whether the frames' keypoints are wanted, too.
-            keep_views: keep of each frame what keypoints are found in.
+            keep_scaled: keep of each frame what keypoints are found in.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.
@@ -295,7 +295,7 @@ class Engine:
         async with aclosing(self.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
-                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_views)
+                    made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_scaled)
         return [made[index] for index in range(len(frames))]
 
     def assert_encoder(self, map_: Map, asserted: str | None) -> None:

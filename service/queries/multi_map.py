@@ -109,7 +109,7 @@ async def locate_in_maps(
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
         except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, deadline, keep_views=verify != "never" and len(frames) == 1)
+    encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=verify != "never" and len(frames) == 1)
     verifiers: dict[str, Verifier] = {}  # by mask: the keypoints of one frame are the same for every encoder
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
@@ -139,7 +139,7 @@ async def _encode(
     masks: dict[str, list[Mask | None]],
     frames: Sequence[RigFrame],
     deadline: RequestDeadline,
-    keep_views: bool,
+    keep_scaled: bool,
 ) -> dict[str, list[Encoded | Exception] | Exception]:
     """The encoded frames for each map, or errors; maps with the same encoder and mask share an encoding."""
     wanted: dict[str, dict[tuple[int, str], Mask | None]] = {}
@@ -158,7 +158,7 @@ async def _encode(
                 [frames[index].data for index, _ in keys],
                 deadline,
                 list(wanted[identity].values()),
-                keep_views=keep_views,
+                keep_scaled=keep_scaled,
             )
             made[identity] = dict(zip(keys, outcomes, strict=True))
         except MAP_ERRORS as error:

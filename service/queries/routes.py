@@ -120,7 +120,7 @@ async def query_batch(
             [part.data for part in files],
             deadline,
             [mask] * len(files),
-            keep_views=options.verify != "never",
+            keep_scaled=options.verify != "never",
         )
         for index, (part, outcome) in enumerate(zip(files, outcomes, strict=True)):
             try:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
+from core.judgement.geometry import final_values
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
@@ -67,7 +68,8 @@ async def process_frame(
         if (repeated := _repeated(session, options, request_id)) is not None:
             return repeated
         mask = await camera_mask(map_, session.options.camera)
-        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask)
+        verify = session.options.verify
+        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask, verify)
         single = counted_answer(engine, statistics, map_, recognized)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
@@ -191,9 +193,8 @@ def _evidence(map_: Map, found: Answer | None) -> Evidence:
     if found is None:
         return NOTHING
     ranked = found.candidates
-    return evidence(
-        ranked.rows, ranked.scores, ranked.whereabouts, found.calibration, neighborhood_of(map_), ranked.examined
-    )
+    scores = ranked.scores if ranked.geometry is None else final_values(ranked.scores, ranked.geometry.share)
+    return evidence(ranked.rows, scores, ranked.whereabouts, found.calibration, neighborhood_of(map_), ranked.examined)
 
 
 def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]:

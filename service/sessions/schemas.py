@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from core.belief import Odometry, RunOptions, Sight, Stride
 from core.judgement.verdict import Verdict
 from core.places import Sequence, Timestamp
-from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters
+from service.http.schemas import CameraName, Cursor, EncoderAssertion, Matches, Milliseconds, Parameters, Verification
 from service.places.schemas import PLACE_EXAMPLE, PlaceView
 from service.queries.schemas import QueryAnswer
 
@@ -81,6 +81,7 @@ class NewSession(BaseModel):
     )
     path_frames: int = Field(strict=True, default=10, ge=2, le=50, description="Frames of a path; for the filter path.")
     camera: CameraName = None
+    verify: Verification = "auto"
     expires_after: float | None = Field(
         strict=True,
         default=None,
