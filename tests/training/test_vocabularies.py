@@ -31,12 +31,12 @@ def test_chosen_pairs_gain_and_are_verified_once(tmp_path: Path, monkeypatch: py
     scores = np.zeros((2, 3), np.float32)
     first = np.array([[True, False, True], [False, False, False]])
     made = Geometry(queries, references, tmp_path / "pairs.npy")
-    np.testing.assert_allclose(made.raised(scores, first), [[1.01, 0, 1.03], [0, 0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(made.raised(scores, first), np.array([[1.01, 0, 1.03], [0, 0, 0]]), rtol=1e-6)
     assert asked == [[1, 1, 3]]
 
     again = Geometry(queries, references, tmp_path / "pairs.npy")
     more = first | np.array([[False, False, False], [False, True, False]])
-    np.testing.assert_allclose(again.raised(scores, more), [[1.01, 0, 1.03], [0, 2.02, 0]], rtol=1e-6)
+    np.testing.assert_allclose(again.raised(scores, more), np.array([[1.01, 0, 1.03], [0, 2.02, 0]]), rtol=1e-6)
     assert asked == [[1, 1, 3], [2, 2]]
 
 
