@@ -86,6 +86,9 @@ def main(
     ] = None,
 ) -> None:
     """Write the network and one encoder file for each preset, and print what they reach."""
+    unknown = set(only or ()) - PRESETS.keys()
+    if unknown:
+        raise typer.BadParameter(f"no preset is named {', '.join(sorted(unknown))}; there are {', '.join(PRESETS)}")
     torch.manual_seed(seed)
     output.mkdir(parents=True, exist_ok=True)
     network = f"{NETWORK}{NETWORK_SUFFIX}"
