@@ -30,7 +30,7 @@ LOCAL_AGREEMENT = " with local agreement"
 TITLES = {
     "m-region-vlad": f"M-Region-VLAD{LOCAL_AGREEMENT}",
     "m-region-vlad-thesis": "M-Region-VLAD as in the thesis",
-    "region-vlad": "Region-VLAD",
+    "region-vlad": "Region-VLAD as in the thesis",
 }
 PAPERS = {
     "m-region-vlad": _CAMAL,
