@@ -49,7 +49,8 @@ STAGE = DEFAULT.agreement
 OUTPUTS = DEFAULT.outputs
 WIDEST = {"pool2": 64, "conv3": 384, "conv4": 384}
 """Directions fitted of each layer; every configuration takes the first so many."""
-THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None}
+THESIS: dict[str, Any] = {"unit_features": False, "projection": None, "agreement": None, "steps": (0.1, 0.1)}
+COARSE = {**THESIS, "steps": DEFAULT.steps}
 
 
 def _stage(**change: Any) -> dict[str, Any]:
@@ -62,6 +63,8 @@ CHANGES: dict[str, dict[str, Any]] = {
     "without second stage and projection": {"agreement": None, "projection": None},
     "as the thesis (raw sums)": THESIS,
     "as the thesis's code (raw sums, global)": {**THESIS, "normalization": "global"},
+    "as the thesis but for the step": COARSE,
+    "as the thesis's code but for the step": {**COARSE, "normalization": "global"},
     "global": {"normalization": "global"},
     "step 0.5": {"steps": (0.5, 0.5)},
     "step 1.0": {"steps": (1.0, 1.0)},

@@ -1,4 +1,7 @@
-"""Turns distilled weights into the packaged encoders: vocabularies, calibration, golden values, files."""
+"""Turns distilled weights into the packaged encoders: vocabularies, calibration, golden values, files.
+
+With ``--only``, it makes some of the encoders anew for the network that is packaged already, and leaves the rest.
+"""
 
 from __future__ import annotations
 
@@ -78,17 +81,26 @@ def main(
     output: Annotated[Path, typer.Option(help="Where the model files go.")] = PACKAGED,
     images: Annotated[int, typer.Option(min=1, help="Photographs for the vocabularies.")] = VOCABULARY_IMAGES,
     seed: int = 0,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Just these presets, of the network in the output folder.")
+    ] = None,
 ) -> None:
     """Write the network and one encoder file for each preset, and print what they reach."""
+    unknown = set(only or ()) - PRESETS.keys()
+    if unknown:
+        raise typer.BadParameter(f"no preset is named {', '.join(sorted(unknown))}; there are {', '.join(PRESETS)}")
     torch.manual_seed(seed)
     output.mkdir(parents=True, exist_ok=True)
-    tensors = load_file(weights)
+    network = f"{NETWORK}{NETWORK_SUFFIX}"
+    tensors = load_file(output / network if only else weights)
     pictures, tasks = vocabulary_pictures(datasets, images, seed), load_tasks(datasets)
     # The encoders of one network go with it, so all files change together, at the end.
     with TemporaryDirectory(dir=output, prefix="unfinished-") as unfinished:
         folder = Path(unfinished)
-        save_network(folder / f"{NETWORK}{NETWORK_SUFFIX}", student_definition(), tensors)
-        for name, definition in PRESETS.items():
+        if not only:
+            save_network(folder / network, student_definition(), tensors)
+        for name in only or PRESETS:
+            definition = PRESETS[name]
             encoder, vocabulary = build(name, definition, tensors, datasets / "train", pictures, seed)
             calibration, figures = assess(encoder, tasks)
             calibration = encoder.calibration = for_small_maps(encoder, datasets, calibration)

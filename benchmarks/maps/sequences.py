@@ -150,12 +150,15 @@ def costs(encoder: Encoder, places: int, rounds: int) -> dict[str, float]:
 def main(
     data: Annotated[Path, typer.Option(help="Folder of the data sets.")] = Path("../shared/datasets/eval"),
     encoder: str = DEFAULT_ENCODER,
+    models: Annotated[
+        Path | None, typer.Option(help="Folder of further encoders, such as training.vocabularies keeps.")
+    ] = None,
     dataset: Annotated[list[str] | None, typer.Option(help="One of them alone; more than once for several.")] = None,
     places: Annotated[int, typer.Option(min=1000)] = 5000,
     rounds: Annotated[int, typer.Option(min=5)] = 60,
 ) -> None:
     """Print the table and keep the figures."""
-    chosen = EncoderCatalogue().get(encoder)
+    chosen = EncoderCatalogue(models).get(encoder)
     rows: list[tuple[object, ...]] = []
     figures: dict[str, Any] = {"encoder": chosen.identity, "recall": {}, "milliseconds": {}}
     for name in dataset if dataset is not None else list(TRAVERSES):

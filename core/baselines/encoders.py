@@ -24,10 +24,13 @@ _CAMAL = (
     "Khaliq, Ehsan, Milford, McDonald-Maier: CAMAL: Context-Aware Multi-layer Attention framework "
     "for Lightweight Environment Invariant Visual Place Recognition, 2019"
 )
+LOCAL_AGREEMENT = " with local agreement"
+"""Names the second stage in titles."""
+
 TITLES = {
-    "m-region-vlad": "M-Region-VLAD",
+    "m-region-vlad": f"M-Region-VLAD{LOCAL_AGREEMENT}",
     "m-region-vlad-thesis": "M-Region-VLAD as in the thesis",
-    "region-vlad": "Region-VLAD",
+    "region-vlad": "Region-VLAD as in the thesis",
 }
 PAPERS = {
     "m-region-vlad": _CAMAL,

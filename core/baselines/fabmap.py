@@ -37,14 +37,19 @@ Observations = NDArray[np.bool_]
 Reals = NDArray[np.float64]
 
 V = 4000
-LONGEST_SIDE = 640
+LONGEST_SIDE, LEAST_LONGEST_SIDE = 640, 320
+"""Pixels of a frame's longer side: a larger frame is shrunk, and a smaller one enlarged, which hardly has a feature."""
+CONTRAST = 0.02
+"""SIFT's threshold; OpenCV's 0.04 leaves less than a hundred features of a small frame.  Both were chosen in view of
+corridor."""
 P_Z_GIVEN_E, P_Z_GIVEN_NOT_E = 0.39, 0.0
 """The detector: the probability that a word is observed where its cause is present, and where it is absent."""
 
 CONSTANTS: Constants = {
     "V": V,
     "features": "SIFT",
-    "longest_side": LONGEST_SIDE,
+    "longest_side": (LEAST_LONGEST_SIDE, LONGEST_SIDE),
+    "contrast": CONTRAST,
     "p(z|e)": P_Z_GIVEN_E,
     "p(z|not e)": P_Z_GIVEN_NOT_E,
     "new_place": "mean field",
@@ -128,12 +133,17 @@ def chow_liu(observations: Observations) -> Tree:
 
 
 def local_features(pixels: Pixels) -> Array:
-    """SIFT descriptors, float32 [T, 128] of whole numbers to 255; T may be 0.  A large frame is shrunk first."""
+    """SIFT descriptors, float32 [T, 128] of whole numbers to 255; T may be 0.
+
+    A large frame is shrunk first, a small one enlarged.
+    """
     grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    scale = LONGEST_SIDE / max(grey.shape)
-    if scale < 1:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, descriptors = cv2.SIFT.create().detectAndCompute(grey, None)
+    side = max(grey.shape)
+    scale = min(max(side, LEAST_LONGEST_SIDE), LONGEST_SIDE) / side
+    if scale != 1:
+        method = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=method)
+    _, descriptors = cv2.SIFT.create(contrastThreshold=CONTRAST).detectAndCompute(grey, None)
     return np.empty((0, 128), np.float32) if descriptors is None else np.asarray(descriptors, np.float32)
 
 

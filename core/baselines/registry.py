@@ -23,9 +23,18 @@ from core.baselines import (
     seqslam,
 )
 from core.baselines.encoders import EncoderSystem, about_encoder
+from core.baselines.stages import (
+    FIRST_STAGE,
+    VERIFIED,
+    VerifiedSystem,
+    about_first_stage,
+    about_verified,
+    first_stage,
+)
 from core.baselines.system import About, Resources, System
 from core.errors import InvalidModel, MissingWeights, UnknownEncoder
-from core.method.catalogue import EncoderCatalogue
+from core.method.catalogue import EncoderCatalogue, EncoderSummary
+from core.networks.network import load_network
 
 
 @dataclass(frozen=True)
@@ -64,16 +73,32 @@ BASELINES: tuple[Baseline, ...] = (
 
 
 def systems(models: EncoderCatalogue) -> list[About]:
-    """All systems that ``build`` knows, without reading weights: installed encoders, the default first, then others."""
-    own = [about_encoder(summary) for summary in sorted(models.describe(), key=lambda summary: not summary.default)]
+    """All systems that ``build`` knows, without reading weights: installed encoders, the default first, then others.
+
+    An encoder of two stages stands there with one and with three, too.
+    """
+    summaries = sorted(models.describe(), key=lambda summary: not summary.default)
+    names = {summary.name for summary in summaries}
+    own = []
+    for summary in summaries:
+        about = about_encoder(summary)
+        own.append(about)
+        if has_second_stage(summary):
+            own += [other for other in (about_first_stage(about), about_verified(about)) if other.name not in names]
     return own + [baseline.about for baseline in BASELINES]
+
+
+def has_second_stage(summary: EncoderSummary) -> bool:
+    """Whether an installed encoder compares cells of frames, too."""
+    return summary.definition is not None and summary.definition.agreement is not None
 
 
 def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -> System:
     """Make a system ready to describe frames, or to be trained first if it is ``Trainable``.
 
     Args:
-        name: of a system, or the name or identity of an installed encoder.
+        name: of a system, or the name or identity of an installed encoder.  With ``.first-stage`` behind the name of
+            an encoder of two stages, it has only the first; with ``.verified``, a third.
         weights: the file that the system needs; for a system that runs on the packaged network,
             another network file to run on.
 
@@ -94,10 +119,19 @@ def build(name: str, *, models: EncoderCatalogue, weights: Path | None = None) -
 
 def _encoder(name: str, models: EncoderCatalogue, weights: Path | None) -> System:
     summaries = {summary.name: summary for summary in models.describe()}
-    summary = summaries.get(name.partition("@")[0])
+    asked, stages = name, ""
+    for ending in (FIRST_STAGE, VERIFIED):
+        whole = summaries.get(name.removesuffix(ending))
+        if name not in summaries and whole is not None and has_second_stage(whole):
+            asked, stages = whole.name, ending
+    summary = summaries.get(asked.partition("@")[0])
     if summary is None:
-        known = [*summaries, *(baseline.about.name for baseline in BASELINES)]
+        known = [about.name for about in systems(models)]
         raise UnknownEncoder(f"no system {name[:80]!r} is known; there are {', '.join(known)}.")
     if weights is not None:
         raise InvalidModel(f"{summary.name} is an installed encoder and takes no file of weights.")
-    return EncoderSystem(models.get(name), about_encoder(summary))
+    encoder, about = models.get(asked), about_encoder(summary)
+    if stages == FIRST_STAGE:
+        network = load_network(models.network_file(summary.network), encoder.definition.layers)
+        return EncoderSystem(first_stage(encoder, network), about_first_stage(about))
+    return VerifiedSystem(EncoderSystem(encoder, about)) if stages else EncoderSystem(encoder, about)

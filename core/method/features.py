@@ -31,7 +31,7 @@ class FeatureDefinition(BaseModel):
     """Which regions are taken from which layers (method, sections 3 and 4).
 
     ``steps`` are the quantisation steps, one a layer, in units of its activations.
-    ``unit_features`` scales each regional feature to unit length before anything else.
+    ``unit_features`` scales each regional feature to unit length before anything else, which the thesis does not.
     ``projection`` is to how many values regional features are projected (``projection.py``); None: not at all.
     ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
     network through its biases alone, and what looks like regions says nothing of the scene.

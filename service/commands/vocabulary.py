@@ -76,7 +76,10 @@ def train(
         ),
     ] = None,
     unit_features: Annotated[
-        bool, typer.Option("--unit-features/--raw", help="Scale each regional feature to unit length.")
+        bool,
+        typer.Option(
+            "--unit-features/--raw", help="Scale each regional feature to unit length, which the thesis does not."
+        ),
     ] = True,
     gamma: Annotated[float, typer.Option(min=0.01, max=1.0, help="Exponent of the power normalisation.")] = 0.5,
     normalization: Annotated[Literal["intra", "global"], typer.Option(help="Of the VLAD.")] = "intra",

@@ -129,12 +129,23 @@ def test_a_blank_frame_and_a_single_place_have_scores() -> None:
     assert np.isfinite(system.index([system.describe(scene(1))]).score([blank])).all()
 
 
-def test_large_frames_are_shrunk_first() -> None:
-    grey = cv2.resize(scene(1)[:, :, 0], (1280, 960), interpolation=cv2.INTER_CUBIC)
-    shrunk = cv2.resize(grey, (640, 480), interpolation=cv2.INTER_AREA)
-    large, small = (local_features(np.asarray(np.dstack([image] * 3), np.uint8)) for image in (grey, shrunk))
-    assert len(small) > 10
-    np.testing.assert_array_equal(large, small)
+@pytest.mark.parametrize(
+    ("given", "seen", "method"),
+    [((1280, 960), (640, 480), cv2.INTER_AREA), ((160, 120), (320, 240), cv2.INTER_CUBIC), ((400, 300),) * 2 + (None,)],
+)
+def test_large_frames_are_shrunk_and_small_ones_enlarged(
+    given: tuple[int, int], seen: tuple[int, int], method: int | None
+) -> None:
+    grey = cv2.resize(scene(1)[:, :, 0], given, interpolation=cv2.INTER_CUBIC)
+    resized = grey if method is None else cv2.resize(grey, seen, interpolation=method)
+    found, expected = (local_features(np.asarray(np.dstack([image] * 3), np.uint8)) for image in (grey, resized))
+    assert len(expected) > 10
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_a_frame_of_corridors_size_has_features_enough() -> None:
+    grey = cv2.cvtColor(scene(1), cv2.COLOR_BGR2GRAY)
+    assert len(local_features(scene(1))) > 2 * len(cv2.SIFT.create().detectAndCompute(grey, None)[0])
 
 
 def test_a_system_without_training_or_features_says_so() -> None:

@@ -1,0 +1,102 @@
+"""An encoder with its first stage alone, and with geometric verification as a third."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from core.baselines.encoders import EncoderSystem
+from core.baselines.registry import build, systems
+from core.baselines.stages import CANDIDATES, WEIGHT, ThreeStages, VerifiedSystem, keypoints_in
+from core.baselines.system import Array, Description
+from core.errors import InvalidModel, UnknownEncoder
+from core.geometry.keypoints import Keypoints
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from tests.service.scenes import blank, scene, seen_again
+
+
+@pytest.fixture(scope="module")
+def models() -> EncoderCatalogue:
+    return EncoderCatalogue()
+
+
+def test_the_first_stage_gives_the_encoders_vectors_and_their_mean_cosines(models: EncoderCatalogue) -> None:
+    system, encoder = build(f"{DEFAULT_ENCODER}.first-stage", models=models), models.get(DEFAULT_ENCODER)
+    assert isinstance(system, EncoderSystem)
+    frames = [scene(0), scene(1), seen_again(scene(0))]
+    described, encoded = [system.describe(frame) for frame in frames], [encoder.encode(frame) for frame in frames]
+    vectors = np.stack([one.descriptor for one in encoded])
+    np.testing.assert_allclose(np.stack([one.arrays["descriptor"] for one in described]), vectors, atol=1e-5)
+    assert all(set(one.arrays) == {"descriptor"} for one in described)
+    scores = system.index(described).score(described)
+    np.testing.assert_allclose(scores, vectors @ vectors.T / encoder.definition.words, atol=1e-5)
+    assert system.encoder.calibration.curve is None  # the default's is of both stages
+
+
+def test_names_and_titles_say_which_stages_there_are(models: EncoderCatalogue) -> None:
+    titles = {about.name: about.title for about in systems(models)}
+    assert titles[DEFAULT_ENCODER] == "M-Region-VLAD with local agreement"
+    assert titles[f"{DEFAULT_ENCODER}.first-stage"] == "M-Region-VLAD, first stage alone"
+    assert titles[f"{DEFAULT_ENCODER}.verified"] == "M-Region-VLAD with local agreement and verification"
+    shown = {about.name: about.configuration for about in systems(models)}
+    assert not any(name.startswith("agreement.") for name in shown[f"{DEFAULT_ENCODER}.first-stage"])
+    assert shown[f"{DEFAULT_ENCODER}.verified"]["verification.candidates"] == CANDIDATES
+    # Encoders of one stage have no others.
+    assert "region-vlad" in titles and "region-vlad.first-stage" not in titles and "region-vlad.verified" not in titles
+
+
+@pytest.mark.parametrize("ending", [".first-stage", ".verified"])
+def test_each_has_an_identity_of_its_own(ending: str, models: EncoderCatalogue) -> None:
+    system = build(DEFAULT_ENCODER + ending, models=models)
+    assert system.identity.startswith(f"{DEFAULT_ENCODER}{ending}@")
+    assert system.identity == build(DEFAULT_ENCODER + ending, models=EncoderCatalogue()).identity
+
+
+@pytest.mark.parametrize("name", ["region-vlad.verified", "nothing.verified", ".first-stage", "hog.verified"])
+def test_only_encoders_of_two_stages_have_others(name: str, models: EncoderCatalogue) -> None:
+    with pytest.raises(UnknownEncoder, match="no system"):
+        build(name, models=models)
+
+
+def test_variants_take_no_file_of_weights(models: EncoderCatalogue) -> None:
+    with pytest.raises(InvalidModel, match="no file of weights"):
+        build(f"{DEFAULT_ENCODER}.verified", models=models, weights=models.network_file("placerec-hybrid"))
+
+
+def test_verification_adds_the_share_of_inliers(models: EncoderCatalogue) -> None:
+    plain, system = (build(DEFAULT_ENCODER + ending, models=models) for ending in ("", ".verified"))
+    assert isinstance(system, VerifiedSystem) and not system.sequential
+    places, query = [scene(0), scene(1), blank()], seen_again(scene(0))
+    described = [system.describe(frame) for frame in places]
+    assert described[0].milliseconds["keypoints"] > 0
+    scores = system.index(described).score([system.describe(query)])
+    without = plain.index([plain.describe(frame) for frame in places]).score([plain.describe(query)])
+    gains = (scores - without)[0]
+    assert scores.shape == (1, 3) and scores.dtype == np.float32
+    assert 0.05 < gains[0] <= WEIGHT  # it shows the scene
+    assert gains[1] < 0.5 * gains[0] and gains[2] == 0  # another scene, and a place without keypoints
+    assert len(keypoints_in(described[2])) == 0
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """An index with scores that are known."""
+
+    scores: Array
+
+    def score(self, queries: Sequence[Description]) -> Array:
+        return np.repeat(self.scores[None], len(queries), axis=0)
+
+
+def test_only_the_best_places_are_verified(models: EncoderCatalogue) -> None:
+    system = build(f"{DEFAULT_ENCODER}.verified", models=models)
+    described = system.describe(scene(0))
+    place = keypoints_in(described)
+    assert isinstance(place, Keypoints) and len(place) > 50
+    scores = np.linspace(0.9, 0.1, CANDIDATES + 3).astype(np.float32)
+    gains = ThreeStages(Fixed(scores), [place] * len(scores)).score([described])[0] - scores
+    np.testing.assert_allclose(gains[CANDIDATES:], 0)
+    assert (gains[:CANDIDATES] > 0.5 * WEIGHT).all()  # each is the same picture
