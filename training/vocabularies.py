@@ -24,10 +24,11 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import track
 
-from core.baselines.stages import CANDIDATES, verified_gains
+from core.baselines.stages import verified_gains
 from core.disk.files import replacing
 from core.frames.preprocessing import Pixels
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.judgement.curves import auc_pr
 from core.method.catalogue import (
     DEFAULT_ENCODER,
@@ -41,6 +42,7 @@ from core.method.encoder import Encoder
 from core.method.presets import NETWORK
 from core.method.vocabulary import pool_features, train_vocabulary
 from core.networks.xfeat import XFeat, load_xfeat
+from core.recognition.verification import CANDIDATES
 from training.packaging import VOCABULARY_IMAGES, vocabulary_pictures
 from training.validation import (
     DISTRACTORS,

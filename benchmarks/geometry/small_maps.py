@@ -66,7 +66,7 @@ def asked(task: Task, scores: NDArray[np.float32], size: int) -> Answers:
         for query in thinned(known, KNOWN) + thinned(strangers, STRANGERS):
             best = kept[np.argsort(-scores[query, kept], kind="stable")[:CANDIDATES]]
             found = verify(task.queries.keypoints[query], [task.references.keypoints[place] for place in best])
-            shares = np.array([one.inlier_count / max(1, min(one.keypoints)) for one in found])
+            shares = np.array([one.inlier_share for one in found])
             first = int((scores[query, best] + WEIGHT * shares).argmax())
             rows.append((found[first].evidence, bool(task.truth[query, best[first]]), bool(known[query])))
     evidence, right, kinds = zip(*rows, strict=True)

@@ -249,7 +249,7 @@ def verified(encoder: Encoder, task: Task, kept: NDArray[np.int64], store: Store
         missing = [place for place in places.tolist() if (row, place) not in store]
         found = verify(task.queries.keypoints[row], [task.references.keypoints[place] for place in missing])
         for place, one in zip(missing, found, strict=True):
-            share = one.inlier_count / max(1, min(one.keypoints))
+            share = one.inlier_share
             store[row, place] = (len(one.matches), one.inlier_count, one.evidence, one.spread, share)
         figures[:, row] = np.array([store[row, place] for place in places.tolist()]).T
     apart = np.abs(kept[order] - kept[order[:, :1]]) > task.frames

@@ -17,24 +17,20 @@ from numpy.typing import NDArray
 from core.baselines.encoders import LOCAL_AGREEMENT, EncoderSystem
 from core.baselines.system import About, Array, Description, Index, system_identity
 from core.frames.preprocessing import Pixels
-from core.geometry import keypoints, verification
-from core.geometry.keypoints import ROW, Keypoints, find_keypoints, keypoints_of
+from core.geometry import detection, keypoints, verification
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints, keypoints_of
 from core.geometry.verification import verify
+from core.judgement.geometry import WEIGHT
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder
 from core.method.features import FeatureExtractor
 from core.method.vocabulary import Vocabulary
 from core.networks.network import ShallowNetwork
 from core.networks.xfeat import load_xfeat
+from core.recognition.verification import CANDIDATES
 
 FIRST_STAGE, VERIFIED = ".first-stage", ".verified"
-
-CANDIDATES = 10
-"""How many of the best places are verified: five lose on lip6, fifteen gain next to nothing."""
-
-WEIGHT = 0.7
-"""What the share of a picture's keypoints that are inliers is worth, in units of the score; fitted on training pictures
-(``benchmarks.geometry.verification``)."""
 
 NOTHING = Calibration(source="encoder-default", threshold=0, margin=0, background_mean=0, background_deviation=1)
 """The calibration of an encoder with its second stage says nothing of its first alone."""
@@ -63,7 +59,7 @@ def about_verified(about: About) -> About:
     """A two-stage encoder and geometric verification."""
     constants = {
         "keypoints": keypoints.MOST,
-        "longest_side": keypoints.LONGEST_SIDE,
+        "longest_side": detection.LONGEST_SIDE,
         "least_cosine": verification.LEAST_COSINE,
         "candidates": CANDIDATES,
         "weight": WEIGHT,
@@ -79,7 +75,7 @@ def about_verified(about: About) -> About:
 
 
 class VerifiedSystem:
-    """An encoder whose best places are verified; a frame has the encoder's arrays and its keypoints, uint8 [39 178]."""
+    """An encoder whose best places are verified; a frame has the encoder's arrays and the record of its keypoints, uint8."""
 
     sequential = False
 
@@ -90,9 +86,9 @@ class VerifiedSystem:
 
     def describe(self, pixels: Pixels) -> Description:
         described, began = self._system.describe(pixels), time.perf_counter()
-        row = np.frombuffer(find_keypoints(self._network, pixels).row().tobytes(), np.uint8)
+        record = np.frombuffer(find_keypoints(self._network, pixels).record(), np.uint8)
         spent = 1e3 * (time.perf_counter() - began)
-        return Description({**described.arrays, "keypoints": row}, {**described.milliseconds, "keypoints": spent})
+        return Description({**described.arrays, "keypoints": record}, {**described.milliseconds, "keypoints": spent})
 
     def index(self, references: Sequence[Description]) -> Index:
         return ThreeStages(self._system.index(references), [keypoints_in(reference) for reference in references])
@@ -116,11 +112,9 @@ class ThreeStages:
 def verified_gains(query: Keypoints, places: Sequence[Keypoints]) -> NDArray[np.float32]:
     """What verification adds to the scores of k places, float32 [k]: ``WEIGHT`` times the share of the keypoints that
     are inliers, of the picture that has fewer."""
-    found = verify(query, places)
-    shares = [one.inlier_count / max(1, min(one.keypoints)) for one in found]
-    return WEIGHT * np.array(shares, np.float32)
+    return WEIGHT * np.array([one.inlier_share for one in verify(query, places)], np.float32)
 
 
 def keypoints_in(description: Description) -> Keypoints:
     """The keypoints of a described frame."""
-    return keypoints_of(np.frombuffer(description.arrays["keypoints"].tobytes(), ROW)[0])
+    return keypoints_of(description.arrays["keypoints"].tobytes())

@@ -10,11 +10,13 @@ import pytest
 
 from core.baselines.encoders import EncoderSystem
 from core.baselines.registry import build, systems
-from core.baselines.stages import CANDIDATES, WEIGHT, ThreeStages, VerifiedSystem, keypoints_in
+from core.baselines.stages import ThreeStages, VerifiedSystem, keypoints_in
 from core.baselines.system import Array, Description
 from core.errors import InvalidModel, UnknownEncoder
 from core.geometry.keypoints import Keypoints
+from core.judgement.geometry import WEIGHT
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.recognition.verification import CANDIDATES
 from tests.service.scenes import blank, scene, seen_again
 
 
