@@ -75,7 +75,7 @@ def about_verified(about: About) -> About:
 
 
 class VerifiedSystem:
-    """An encoder whose best places are verified; a frame has the encoder's arrays and the record of its keypoints, uint8."""
+    """An encoder whose best places are verified; a frame has the encoder's arrays and its keypoints' record, uint8."""
 
     sequential = False
 
