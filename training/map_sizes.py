@@ -95,7 +95,8 @@ class Pairs:
     def verified(self, query: int, places: Positions) -> Geometry:
         """What was found of some references, int64 [n], in their order."""
         missing = places[np.isnan(self.evidence[query, places])]
-        found = verification.verify(self.queries[query], [self.references[place] for place in missing.tolist()])
+        candidates = [self.references[place] for place in missing.tolist()]
+        found = verification.verify(self.queries[query], candidates) if candidates else []
         for place, one in zip(missing.tolist(), found, strict=True):
             self.evidence[query, place] = one.evidence
             self.share[query, place] = one.inlier_count / max(1, min(one.keypoints))
