@@ -37,6 +37,11 @@ def record_bytes(count: int) -> int:
     return _HEADER.size + _EACH * count
 
 
+def count_of(size: int) -> int:
+    """How many keypoints a record of so many bytes has."""
+    return (size - _HEADER.size) // _EACH
+
+
 @dataclass(frozen=True)
 class Keypoints:
     """The n keypoints of a frame, best first; 0 <= n <= MOST.

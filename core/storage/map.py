@@ -23,12 +23,13 @@ from core.errors import (
     UnknownSequence,
 )
 from core.frames.images import Limits, decode, encode_thumbnail
+from core.geometry.keypoints import Keypoints
 from core.places import Place, PlaceFields
 from core.storage.archives.exporter import Exporter
 from core.storage.attributes import Attributes
 from core.storage.cameras import Cameras
 from core.storage.counterparts import Counterparts
-from core.storage.database import ledger
+from core.storage.database import keypoints, ledger
 from core.storage.database.connections import DatabaseClosed
 from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, open_map
@@ -36,6 +37,7 @@ from core.storage.pagination import page_of_places, page_of_sequences
 from core.storage.records import (
     Change,
     Enrolment,
+    KeptFrame,
     MapRecord,
     SameFrame,
     SequenceSummary,
@@ -45,7 +47,7 @@ from core.storage.records import (
 )
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.tiers import IndexStatus, StorageStatus, storage_of, unopened
+from core.storage.search.tiers import IndexStatus, KeypointsStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
 from core.storage.verification import Progress, inspect, no_progress
 from core.storage.writing import FailedWrites, Write, check_enrolment
@@ -113,6 +115,7 @@ class Map:
         self._end: PlacerecError | None = None
         self._failed_writes = FailedWrites(folder)
         self._recent_places = RecentPlaces()
+        self._keypoints_of: tuple[object, KeypointsStatus | None] = (None, None)  # in a state of the database
         self.indexer: Indexer | None = None
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
@@ -258,7 +261,19 @@ class Map:
     def storage_status(self) -> StorageStatus:
         """How much room the map takes on disk."""
         with self._guarded("read"):
-            return storage_of(self._folder, self._record.precision, self.count_places())
+            return storage_of(self._folder, self._record.precision, self.count_places(), self._keypoints_status())
+
+    def _keypoints_status(self) -> KeypointsStatus | None:
+        """How many places have keypoints; None while the map is not read from disk."""
+        opened = self._opened
+        if opened is None:
+            return None
+        state, known = opened.database.state, self._keypoints_of
+        if known[0] is not state:
+            with self._reading() as connection:
+                places, size = keypoints.room(connection)
+            known = self._keypoints_of = (state, KeypointsStatus(places=places, bytes=size))
+        return known[1]
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
@@ -368,6 +383,20 @@ class Map:
             stored = ledger.expect(write.connection, place_id)
             return write.set_fields(stored, patched_fields(stored.place, changes))[0]
 
+    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+        """Store the keypoints of places that :meth:`without_keypoints` listed, with one COMMIT.
+
+        A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
+        places of a map whose setting ``verification`` is off.
+
+        Returns:
+            How many were stored.
+        """
+        if not found:
+            return 0
+        with self._writing() as write:
+            return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
+
     def forget(self, place_id: str) -> None:
         """Delete a place.
 
@@ -451,6 +480,28 @@ class Map:
         with self._reading() as connection:
             found = ledger.rows_of_places(connection, list(place_ids))
         return [found.get(place_id) for place_id in place_ids]
+
+    def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
+        """The keypoints of the places of rows that a search returned, read from disk.
+
+        Returns:
+            In the order of ``rows``; None where a place was deleted or got another frame since, where none are kept,
+            and where those that are kept are damaged, which is logged.
+        """
+        wanted = [int(row) for row in rows]
+        with self._reading() as connection:
+            found = keypoints.at_rows(connection, wanted)
+        return [found.get(row) for row in wanted]
+
+    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+        """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
+
+        Args:
+            after: the number of the last place of the page before; 0 for the first page.
+            limit: how many places are listed at most; fewer if there are no further ones.
+        """
+        with self._reading() as connection:
+            return keypoints.frames_without(connection, after, limit)
 
     def picture(self, place_id: str) -> bytes | None:
         """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.errors import InvalidField
+from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Timestamp
 from core.storage.files.row_formats import Precision
@@ -97,6 +98,7 @@ class Enrolment:
     regions: how many regions of interest the frame has.
     digest: SHA-256 of the image's bytes, 32 bytes.
     thumbnail, image: a small JPEG of the frame, and the bytes as received; the map stores what ``keep`` says.
+    keypoints: of the frame; stored if the map's setting ``verification`` says so.  None: they were not looked for.
     """
 
     id: str
@@ -107,6 +109,7 @@ class Enrolment:
     local: NDArray[np.int8] = field(default_factory=lambda: np.empty((0, 0), np.int8))
     thumbnail: bytes | None = None
     image: bytes | None = None
+    keypoints: Keypoints | None = None
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,22 @@ class SameFrame:
     id: str
     fields: PlaceFields
     digest: bytes
+
+
+@dataclass(frozen=True)
+class KeptFrame:
+    """A place whose frame is kept, from which its keypoints can be found.
+
+    number: grows in the order of enrolment.
+    digest: SHA-256 of its image and of its camera's mask, 32 bytes.
+    picture: what is kept; keypoints found in a thumbnail are those of a smaller picture, as their width and height say.
+    """
+
+    number: int
+    id: str
+    digest: bytes
+    camera: str | None
+    picture: Literal["thumbnail", "image"]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage
 from core.index.flat import vectors
-from core.storage.database import row_checksums
+from core.storage.database import keypoints, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
 from core.storage.database.ledger import SegmentEntry, segment_entries
@@ -94,8 +94,8 @@ def inspect(
 ) -> VerifyReport:
     """Check a map's files against each other and, if the map is in service, against its snapshot.
 
-    This checks SQLite's integrity, the checksums of rows and descriptors, the rows that places refer to, the digests of
-    pictures and the index files, and that the snapshot is what is stored.
+    This checks SQLite's integrity, the checksums of rows, descriptors and keypoints, the rows that places refer to, the
+    digests of pictures and the index files, and that the snapshot is what is stored.
 
     Args:
         connection: in a transaction of the moment of the snapshot.  The transaction is ended before descriptors are
@@ -117,6 +117,8 @@ def inspect(
         (findings.places,) = connection.execute("SELECT count(*) FROM places").fetchone()
         with findings.noting():
             _check_pictures(connection, findings)
+        with findings.noting():
+            _check_keypoints(connection, findings)
         if snapshot is not None:
             with findings.noting():
                 _check_locations(connection, snapshot, findings)
@@ -166,6 +168,16 @@ def _check_pictures(connection: sqlite3.Connection, findings: _Findings) -> None
         # The digest of a place with a camera covers its image and the camera's mask.
         if found != digest or (kind == "image" and camera is None and found != source_digest):
             findings.problems.append(f"{FILE}: the {kind} of place {place!r} does not match its digest")
+
+
+def _check_keypoints(connection: sqlite3.Connection, findings: _Findings) -> None:
+    """Check all keypoints; those of no place are found with the foreign keys."""
+    findings.checked_bytes += keypoints.room(connection)[1]
+    places = keypoints.damaged(connection)
+    for place in places[:_MOST_LISTED]:
+        findings.problems.append(f"{FILE}: the keypoints of place {place!r} do not match their checksum")
+    if len(places) > _MOST_LISTED:
+        findings.problems.append(f"{FILE}: the same is true of {len(places) - _MOST_LISTED} more places")
 
 
 def _check_descriptors(

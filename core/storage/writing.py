@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
+from core.geometry.keypoints import Keypoints
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, check_place_id, microseconds
-from core.storage.database import ledger
+from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
 from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap
-from core.storage.records import Change, Enrolment, History, Keep, MapRecord, SameFrame
+from core.storage.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
 
@@ -143,6 +144,8 @@ class Write:
         """
         stored = ledger.find(self.connection, item.id)
         if stored is not None and stored.digest == item.digest:
+            if item.keypoints is not None and not keypoints.are_kept(self.connection, stored.number):
+                self._put_keypoints(stored, item.keypoints)
             return self.set_fields(stored, item.fields)
         row = self._snapshot.rows + self._appended
         if self._appended == len(self._records):
@@ -155,11 +158,26 @@ class Write:
             now_stored = ledger.insert(self.connection, item, row, checksum, keep, self._now)
         else:
             ledger.replace_descriptor(self.connection, stored, item, row, checksum, keep)
+            keypoints.delete(self.connection, stored.number)
             now_stored = ledger.set_fields(self.connection, stored, item.fields, self._now)
             self._mark_dead(stored.row)
+        if item.keypoints is not None:
+            self._put_keypoints(now_stored, item.keypoints)
         self._appended += 1
         self._locations.append(_location(now_stored))
         return now_stored.place, "created" if stored is None else "replaced"
+
+    def _put_keypoints(self, stored: StoredPlace, found: Keypoints) -> None:
+        if self.record.verification:
+            keypoints.put(self.connection, stored.number, stored.digest, found.record())
+
+    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+        """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
+        stored = ledger.find(self.connection, frame.id)
+        if stored is None or stored.digest != frame.digest or keypoints.are_kept(self.connection, stored.number):
+            return False
+        self._put_keypoints(stored, found)
+        return self.record.verification
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""

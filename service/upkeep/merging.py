@@ -224,7 +224,7 @@ def _places_before(context: JobContext, map_: Map) -> list[Outline]:
 
 
 def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> None:
-    """Copy the places that are missing, and then those that changed in the other map meanwhile."""
+    """Copy the places that are missing, then those that changed in the other map meanwhile, and their stations."""
     for _ in range(ROUNDS):
         context.check_cancelled()
         here = {place.id: place.digest for place in map_.transfer.outline()}
@@ -232,7 +232,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
         coming = [(place, name) for place, name in plan.coming if name in context.notes["coming"]]
         due = [(place, name) for place, name in coming if here.get(name) != place.digest]
         if not due:
-            return
+            break
         names = context.notes["report"]["renamed"]
         for camera in other.cameras.all():
             name = names["cameras"].get(camera.name, camera.name)
@@ -246,6 +246,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
                 free = _still_free(context, map_, due[first : first + PLACES_PER_COMMIT])
                 _copy(context, map_, other, snapshot, free)
             context.progress(len(coming) - len(due) + min(first + PLACES_PER_COMMIT, len(due)), len(coming))
+    map_.counterparts.copy(other.counterparts, {place.id: name for place, name in coming})
 
 
 def _still_free(context: JobContext, map_: Map, due: Sequence[tuple[Outline, str]]) -> list[tuple[Outline, str]]:
@@ -274,8 +275,9 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
     ready = [(p, name) for p, name in due if p.id in found and found[p.id][1] == p.row < snapshot.rows]
     rows = np.array([place.row for place, _ in ready], np.int64)
     descriptors, local = snapshot.descriptors_at(rows), snapshot.locals_at(rows)
+    keypoints = other.keypoints_at([place.row for place, _ in ready])
     items = []
-    for (place, name), descriptor, cells in zip(ready, descriptors, local, strict=True):
+    for (place, name), descriptor, cells, of_frame in zip(ready, descriptors, local, keypoints, strict=True):
         stored = found[place.id][0]
         fields = {field: getattr(stored, field) for field in PlaceFields.model_fields}
         if stored.sequence is not None:
@@ -292,6 +294,7 @@ def _copy(context: JobContext, map_: Map, other: Map, snapshot: Snapshot, due: S
             local=cells,
             thumbnail=picture if stored.picture == "thumbnail" else None,
             image=picture if stored.picture == "image" else None,
+            keypoints=of_frame,
         )
         ordinal = ends.get(fields["sequence"] or "", 0) + place.ordinal
         items.append((item, History(stored.picture, ordinal, stored.created_at, stored.updated_at)))

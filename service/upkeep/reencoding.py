@@ -15,6 +15,7 @@ import numpy as np
 
 from core.errors import InvalidImage, MapExists, NoRegions, PlacerecError, UnknownCamera, UnknownMap
 from core.frames.masks import Mask
+from core.geometry.keypoints import Keypoints
 from core.places import PlaceFields
 from core.storage import Enrolment, History, Map
 from core.storage.transfer import Outline
@@ -158,10 +159,11 @@ class _Reencoding:
         fields = self.source.transfer.find([place.id for place in (*new, *known)])
         ready = [place for place in new if place.id in fields and fields[place.id][1] == place.row]
         frames = [images[place.id] or b"" for place in ready]
+        keypoints = self.source.keypoints_at([place.row for place in ready])  # they do not depend on the encoder
         masks = [self._mask(place.camera) for place in ready]
         outcomes = encode_after_requests(self.engine, self.context, self.identity, frames, masks) if ready else []
         items: list[tuple[Enrolment, History]] = []
-        for place, image, outcome in zip(ready, frames, outcomes, strict=True):
+        for place, image, found, outcome in zip(ready, frames, keypoints, outcomes, strict=True):
             try:
                 if isinstance(outcome, Exception):
                     raise outcome
@@ -171,9 +173,9 @@ class _Reencoding:
             except (InvalidImage, NoRegions) as error:
                 self.left_out[place.id] = (place, str(error))
                 continue
-            described = (encoding.descriptor, len(encoding.regions), encoding.local, image)
+            described = (encoding.descriptor, len(encoding.regions), encoding.local, image, found)
             items.append(self._item(place, fields, *described))
-        nothing = np.empty(0, np.float32), 0, np.empty((0, 0), np.int8), None
+        nothing = np.empty(0, np.float32), 0, np.empty((0, 0), np.int8), None, None
         items += [self._item(place, fields, *nothing) for place in known if place.id in fields]
         self.made.transfer.adopt(items)
 
@@ -185,10 +187,11 @@ class _Reencoding:
         regions: int,
         local: Any,
         image: bytes | None,
+        keypoints: Keypoints | None,
     ) -> tuple[Enrolment, History]:
         stored = fields[place.id][0]
         kept = PlaceFields(**{name: getattr(stored, name) for name in PlaceFields.model_fields})
-        item = Enrolment(place.id, kept, descriptor, regions, place.digest, local, image=image)
+        item = Enrolment(place.id, kept, descriptor, regions, place.digest, local, image=image, keypoints=keypoints)
         return item, History("image", place.ordinal, stored.created_at, stored.updated_at)
 
     def _mask(self, camera: str | None) -> Mask | None:
@@ -203,6 +206,8 @@ class _Reencoding:
         for camera in self.source.cameras.all():
             if camera.name not in masks or masks[camera.name] != camera.mask:
                 self.made.cameras.put(camera.name, camera.mask)
+        names = {place.id: place.id for place in self.made.transfer.outline()}
+        self.made.counterparts.copy(self.source.counterparts, names)
         named = [{"id": place.id, "detail": why} for place, why in list(self.left_out.values())[:MOST_LISTED]]
         result = {
             "map": self.target,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from core.storage import Atlas, Map
+from tests.durability.model import GONE
 
 SETTLING_SECONDS = 60.0
 
@@ -73,13 +74,19 @@ def _places(map_: Map) -> list[dict[str, Any]]:
             break
     assert list(by_id) == [place.id for place in outline], "the two listings differ"
     found, rankings = [], snapshot.search_batch(descriptors)
+    keypoints, where = map_.keypoints_at(rows.tolist()), snapshot.whereabouts.take(rows)
+    tracks = {code: place.sequence for code, place in zip(where.sequence.tolist(), outline, strict=True)}
+    own = (where.track == where.sequence) & (where.station == where.ordinal)
     for position, place in enumerate(outline):
-        picture = map_.picture(place.id)
+        picture, of_frame = map_.picture(place.id), keypoints[position]
+        track = [tracks.get(int(where.track[position]), GONE), int(where.station[position])]
         found.append({
             **by_id[place.id],
             "digest": place.digest.hex(),
             "ordinal": place.ordinal,
             "kept": None if picture is None else sha(picture),
+            "keypoints": None if of_frame is None else sha(of_frame.record()),
+            "track": None if own[position] else track,
             "descriptor": sha(descriptors[position].tobytes()),
             "local": sha(local[position].tobytes()),
             "found_first": shown[int(rankings[position][0][0])],

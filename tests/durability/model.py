@@ -46,11 +46,23 @@ class Shown:
     image: Any
     descriptor: Mapping[str, Any]
     local: Mapping[str, Any]
+    keypoints: Any = ANY
+
+
+GONE = "(gone)"
+"""The name of a track whose sequence is gone."""
+
+Station = tuple[str, int]
+"""The name of a track, and an ordinal along it."""
 
 
 @dataclass
 class PlaceModel:
-    """One place."""
+    """One place.
+
+    track: where another traverse shows what it shows, as it was stored; None: at its own ordinal.
+    pose_of: the place whose pose it got.
+    """
 
     shown: Shown
     fields: Fields
@@ -60,6 +72,16 @@ class PlaceModel:
     updated: Any = ANY
     descriptor: Any = ANY
     regions: Any = ANY
+    keypoints: Any = None
+    track: Station | None = None
+    pose_of: str | None = None
+
+    @property
+    def station(self) -> Station | None:
+        """Where along which track it is; None for a place without a sequence that has no counterpart."""
+        if self.track is not None:
+            return self.track
+        return None if self.sequence is None else (self.sequence, self.ordinal)
 
     @property
     def sequence(self) -> str | None:
@@ -103,10 +125,14 @@ class MapModel:
 
     # Writes; each returns the answer that it must get
 
-    def enrol(self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None) -> str:
-        """Enrol a frame; created, replaced, updated or unchanged."""
+    def enrol(
+        self, place_id: str, shown: Shown, fields: Fields, keep: str | None = None, keypoints: Any | None = None
+    ) -> str:
+        """Enrol a frame, with these keypoints or none; created, replaced, updated or unchanged."""
+        keypoints = keypoints if self.settings.get("verification", True) else None
         known = self.places.get(place_id)
         if known is not None and known.shown.digest == shown.digest:
+            known.keypoints = keypoints if known.keypoints is None else known.keypoints
             return self.set_fields(place_id, fields)
         kept = self.settings["keep"] if keep is None else keep
         if known is None:
@@ -115,7 +141,9 @@ class MapModel:
         else:
             known.shown, known.kept = shown, kept
             self._place_in(known, fields)
+            known.track = known.pose_of = None
             made = known
+        made.keypoints = keypoints
         made.descriptor, made.regions, made.updated = shown.descriptor.get(self.precision, ANY), shown.regions, ANY
         return "created" if known is None else "replaced"
 
@@ -136,13 +164,33 @@ class MapModel:
         """Take over a place of another map with its history."""
         before = self.places.get(place_id)
         same = before is not None and before.shown.digest == of.shown.digest
-        self.enrol(place_id, of.shown, of.fields, of.kept)
+        self.enrol(place_id, of.shown, of.fields, of.kept, of.keypoints)
         place = self.places[place_id]
         place.created, place.updated = of.created, of.updated
         if not same:
             place.descriptor = of.descriptor
         place.ordinal = place.ordinal if ordinal is None else ordinal
         self.ends[place.sequence] = max(self.ends[place.sequence], place.ordinal + 1)
+
+    def fill_in(self, limit: int) -> int:
+        """Find the keypoints of the first places that have none and keep a picture; how many were stored."""
+        lacking = [place for place in self.places.values() if place.keypoints is None and place.kept != "none"]
+        if not self.settings.get("verification", True):
+            return 0
+        for place in lacking[:limit]:
+            place.keypoints = place.shown.keypoints
+        return len(lacking[:limit])
+
+    def store_counterparts(self, stations: Sequence[Sequence[str]], poses: Sequence[Sequence[str]]) -> None:
+        """Put places to the stations of others, and give places the poses of others; pairs of ids."""
+        before = {place_id: copy.copy(place) for place_id, place in self.places.items()}
+        for place_id, other in stations:
+            self.places[place_id].track = before[other].station
+        for place_id, other in poses:
+            place, pose = self.places[place_id], before[other].fields["pose"]
+            if canonical(place.fields)["pose"] != canonical({"pose": pose})["pose"]:
+                place.fields, place.updated = {**place.fields, "pose": pose}, ANY
+            place.pose_of = other
 
     def forget(self, place_id: str) -> None:
         """Remove a place."""
@@ -178,6 +226,8 @@ class MapModel:
         return ordinal
 
     def _place_in(self, place: PlaceModel, fields: Fields) -> None:
+        if canonical(place.fields)["pose"] != canonical(fields)["pose"]:
+            place.pose_of = None
         before, place.fields = place.sequence, dict(fields)
         if place.sequence != before:
             place.ordinal = self._next(place.sequence)
@@ -186,6 +236,9 @@ class MapModel:
     def _drop_if_empty(self, sequence: str | None) -> None:
         if sequence is not None and all(place.sequence != sequence for place in self.places.values()):
             self.ends.pop(sequence, None)
+            for place in self.places.values():
+                if place.track is not None and place.track[0] == sequence:
+                    place.track = (GONE, place.track[1])
 
     # What must be found
 
@@ -206,6 +259,7 @@ class MapModel:
 
     def _expected_place(self, place_id: str, place: PlaceModel) -> dict[str, Any]:
         shown = place.shown
+        own = (place.sequence, place.ordinal)
         kept = {"none": None, "thumbnail": shown.thumbnail, "image": shown.image}[place.kept]
         return {
             "id": place_id,
@@ -217,6 +271,9 @@ class MapModel:
             "digest": shown.digest,
             "ordinal": place.ordinal,
             "kept": kept,
+            "keypoints": place.keypoints,
+            "track": None if place.track in (None, own) else list(place.track or own),
+            "pose_of": place.pose_of,
             "descriptor": place.descriptor,
             "local": shown.local.get(self.precision, ANY),
             "found_first": shown.digest,
@@ -242,6 +299,7 @@ class MapModel:
             place = self.places[told["id"]]
             place.created, place.updated = told["created_at"], told["updated_at"]
             place.descriptor, place.regions = told["descriptor"], told["regions"]
+            place.keypoints = told["keypoints"]
 
 
 World = dict[str, MapModel]

@@ -40,11 +40,12 @@ def test_any_difference_is_a_loss(part: str) -> None:
         settled([before, after], {})
 
 
-def test_half_of_a_place_is_lost() -> None:
+@pytest.mark.parametrize("part", ["descriptor", "keypoints", "track", "pose_of"])
+def test_half_of_a_place_is_lost(part: str) -> None:
     before = world()
     found = {"lab": copy.deepcopy(before["lab"].expected())}
-    found["lab"]["places"][1]["descriptor"] = "another"
-    with pytest.raises(Lost, match="descriptor"):
+    found["lab"]["places"][1][part] = "another"
+    with pytest.raises(Lost, match=part):
         settled([before], found)
 
 

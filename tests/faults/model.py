@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from core.storage import Atlas, Map
-from tests.core.storage.frames import descriptor_of, local_of, stored_of
+from tests.core.storage.frames import descriptor_of, keypoints_of, local_of, stored_of
 
 State = dict[str, Any]
 """Maps by id: the description, tier setting, cameras, and places in the order of their enrolment."""
 
 
-def place(shown: str, keep: str = "thumbnail", **fields: Any) -> State:
+def place(shown: str, keep: str = "thumbnail", keypoints: bool = True, **fields: Any) -> State:
     """A place as :func:`told` has it; fields that are not given are empty."""
     pose, sequence, metadata = fields.get("x"), fields.get("sequence"), fields.get("metadata", {})
     picture = {"thumbnail": f"thumbnail of {shown}", "image": f"image of {shown}"}[keep]
@@ -27,6 +27,8 @@ def place(shown: str, keep: str = "thumbnail", **fields: Any) -> State:
         "regions": len(shown),
         "descriptor": zlib.crc32(stored_of(shown).tobytes()),
         "local": zlib.crc32(local_of(shown).tobytes()),
+        "keypoints": zlib.crc32(keypoints_of(shown).record()) if keypoints else None,
+        "is_aligned": False,
     }
 
 
@@ -37,6 +39,8 @@ def told(map_: Map) -> State:
     places = {}
     for found, row in zip(listed, rows, strict=True):
         kept = map_.picture(found.id)
+        (keypoints,) = [None] if row is None else map_.keypoints_at([row])
+        where = None if row is None else snapshot.whereabouts.take([row])
         places[found.id] = {
             "x": None if found.pose is None else found.pose.x,
             "sequence": found.sequence,
@@ -46,6 +50,8 @@ def told(map_: Map) -> State:
             "regions": found.regions,
             "descriptor": None if row is None else zlib.crc32(snapshot.descriptors_at(_rows(row)).tobytes()),
             "local": None if row is None else zlib.crc32(snapshot.locals_at(_rows(row)).tobytes()),
+            "keypoints": None if keypoints is None else zlib.crc32(keypoints.record()),
+            "is_aligned": where is not None and bool((where.track != where.sequence).any()),
         }
     state: State = {
         "description": map_.record.description,

@@ -12,7 +12,7 @@ import os
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,9 @@ from core.errors import PlacerecError
 from core.frames.masks import Mask
 from core.places import PlaceFields
 from core.storage import Atlas, Map, MapSettings
+from core.storage.counterparts import Correspondence
 from core.storage.search import index_files
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.faults.model import State, all_told, best_of, place
 
 MASK = Mask(polygons=(((0.0, 0.9), (1.0, 0.9), (1.0, 1.0), (0.0, 1.0)),))
@@ -95,6 +96,25 @@ def _move(world: World) -> object:
     return world.map("lab").set_fields("p1", fields)
 
 
+def _enrol_without_keypoints(world: World) -> object:
+    return world.map("lab").enrol([replace(frame("b0", "b0!", sequence="other"), keypoints=None)])
+
+
+def _find_keypoints(world: World) -> object:
+    lab = world.map("lab")
+    found = [(one, keypoints_of("b0!")) for one in lab.without_keypoints(0, 9)]
+    assert found, "no place lacks keypoints"
+    return lab.add_keypoints(found)
+
+
+def _align(world: World) -> None:
+    lab = world.map("lab")
+    row, other = lab.rows_of(["b0", "p3"])
+    assert row is not None and other is not None
+    where = lab.snapshot().whereabouts
+    lab.counterparts.store(Correspondence({row: (int(where.sequence[other]), int(where.ordinal[other]))}))
+
+
 def _forget_sequence(state: State) -> None:
     for name in [name for name, found in _places(state).items() if found["sequence"] == "monday"]:
         del _places(state)[name]
@@ -142,6 +162,17 @@ STEPS: tuple[Step, ...] = (
         lambda world: world.map("lab").patch("p0", {"metadata": {"door": True}}),
         lambda state: _places(state)["p0"].update(metadata={"door": True}),
     ),
+    Step(
+        "enrol without keypoints",
+        _enrol_without_keypoints,
+        lambda state: _places(state).update(b0=place("b0!", keypoints=False, sequence="other")),
+    ),
+    Step(
+        "find keypoints",
+        _find_keypoints,
+        lambda state: _places(state)["b0"].update(keypoints=place("b0!")["keypoints"]),
+    ),
+    Step("align", _align, lambda state: _places(state)["b0"].update(is_aligned=True)),
     Step(
         "camera",
         lambda world: world.map("lab").cameras.put("left", MASK),

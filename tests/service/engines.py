@@ -17,6 +17,7 @@ from service.engine.engine import Engine
 from service.jobs.records import Job
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+from tests.core.storage.frames import keypoints_of
 
 ENCODER = "some@" + "0" * 64
 
@@ -44,19 +45,20 @@ def enrolments(first: int, count: int, name: str, sequence: str, dimension: int 
         fields = PlaceFields(pose=Pose(x=number, y=0), sequence=sequence, metadata={"number": number})
         descriptor = random.normal(size=dimension).astype(np.float32)
         digest = number.to_bytes(32, "big")
-        made.append(Enrolment(f"{name}{number}", fields, descriptor, 5, digest, thumbnail=picture))
+        keypoints = keypoints_of(f"picture {number}")
+        made.append(Enrolment(f"{name}{number}", fields, descriptor, 5, digest, thumbnail=picture, keypoints=keypoints))
     return made
 
 
 def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
-    """Everything that a map stores: places, their order, pictures and descriptors."""
+    """Everything that a map stores: places, their order, pictures, keypoints and descriptors."""
     map_ = engine.atlas.get(map_id)
     outline, snapshot = map_.transfer.outline(), map_.snapshot()
     rows = np.array([place.row for place in outline], np.int64)
-    descriptors = snapshot.descriptors_at(rows)
+    descriptors, keypoints = snapshot.descriptors_at(rows), map_.keypoints_at(rows.tolist())
     return [
-        (map_.place(place.id), place.ordinal, map_.picture(place.id), descriptor.tobytes())
-        for place, descriptor in zip(outline, descriptors, strict=True)
+        (map_.place(place.id), place.ordinal, map_.picture(place.id), found and found.record(), descriptor.tobytes())
+        for place, found, descriptor in zip(outline, keypoints, descriptors, strict=True)
     ]
 
 

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
-from core.errors import InvalidArchive, InvalidField, InvalidImage
+from core.errors import InvalidArchive, InvalidField, InvalidImage, InvalidKeypoints
+from core.geometry.keypoints import MOST, keypoints_of, record_bytes
 from core.places import NO_SEQUENCE
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
 from core.storage.cameras import MOST_CAMERAS
-from core.storage.database import ledger, row_checksums
+from core.storage.database import keypoints, ledger, row_checksums
 from core.storage.database.connections import FILE, connect
 from core.storage.database.ledger import moment_text, segment_entries
 from core.storage.files import segment_files as descriptors
@@ -40,6 +41,9 @@ TEXT_BYTES = 2 << 20
 
 MOST_PLACE_BYTES = 1 << 30
 """Most bytes of one descriptor with its local descriptors, as float32."""
+
+MOST_CODES = 1024
+"""Sequences whose codes are remembered at a time."""
 
 LINES_BETWEEN = 1024
 """After so many lines of sequences ``advance`` is called, which may end the work."""
@@ -69,16 +73,19 @@ def layout_of(manifest: Manifest, rows_per_segment: int = ROWS_PER_SEGMENT) -> L
 
 
 def check_sizes(manifest: Manifest) -> None:
-    """Check that the parts of descriptors have the size that their places need.
+    """Check that the parts of descriptors and keypoints have a size that their places may need.
 
     Raises:
         InvalidArchive.
     """
     width = layout_of(manifest).frame.itemsize
     for number in range(manifest.groups):
-        part = manifest.group(number)[1]
+        _, part, _, *more = manifest.group(number)
         if part.bytes != part.rows * width:
             raise InvalidArchive(f"{part.name} has {part.bytes} bytes, not {part.rows} times {width} bytes.")
+        for part in more:
+            if part.bytes > part.rows * record_bytes(MOST):
+                raise InvalidArchive(f"{part.name} has more bytes than the keypoints of {part.rows} places.")
 
 
 def build(
@@ -131,8 +138,10 @@ class _Building:
         self.archive, self.folder, self.connection = archive, folder, connection
         self.layout, self.advance, self.check_picture = layout, advance, check_picture
         self.most_picture_bytes = most_picture_bytes
-        self.latest: tuple[str | None, int] = (None, NO_SEQUENCE)
-        """The last sequence of a place, and its code."""
+        self.codes: dict[str, int] = {}
+        """The codes of the last sequences of places."""
+        self.lost: dict[int, int] = {}
+        """The codes of the tracks whose sequences are gone, by their numbers in the file."""
         self.rows = 0
 
     def run(self) -> None:
@@ -171,8 +180,8 @@ class _Building:
         row_checksums.write_checksums(self.connection, "cameras")
         reader.finish()
 
-    def _group(self, places: Part, frames: Part, pictures: Part) -> None:
-        lines, rows, images = (self.archive.part(part) for part in (places, frames, pictures))
+    def _group(self, places: Part, frames: Part, *more: Part) -> None:
+        lines, rows, *others = (self.archive.part(part) for part in (places, frames, *more))
         step = max(1, CHUNK_BYTES // self.layout.record.itemsize)
         chunk: list[PlaceLine] = []
         held = 0
@@ -180,25 +189,28 @@ class _Building:
             chunk.append(line)
             held += size
             if len(chunk) == step or held >= TEXT_BYTES:
-                self._commit(chunk, rows, images)
+                self._commit(chunk, rows, *others)
                 chunk, held = [], 0
-        self._commit(chunk, rows, images)
-        lines.finish()
-        rows.finish()
-        images.finish()
+        self._commit(chunk, rows, *others)
+        for reader in (lines, rows, *others):
+            reader.finish()
 
-    def _commit(self, chunk: list[PlaceLine], rows: PartReader, images: PartReader) -> None:
-        """Append the descriptors of places, then store the places with their pictures in one COMMIT."""
+    def _commit(
+        self, chunk: list[PlaceLine], rows: PartReader, images: PartReader, records: PartReader | None = None
+    ) -> None:
+        """Append the descriptors of places, then store the places with pictures and keypoints in one COMMIT."""
         if not chunk:
             return
         kept = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
         self._check_descriptors(kept, chunk, rows.name)
-        records = self.layout.records_of(kept, self.rows)
-        descriptors.append(self.folder, self.layout, self.rows, records)
-        checksums: list[int] = records["checksum"].tolist()
+        made = self.layout.records_of(kept, self.rows)
+        descriptors.append(self.folder, self.layout, self.rows, made)
+        checksums: list[int] = made["checksum"].tolist()
         with transaction(self.connection):
             for row, (line, checksum) in enumerate(zip(chunk, checksums, strict=True), start=self.rows):
-                self._insert(line, row, checksum, images)
+                number = self._insert(line, row, checksum)
+                self._insert_picture(line, number, images)
+                self._insert_keypoints(line, number, records)
             row_checksums.write_checksums(self.connection, "places", "row >= ?", self.rows)
             record_appended(self.connection, self.layout, self.rows, checksums)
         self.rows += len(chunk)
@@ -212,8 +224,9 @@ class _Building:
             if not 0 < value <= LARGEST_HALF:  # this is also false for NaN
                 raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} cannot be compared.")
 
-    def _insert(self, line: PlaceLine, row: int, checksum: int, images: PartReader) -> None:
-        code = self._code(line)
+    def _insert(self, line: PlaceLine, row: int, checksum: int) -> int:
+        """Store a place without its picture and keypoints; returns its number."""
+        code = NO_SEQUENCE if line.sequence is None else self._code(line.sequence, line)
         try:
             columns = ledger.field_columns(line.fields())
         except InvalidField as error:
@@ -227,39 +240,66 @@ class _Building:
             "picture": "none" if line.picture is None else line.picture.kind,
             "sequence": code,
             "ordinal": line.ordinal,
+            "track": self._track(line),
+            "station": line.station,
+            "pose_of": line.pose_of,
             "created_at": moment_text(line.created_at),
             "updated_at": moment_text(line.updated_at),
         }
         names, marks = ", ".join(columns), ", ".join("?" * len(columns))
         query = f"INSERT INTO places ({names}) VALUES ({marks})"
         number = self.connection.execute(query, tuple(columns.values())).lastrowid
-        if line.picture is not None:
-            if line.picture.bytes > self.most_picture_bytes:
-                more = f"it has {line.picture.bytes} bytes of at most {self.most_picture_bytes}"
-                raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {more}.")
-            content = images.read(line.picture.bytes)
-            digest = hashlib.sha256(content).digest()
-            if digest.hex() != line.picture.sha256:
-                raise InvalidArchive(f"The picture of place {line.id!r} does not match its SHA-256.")
-            try:
-                self.check_picture(content)
-            except InvalidImage as error:
-                raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
-            self.connection.execute(
-                "INSERT INTO pictures (place, digest, bytes) VALUES (?, ?, ?)", (number, digest, content)
-            )
+        assert number is not None
+        return number
 
-    def _code(self, line: PlaceLine) -> int:
-        """The code of a place's sequence in the tables."""
-        if line.sequence is None:
-            return NO_SEQUENCE
-        if line.sequence != self.latest[0]:
-            query = "SELECT code FROM sequences WHERE name = ?"
-            found = self.connection.execute(query, (line.sequence,)).fetchone()
+    def _insert_picture(self, line: PlaceLine, number: int, images: PartReader) -> None:
+        if line.picture is None:
+            return
+        if line.picture.bytes > self.most_picture_bytes:
+            more = f"it has {line.picture.bytes} bytes of at most {self.most_picture_bytes}"
+            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {more}.")
+        content = images.read(line.picture.bytes)
+        digest = hashlib.sha256(content).digest()
+        if digest.hex() != line.picture.sha256:
+            raise InvalidArchive(f"The picture of place {line.id!r} does not match its SHA-256.")
+        try:
+            self.check_picture(content)
+        except InvalidImage as error:
+            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
+        self.connection.execute(
+            "INSERT INTO pictures (place, digest, bytes) VALUES (?, ?, ?)", (number, digest, content)
+        )
+
+    def _insert_keypoints(self, line: PlaceLine, number: int, records: PartReader | None) -> None:
+        if line.keypoints is None:
+            return
+        if records is None:
+            raise InvalidArchive(f"The place {line.id!r} has keypoints, which files of version 1 do not hold.")
+        record = records.read(record_bytes(line.keypoints))
+        try:
+            keypoints_of(record)
+        except InvalidKeypoints as error:
+            raise InvalidArchive(f"The keypoints of place {line.id!r} cannot be taken: {error}") from None
+        keypoints.put(self.connection, number, bytes.fromhex(line.digest), record)
+
+    def _code(self, name: str, line: PlaceLine) -> int:
+        """The code of a sequence in the tables."""
+        if name not in self.codes:
+            found = self.connection.execute("SELECT code FROM sequences WHERE name = ?", (name,)).fetchone()
             if found is None:
                 raise InvalidArchive(f"The place {line.id!r} is of a sequence that the file does not list.")
-            self.latest = line.sequence, found[0]
-        return self.latest[1]
+            if len(self.codes) >= MOST_CODES:
+                self.codes.clear()
+            self.codes[name] = found[0]
+        return self.codes[name]
+
+    def _track(self, line: PlaceLine) -> int | None:
+        """The code of a place's track; one whose sequence is gone gets a code that no sequence will ever have."""
+        if line.track is None or isinstance(line.track, str):
+            return None if line.track is None else self._code(line.track, line)
+        if line.track not in self.lost:
+            self.lost[line.track] = ledger.new_track(self.connection)
+        return self.lost[line.track]
 
     def _check(self) -> None:
         """Check what concerns several places; each place was checked by itself."""

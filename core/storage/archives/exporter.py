@@ -38,7 +38,7 @@ from core.storage.archives.manifest import (
 )
 from core.storage.archives.tar_layout import BLOCK, END_BYTES, TarLayout, header, padded
 from core.storage.cameras import Access
-from core.storage.database import ledger, row_checksums
+from core.storage.database import keypoints, ledger, row_checksums
 from core.storage.database.connections import FILE
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
@@ -141,9 +141,9 @@ class Exporter:
             parts.append(_unread(name, len(sizes), sum(sizes)))
         places = 0
         for group in self._grouped(connection, layout):
-            rows, text, pictures = group
-            sizes = [text, rows * layout.frame.itemsize, pictures]
-            names = group_names((len(parts) - 2) // 3)
+            rows, text, pictures, records = group
+            sizes = [text, rows * layout.frame.itemsize, pictures, records]
+            names = group_names((len(parts) - 2) // len(sizes))
             parts += [_unread(name, rows, size) for name, size in zip(names, sizes, strict=True)]
             places += rows
         manifest = Manifest(format=FORMAT, version=VERSION, map=record, places=places, parts=parts)
@@ -152,18 +152,19 @@ class Exporter:
             raise StorageFailure(f"The map has too many places for one file: {more}.")
         return manifest
 
-    def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[tuple[int, int, int]]:
-        """Of each group its places, and the bytes of its lines and pictures."""
+    def _grouped(self, connection: sqlite3.Connection, layout: Layout) -> Iterator[tuple[int, int, int, int]]:
+        """Of each group its places, and the bytes of its lines, pictures and keypoints."""
         most = max(1, min(PLACES_PER_GROUP, BYTES_PER_GROUP // layout.frame.itemsize))
-        rows = text = pictures = 0
+        rows = text = pictures = records = 0
         for line in place_lines(connection):
             if rows == most or (rows and pictures + line.picture_bytes > BYTES_PER_GROUP):
-                yield rows, text, pictures
+                yield rows, text, pictures, records
                 self._expect_there()
-                rows = text = pictures = 0
-            rows, text, pictures = rows + 1, text + len(line.text), pictures + line.picture_bytes
+                rows = text = pictures = records = 0
+            rows, text = rows + 1, text + len(line.text)
+            pictures, records = pictures + line.picture_bytes, records + line.keypoints_bytes
         if rows:
-            yield rows, text, pictures
+            yield rows, text, pictures, records
 
     def _write(
         self,
@@ -183,12 +184,13 @@ class Exporter:
         ]
         lines, done = place_lines(connection), 0
         for number in range(planned.groups):
-            places, frames, pictures = planned.group(number)
+            places, frames, pictures, records = planned.group(number)
             group = list(islice(lines, places.rows))
             parts += [
                 _write_part(file, places, (line.text for line in group)),
                 _write_part(file, frames, self._frames(group, layout)),
                 _write_part(file, pictures, _pictures(connection, group)),
+                _write_part(file, records, _keypoints(connection, group)),
             ]
             done += len(group)
             advance(done)
@@ -230,6 +232,12 @@ def _pictures(connection: sqlite3.Connection, group: Iterable[StoredLine]) -> It
             content = ledger.picture(connection, line.number, line.id)
             assert content is not None
             yield content
+
+
+def _keypoints(connection: sqlite3.Connection, group: Iterable[StoredLine]) -> Iterator[bytes]:
+    for line in group:
+        if line.keypoints_bytes:
+            yield keypoints.record_of(connection, line.number)
 
 
 def _write_part(file: BinaryIO, part: Part, chunks: Iterable[bytes | memoryview]) -> Part:

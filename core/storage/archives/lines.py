@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from core.errors import InvalidArchive
 from core.frames.masks import Mask
+from core.geometry.keypoints import MOST, count_of
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
 from core.storage.records import validation_message
@@ -58,20 +59,39 @@ class Picture(_Line):
 
 
 class PlaceLine(_Line):
-    """A place.  digest: SHA-256 of the image with which it was enrolled and of its camera's mask."""
+    """A place.
+
+    track, station: the sequence and the ordinal at which another traverse shows the same; None: its own.  A sequence
+        that is gone has no name any more, but a number, by which the places on its track are told from others.
+    pose_of: the place whose pose it got from an alignment.
+    digest: SHA-256 of the image with which it was enrolled and of its camera's mask.
+    keypoints: how many its frame has, whose record is the next one in the keypoints of its group; None: none are kept.
+    """
 
     id: Annotated[str, Field(pattern=f"^{PLACE_ID}$")]
     pose: Pose | None
+    pose_of: Annotated[str, Field(pattern=f"^{PLACE_ID}$")] | None = None
     timestamp: Timestamp | None
     sequence: Sequence | None
     ordinal: Number
+    track: Sequence | Number | None = None
+    station: Annotated[int, Field(ge=-LARGEST, le=LARGEST, strict=True)] | None = None
     camera: Camera | None
     metadata: dict[str, Any]
     regions: Number
     digest: Digest
     picture: Picture | None
+    keypoints: Annotated[int, Field(ge=0, le=MOST, strict=True)] | None = None
     created_at: Timestamp
     updated_at: Timestamp
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if (self.track is None) != (self.station is None):
+            raise ValueError("a track needs a station, and a station a track")
+        if self.pose_of is not None and self.pose is None:
+            raise ValueError("a place without a pose has no pose of another")
+        return self
 
     def fields(self) -> PlaceFields:
         """The fields that the owner of the map gave the place."""
@@ -137,47 +157,61 @@ _POSE = ("x", "y", "z", "latitude", "longitude", "heading")
 _PLACES = (
     "SELECT p.id, p.x, p.y, p.z, p.latitude, p.longitude, p.heading, p.timestamp, s.name, p.ordinal, p.camera,"
     " p.metadata, p.regions, lower(hex(p.digest)), p.picture, length(k.bytes), lower(hex(k.digest)),"
-    " p.created_at, p.updated_at, p.number, p.row, p.checksum"
+    " p.created_at, p.updated_at, p.number, p.row, p.checksum, p.track, p.station, t.name, length(f.record),"
+    " p.pose_of"
     " FROM places p JOIN sequences s ON s.code = p.sequence LEFT JOIN pictures k ON k.place = p.number"
+    " LEFT JOIN sequences t ON t.code = p.track LEFT JOIN keypoints f ON f.place = p.number"
     " ORDER BY p.number"
 )
 
 
 class StoredLine:
-    """The line of a place, and where its picture and descriptor are.
+    """The line of a place, and where its picture, keypoints and descriptor are.
 
     text: the line.
     picture_bytes: size of the picture kept of its frame; 0 if none is kept.
+    keypoints_bytes: size of the record of its keypoints; 0 if none are kept.
     number, row, checksum: of the place and its descriptor in the database.
     """
 
-    __slots__ = ("checksum", "id", "number", "picture_bytes", "row", "text")
+    __slots__ = ("checksum", "id", "keypoints_bytes", "number", "picture_bytes", "row", "text")
 
-    def __init__(self, values: tuple[Any, ...]) -> None:
+    def __init__(self, values: tuple[Any, ...], lost: dict[int, int]) -> None:
+        """Of a row of the places.
+
+        Args:
+            lost: the numbers of the tracks whose sequence is gone, by their codes; it gets those that it lacks.
+        """
         pose = {name: value for name, value in zip(_POSE, values[1:7], strict=True) if value is not None}
         picture = None if values[15] is None else {"kind": values[14], "bytes": values[15], "sha256": values[16]}
         self.text = _line(
             {
                 "id": values[0],
                 "pose": pose or None,
+                "pose_of": values[26],
                 "timestamp": values[7],
                 "sequence": values[8],
                 "ordinal": values[9],
+                "track": None if values[22] is None else values[24] or lost.setdefault(values[22], len(lost)),
+                "station": values[23],
                 "camera": values[10],
                 "metadata": json.loads(values[11]),
                 "regions": values[12],
                 "digest": values[13],
                 "picture": picture,
+                "keypoints": None if values[25] is None else count_of(values[25]),
                 "created_at": values[17],
                 "updated_at": values[18],
             }
         )
         self.id: str = values[0]
         self.picture_bytes: int = values[15] or 0
+        self.keypoints_bytes: int = values[25] or 0
         self.number, self.row, self.checksum = (int(value) for value in values[19:22])
 
 
 def place_lines(connection: sqlite3.Connection) -> Iterator[StoredLine]:
     """The lines of all places in the order of their enrolment."""
+    lost: dict[int, int] = {}
     for values in connection.execute(_PLACES):
-        yield StoredLine(values)
+        yield StoredLine(values, lost)

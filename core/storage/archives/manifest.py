@@ -10,11 +10,12 @@ The file is a plain tar (ustar).  Its members, in this order:
     descriptors-000001.bin      of the same places: descriptor and local descriptors as the map stores them,
                                 without anything between them
     pictures-000001.bin         of the same places: the pictures kept of their frames
+    keypoints-000001.bin        of the same places: the records of their keypoints (:mod:`core.geometry.keypoints`)
     places-000002.jsonl …       and so on
 
 The bytes of a file follow from its manifest and its parts, so the SHA-256 of the manifest identifies the whole file.
 
-In version 1 the map's record does not say whether keypoints are kept.
+In version 1 there are no keypoints and no tracks.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ FORMAT = "placerec map"
 VERSION = 2
 MANIFEST, SEAL = "manifest.json", "manifest.sha256"
 SEQUENCES, CAMERAS = "sequences.jsonl", "cameras.jsonl"
-GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"))
+GROUP_KINDS = (("places", "jsonl"), ("descriptors", "bin"), ("pictures", "bin"), ("keypoints", "bin"))
+"""The parts of a group; those of version 1 are the first three."""
 
 MOST_MANIFEST_BYTES = 8 << 20
-"""A part takes some 165 bytes, so this is enough for 17 million places or 4 TB of pictures."""
+"""A part takes some 165 bytes, so this is enough for 12 million places or 3 TB of pictures."""
 
 MOST_PART_BYTES = 8 << 30
 """The size of a part is less than this, so that a tar header can hold it."""
@@ -83,18 +85,23 @@ class Manifest(BaseModel):
 
     @property
     def groups(self) -> int:
-        """How many groups of places, descriptors and pictures there are."""
-        return (len(self.parts) - 2) // len(GROUP_KINDS)
+        """How many groups of places, descriptors, pictures and keypoints there are."""
+        return (len(self.parts) - 2) // _kinds(self.version)
 
     def group(self, number: int) -> Sequence[Part]:
-        """Places, descriptors and pictures of group ``number``, counted from 0."""
-        first = 2 + number * len(GROUP_KINDS)
-        return self.parts[first : first + len(GROUP_KINDS)]
+        """Places, descriptors, pictures and, from version 2 on, keypoints of group ``number``, counted from 0."""
+        first = 2 + number * _kinds(self.version)
+        return self.parts[first : first + _kinds(self.version)]
 
 
-def group_names(number: int) -> list[str]:
+def _kinds(version: int) -> int:
+    """How many parts a group has."""
+    return 3 if version == 1 else len(GROUP_KINDS)
+
+
+def group_names(number: int, version: int = VERSION) -> list[str]:
     """The names of the parts of group ``number``, counted from 0."""
-    return [f"{kind}-{number + 1:06d}.{suffix}" for kind, suffix in GROUP_KINDS]
+    return [f"{kind}-{number + 1:06d}.{suffix}" for kind, suffix in GROUP_KINDS[: _kinds(version)]]
 
 
 def written(manifest: Manifest) -> bytes:
@@ -196,7 +203,7 @@ def _read(value: dict[str, Any]) -> Manifest:
         raise InvalidArchive(f"{MANIFEST}: {error}") from None
     names = [SEQUENCES, CAMERAS]
     for number in range(max(0, manifest.groups)):
-        names += group_names(number)
+        names += group_names(number, manifest.version)
     if [part.name for part in manifest.parts] != names:
         raise InvalidArchive(f"{MANIFEST}: the parts are not those of a map, in their order.")
     for number in range(manifest.groups):

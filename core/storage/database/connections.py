@@ -15,7 +15,7 @@ from pathlib import Path
 from core.disk import sqlite_file
 from core.disk.files import sync_file
 from core.disk.sqlite_file import DURABLE
-from core.storage.database import row_checksums
+from core.storage.database import keypoints, row_checksums
 from core.storage.database.schema import check_schema, migrate
 
 FILE = "map.sqlite"
@@ -38,7 +38,7 @@ def connect(path: Path, create: bool = False) -> sqlite3.Connection:
         sqlite3.Error: the file is missing (unless ``create``) or cannot be read.
     """
     connection = sqlite_file.connect(path, "rwc" if create else "rw", _SETTINGS)
-    row_checksums.register(connection)
+    _register(connection)
     return connection
 
 
@@ -52,8 +52,13 @@ def connect_without_log(path: Path) -> sqlite3.Connection:
         f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True, isolation_level=None, check_same_thread=False
     )
     connection.execute("PRAGMA trusted_schema = OFF")
-    row_checksums.register(connection)
+    _register(connection)
     return connection
+
+
+def _register(connection: sqlite3.Connection) -> None:
+    row_checksums.register(connection)
+    keypoints.register(connection)
 
 
 class Database:

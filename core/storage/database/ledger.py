@@ -241,6 +241,14 @@ def _sequence_code(connection: sqlite3.Connection, name: str | None) -> int:
     return code
 
 
+def new_track(connection: sqlite3.Connection) -> int:
+    """The code of a track whose sequence is gone: no sequence has it or will ever get it."""
+    code = connection.execute("INSERT INTO sequences (name, next_ordinal) VALUES (NULL, 0)").lastrowid
+    assert code is not None
+    connection.execute("DELETE FROM sequences WHERE code = ?", (code,))
+    return code
+
+
 def _next_ordinal(connection: sqlite3.Connection, code: int) -> int:
     query = "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE code = ? RETURNING next_ordinal - 1"
     ((ordinal,),) = connection.execute(query, (code,)).fetchall()

@@ -100,6 +100,15 @@ def unopened(setting: TierSetting, places: int) -> IndexStatus:
     )
 
 
+class KeypointsStatus(BaseModel):
+    """The keypoints that a map keeps."""
+
+    model_config = ConfigDict(frozen=True)
+
+    places: int = Field(ge=0, description="How many places have keypoints.")
+    bytes: int = Field(ge=0, description="What they take in map.sqlite.")
+
+
 class StorageStatus(BaseModel):
     """What a map takes on disk."""
 
@@ -109,11 +118,17 @@ class StorageStatus(BaseModel):
     bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
     descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
     index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
-    database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata and pictures.")
+    database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata, pictures, keypoints.")
+    keypoints: KeypointsStatus | None = Field(
+        description="Of how many places keypoints are kept; null until the map is first used after a start."
+    )
 
 
-def storage_of(folder: Path, precision: Precision, places: int) -> StorageStatus:
+def storage_of(folder: Path, precision: Precision, places: int, keypoints: KeypointsStatus | None) -> StorageStatus:
     """How much room the files of a map take; a file that is deleted meanwhile counts as empty.
+
+    Args:
+        keypoints: which of the map's places have keypoints; None: not known.
 
     Raises:
         OSError: the disk refuses.
@@ -129,4 +144,5 @@ def storage_of(folder: Path, precision: Precision, places: int) -> StorageStatus
         descriptors=sizes[".seg"],
         index=sizes[".index"],
         database=sizes[""],
+        keypoints=keypoints,
     )

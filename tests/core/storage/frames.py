@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from core.geometry.keypoints import LENGTH, SHARES, Keypoints
 from core.places import PlaceFields, Pose
 from core.storage import Enrolment
 from core.storage.files.segment_files import Layout
@@ -41,6 +42,15 @@ def local_of(name: str, shape: tuple[int, int] = LOCAL_SHAPE) -> NDArray[np.int8
     return np.random.default_rng(seed).integers(-128, 128, shape, dtype=np.int8)
 
 
+def keypoints_of(name: str) -> Keypoints:
+    """One to four keypoints."""
+    seed = int.from_bytes(hashlib.sha256(f"keypoints of {name}".encode()).digest()[:8], "big")
+    random = np.random.default_rng(seed)
+    count = int(random.integers(1, 5))
+    positions = random.integers(0, SHARES, (count, 2), dtype=np.uint16)
+    return Keypoints(640, 480, positions, random.integers(1, 128, (count, LENGTH), dtype=np.int8))
+
+
 def digest_of(name: str) -> bytes:
     """SHA-256 of the image's bytes, for which the name stands."""
     return hashlib.sha256(f"image of {name}".encode()).digest()
@@ -67,6 +77,7 @@ def frame(
         digest=digest_of(shown),
         thumbnail=f"thumbnail of {shown}".encode(),
         image=f"image of {shown}".encode(),
+        keypoints=keypoints_of(shown),
     )
 
 

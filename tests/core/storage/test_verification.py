@@ -10,6 +10,7 @@ import pytest
 from core.errors import MapQuarantined
 from core.index.flat import vectors
 from core.storage import Atlas, Map, MapSettings
+from core.storage.database import keypoints
 from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame
 from tests.core.storage.test_opening import flip
@@ -45,7 +46,10 @@ def test_a_good_map(hall: Map, folder: Path) -> None:
     report = hall.verify()
     assert (report.ok, report.places, report.rows) == (True, 9, 10)
     assert (report.problems, report.stale_caches) == ([], [])
-    assert report.checked_bytes == 10 * RECORD_BYTES + 9 * len("image 0")
+    with hall._reading() as connection:
+        _, of_keypoints = keypoints.room(connection)
+    assert of_keypoints > 9 * 68
+    assert report.checked_bytes == 10 * RECORD_BYTES + 9 * len("image 0") + of_keypoints
 
 
 def test_every_damaged_row_is_named(hall: Map, folder: Path) -> None:

@@ -61,12 +61,13 @@ def _create(world: World, operation: Operation) -> None:
 
 def _enrol(world: World, operation: Operation) -> str:
     item = operation["item"]
-    return _map(world, operation).enrol(item["id"], shown(item["picture"]), item["fields"])
+    return _map(world, operation).enrol(item["id"], shown(item["picture"]), item["fields"], keypoints=ANY)
 
 
 def _batch(world: World, operation: Operation) -> list[str]:
     map_ = _map(world, operation)
-    return [map_.enrol(item["id"], shown(item["picture"]), item["fields"]) for item in operation["items"]]
+    items = operation["items"]
+    return [map_.enrol(item["id"], shown(item["picture"]), item["fields"], keypoints=ANY) for item in items]
 
 
 def _query(world: World, operation: Operation) -> Any:

@@ -26,12 +26,13 @@ from core.errors import PlacerecError
 from core.frames.masks import Mask
 from core.places import PlaceFields
 from core.storage import Atlas, Enrolment, History, MapSettings, opening
+from core.storage.counterparts import Correspondence
 from core.storage.database import connections as database
 from core.storage.files.row_formats import inner_products, pack_descriptors
 from core.storage.search import index_files, recall
-from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, keypoints_of
 from tests.durability.contents import contents, map_contents
-from tests.durability.storage.operations import Operation, enrolment
+from tests.durability.storage.operations import Operation, enrolment, pictures
 
 ROWS_PER_SEGMENT = 4
 GROUP_ROWS = 8
@@ -107,7 +108,7 @@ class Storage:
         self._atlas.create(operation["map"], ENCODER, DIMENSION, settings, LOCAL_SHAPE, unlisted, precision)
 
     def _enrol(self, operation: Operation) -> Answer:
-        items = [enrolment(item["id"], item["picture"], item["fields"]) for item in operation["items"]]
+        items = [enrolment(**item) for item in operation["items"]]
         done = self._atlas.get(operation["map"]).enrol(items)
         told = {place.id: place.model_dump(mode="json") for place, _ in done}  # the last of each id
         return {"answer": [change for _, change in done], "places": list(told.values())}
@@ -135,6 +136,22 @@ class Storage:
     def _edit(self, operation: Operation) -> Answer:
         return {"answer": self._atlas.get(operation["map"]).edit(operation["changes"]).revision}
 
+    def _keypoints(self, operation: Operation) -> Answer:
+        map_ = self._atlas.get(operation["map"])
+        found = [(one, keypoints_of(pictures()[one.digest])) for one in map_.without_keypoints(0, operation["limit"])]
+        return {"answer": map_.add_keypoints(found)}
+
+    def _counterparts(self, operation: Operation) -> None:
+        map_ = self._atlas.get(operation["map"])
+        rows = {place.id: place.row for place in map_.transfer.outline()}
+        where = map_.snapshot().whereabouts
+        stations = {
+            rows[place_id]: (int(where.track[rows[other]]), int(where.station[rows[other]]))
+            for place_id, other in operation["stations"]
+        }
+        poses: dict[int, int | None] = {rows[place_id]: rows[other] for place_id, other in operation["poses"]}
+        map_.counterparts.store(Correspondence(stations, poses))
+
     def _camera(self, operation: Operation) -> Answer:
         mask = None if operation["mask"] is None else Mask.model_validate(operation["mask"])
         return {"answer": self._atlas.get(operation["map"]).cameras.put(operation["name"], mask)[1]}
@@ -160,6 +177,7 @@ class Storage:
                 snapshot.locals_at(np.array([row]))[0],
                 picture if place.picture == "thumbnail" else None,
                 picture if place.picture == "image" else None,
+                source.keypoints_at([row])[0],
             )
             items.append((item, History(place.picture, ordinal, place.created_at, place.updated_at)))
         target.transfer.adopt(items)

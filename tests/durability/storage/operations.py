@@ -13,7 +13,7 @@ import numpy as np
 from core.places import PlaceFields
 from core.storage import Enrolment, MapSettings
 from core.storage.files.row_formats import Precision, pack_descriptors, pack_local, unpack_descriptors, unpack_local
-from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, local_of
+from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, descriptor_of, digest_of, keypoints_of, local_of
 from tests.durability.contents import sha
 from tests.durability.model import MapModel, Refused, Shown, World
 
@@ -54,14 +54,15 @@ def shown(picture: str) -> Shown:
         image=sha(image_of(picture)),
         descriptor={name: sha(vector[0].tobytes()) for name, vector in stored.items()},
         local={name: sha(found[0].tobytes()) for name, found in local.items()},
+        keypoints=sha(keypoints_of(picture).record()),
     )
 
 
-def enrolment(place_id: str, picture: str, fields: dict[str, Any]) -> Enrolment:
-    """A picture as it is enrolled; ``"blank"`` has no region."""
+def enrolment(id: str, picture: str, fields: dict[str, Any], keypoints: bool) -> Enrolment:
+    """A picture as it is enrolled, with or without keypoints; ``"blank"`` has no region."""
     descriptor = np.zeros(DIMENSION, np.float32) if picture == "blank" else descriptor_of(picture)
     return Enrolment(
-        place_id,
+        id,
         PlaceFields.model_validate(fields),
         descriptor,
         len(picture),
@@ -69,7 +70,15 @@ def enrolment(place_id: str, picture: str, fields: dict[str, Any]) -> Enrolment:
         local_of(picture),
         thumbnail_of(picture),
         image_of(picture),
+        keypoints_of(picture) if keypoints else None,
     )
+
+
+@lru_cache(maxsize=1)
+def pictures() -> dict[bytes, str]:
+    """The names of all pictures by the SHA-256 of their bytes."""
+    names = [f"picture {number}" for number in range(PICTURES)]
+    return {hashlib.sha256(image_of(name)).digest(): name for name in names}
 
 
 # The model's side
@@ -101,7 +110,11 @@ def _enrol(world: World, operation: Operation) -> list[str]:
     map_ = _map(world, operation["map"])
     if any(item["picture"] == "blank" for item in operation["items"]):
         raise Refused("NoRegions")
-    return [map_.enrol(item["id"], shown(item["picture"]), item["fields"]) for item in operation["items"]]
+    found = [(item, shown(item["picture"])) for item in operation["items"]]
+    return [
+        map_.enrol(item["id"], of, item["fields"], keypoints=of.keypoints if item["keypoints"] else None)
+        for item, of in found
+    ]
 
 
 def _adopt(world: World, operation: Operation) -> None:
@@ -131,6 +144,10 @@ def _forget_many(world: World, operation: Operation) -> int:
     return len(operation["ids"])
 
 
+def _counterparts(world: World, operation: Operation) -> None:
+    _map(world, operation["map"]).store_counterparts(operation["stations"], operation["poses"])
+
+
 def _delete(world: World, operation: Operation) -> None:
     _map(world, operation["map"])
     del world[operation["map"]]
@@ -156,6 +173,8 @@ _APPLIED: dict[str, Callable[[World, Operation], Any]] = {
     "forget-sequence": lambda world, o: _map(world, o["map"]).forget_sequence(o["name"]),
     "forget-many": _forget_many,
     "edit": lambda world, o: _map(world, o["map"]).edit(o["changes"]),
+    "keypoints": lambda world, o: _map(world, o["map"]).fill_in(o["limit"]),
+    "counterparts": _counterparts,
     "camera": _camera,
     "forget-camera": _forget_camera,
     "adopt": _adopt,
@@ -187,8 +206,8 @@ def chosen(random: Random, world: World, prefix: str) -> Operation:
     if len(map_.places) > LARGEST_MAP and random.random() < 0.5:
         return {"do": "delete", "map": name}
     kinds = ("enrol", "enrol", "enrol", "batch", "batch", "fields", "patch", "forget", "sequence", "many", "edit",
-             "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
-    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 2, 3, 0.7, 4, 0.5)
+             "keypoints", "counterparts", "camera", "adopt", "delete", "look", "reopen")  # fmt: skip
+    weights = (6, 6, 6, 5, 5, 4, 5, 3, 0.7, 1, 2, 2, 3, 2, 3, 0.7, 4, 0.5)
     kind = random.choices(kinds, weights)[0]
     return _CHOSEN[kind](random, world, name, listed) or _batch(random, world, name, listed)
 
@@ -229,7 +248,8 @@ def _fields(random: Random) -> dict[str, Any]:
 
 
 def _item(random: Random, place_id: str) -> dict[str, Any]:
-    return {"id": place_id, "picture": f"picture {random.randrange(PICTURES)}", "fields": _fields(random)}
+    picture, keypoints = f"picture {random.randrange(PICTURES)}", random.random() < 0.7
+    return {"id": place_id, "picture": picture, "fields": _fields(random), "keypoints": keypoints}
 
 
 def _new_id(random: Random, map_: MapModel) -> str:
@@ -244,7 +264,7 @@ def _one(random: Random, world: World, name: str, listed: list[str]) -> Operatio
 def _batch(random: Random, world: World, name: str, listed: list[str]) -> Operation:
     items = [_item(random, _new_id(random, world[name])) for _ in range(random.randrange(2, 12))]
     if random.random() < 0.05:
-        items.append({"id": "p0", "picture": "blank", "fields": {}})
+        items.append({"id": "p0", "picture": "blank", "fields": {}, "keypoints": False})
     return {"do": "enrol", "map": name, "items": items}
 
 
@@ -288,6 +308,7 @@ def _edited(random: Random, world: World, name: str, listed: list[str]) -> Opera
         {"same_place_radius": float(random.randrange(9)), "same_place_frames": random.randrange(9)},
         {"index": random.choice(["exact", "compact", "inverted", "auto"])},
         {"index": random.choice(["exact", "compact", "inverted"])},
+        {"verification": random.random() < 0.7},
     ])  # fmt: skip
     return {"do": "edit", "map": name, "changes": changes}
 
@@ -297,6 +318,21 @@ def _cameras(random: Random, world: World, name: str, listed: list[str]) -> Oper
     if random.random() < 0.3:
         return {"do": "forget-camera", "map": name, "name": camera}
     return {"do": "camera", "map": name, "name": camera, "mask": random.choice(MASKS)}
+
+
+def _filled_in(random: Random, world: World, name: str, listed: list[str]) -> Operation:
+    return {"do": "keypoints", "map": name, "limit": random.randrange(1, 9)}
+
+
+def _counterpart(random: Random, world: World, name: str, listed: list[str]) -> Operation | None:
+    """Some places come to the stations of others, and some get the poses of others."""
+    places = world[name].places
+    tracked = [place_id for place_id, place in places.items() if place.station is not None]
+    posed = [place_id for place_id, place in places.items() if place.fields.get("pose") is not None]
+    some = random.sample(list(places), min(len(places), 4))
+    stations = [[place_id, random.choice(tracked)] for place_id in some] if tracked else []
+    poses = [[place_id, random.choice(posed)] for place_id in some[:2]] if posed else []
+    return {"do": "counterparts", "map": name, "stations": stations, "poses": poses} if stations or poses else None
 
 
 def _adopted(random: Random, world: World, name: str, listed: list[str]) -> Operation | None:
@@ -322,6 +358,8 @@ _CHOSEN: dict[str, _Chosen] = {
     "sequence": _sequence,
     "many": _many,
     "edit": _edited,
+    "keypoints": _filled_in,
+    "counterparts": _counterpart,
     "camera": _cameras,
     "adopt": _adopted,
     "delete": lambda random, world, name, listed: {"do": "delete", "map": name},

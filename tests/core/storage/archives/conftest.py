@@ -7,6 +7,7 @@ import pytest
 from core.frames.masks import Mask
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.storage.counterparts import Correspondence
 from tests.core.storage.archives.files import exported
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
@@ -16,12 +17,16 @@ def filled(lab: Map) -> Map:
     moment = datetime(2026, 11, 20, 10, tzinfo=UTC)
     lab.enrol([frame(f"p{i}", x=i / 3, sequence="monday", metadata={"i": i, "ä": [None, 1.5]}) for i in range(7)])
     lab.edit({"keep": "image"})
-    lab.enrol([frame("q0", timestamp=moment), frame("q1", camera="front"), frame("gone")])
+    lab.enrol([frame("q0", timestamp=moment), frame("q1", camera="front"), frame("gone", sequence="gone")])
     roof = frame("roof")
     where = PlaceFields(pose=Pose(latitude=48.8, longitude=2.3, heading=10), sequence="Ünter den Linden")
     lab.enrol([Enrolment("roof", where, roof.descriptor, 3, roof.digest, roof.local)])
     lab.enrol([frame("p3", "p3 from elsewhere", x=1.0, sequence="monday")])
-    lab.forget("gone")
+    q0, q1, gone, roof_row, p2 = (int(row or 0) for row in lab.rows_of(["q0", "q1", "gone", "roof", "p2"]))
+    sequence = lab.snapshot().whereabouts.sequence
+    monday, track = int(sequence[p2]), int(sequence[gone])
+    lab.counterparts.store(Correspondence({q0: (monday, 2), q1: (track, 0), roof_row: (track, 1)}, {q0: p2}))
+    lab.forget("gone")  # with its sequence, whose track stays
     lab.forget("p5")
     lab.cameras.put("front", Mask(polygons=(((0, 0), (0.25, 0), (0, 0.25)),)))
     lab.cameras.put("rear", None)

@@ -22,6 +22,7 @@ from tests.core.storage.frames import DIMENSION, ENCODER, frame
 
 Made = Callable[[bytes], bytes]
 PLACES, FRAMES, PICTURES = "places-000001.jsonl", "descriptors-000001.bin", "pictures-000001.bin"
+KEYPOINTS = "keypoints-000001.bin"
 CAMERAS, SEQUENCES = "cameras.jsonl", "sequences.jsonl"
 
 
@@ -113,6 +114,23 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a picture of no kind": (line(PLACES, 5, picture={**KEPT, "kind": "none"}), "picture"),
     "pictures left over": (raw(PICTURES, lambda d: d + b"more"), "longer"),
     "pictures too few": (raw(PICTURES, lambda d: d[:-1]), "shorter"),
+    "keypoints of other numbers": (place(keypoints=5), "keypoints of place 'p1' cannot be taken|shorter"),
+    "keypoints too many": (place(keypoints=577), "keypoints"),
+    "keypoints below 0": (place(keypoints=-1), "keypoints"),
+    "keypoints that are true": (place(keypoints=True), "keypoints"),
+    "keypoints not listed": (place(keypoints=None), "cannot be taken|longer"),
+    "keypoints left over": (raw(KEYPOINTS, lambda d: d + b"more"), "longer"),
+    "keypoints too few": (raw(KEYPOINTS, lambda d: d[:-1]), "shorter"),
+    "keypoints of no frame": (raw(KEYPOINTS, lambda d: bytes(4) + d[4:]), "keypoints of place 'p0' cannot be taken"),
+    "keypoints without descriptors": (raw(KEYPOINTS, lambda d: d[:12] + bytes(len(d) - 12)), "lacks a descriptor"),
+    "endless keypoints": (raw(KEYPOINTS, lambda d: d + bytes(400_000)), "more bytes than the keypoints of 9 places"),
+    "a track not listed": (place(track="sunday", station=1), "does not list"),
+    "a track without a station": (place(track="monday"), "needs a station"),
+    "a station without a track": (place(station=1), "needs a station"),
+    "a pose of nobody": (place(pose_of="../p1"), "pose_of"),
+    "a pose of another that is none": (place(pose=None, pose_of="p0"), "has no pose of another"),
+    "a track below 0": (place(track=-1, station=1), "track"),
+    "a station too far": (place(track=0, station=1 << 63), "station"),
     "descriptors left over": (raw(FRAMES, lambda d: d + d[:47]), ", not 9 times"),
     "descriptors too few": (raw(FRAMES, lambda d: d[:-47]), ", not 9 times"),
     "a descriptor of zeros": (descriptor(), "cannot be compared"),
@@ -307,8 +325,10 @@ def test_a_full_disk_leaves_nothing(content: bytes, tmp_path: Path, monkeypatch:
 
 
 def test_lines_are_what_a_person_can_read(content: bytes) -> None:
-    start = content.index(b'{"id":"roof"')
-    shown = json.loads(content[start : content.index(b"\n", start)])
+    lines = {line["id"]: line for line in map(json.loads, parts_of(content)[1][PLACES].splitlines())}
+    shown = lines["roof"]
+    assert (shown["track"], shown["station"]) == (lines["q1"]["track"], 1) == (0, 1), "its sequence is gone"
+    assert (lines["q0"]["track"], lines["q0"]["station"], lines["q0"]["pose_of"]) == ("monday", 2, "p2")
     assert shown["pose"] == {"latitude": 48.8, "longitude": 2.3, "heading": 10.0}
     assert shown["sequence"] == "Ünter den Linden"
 

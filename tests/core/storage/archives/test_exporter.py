@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.places import Neighborhood
 from core.storage import Atlas, Map, MapSettings
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
@@ -24,6 +25,14 @@ from tests.core.storage.test_opening import flip
 
 def listed(map_: Map) -> list[object]:
     return [map_.places(None, 100), map_.sequences(None, 100), map_.cameras.all(), map_.transfer.sequence_ends()]
+
+
+def same_place(map_: Map, place_id: str) -> list[str]:
+    """The ids of the places that are the same place, sorted."""
+    (row,), snapshot = map_.rows_of([place_id]), map_.snapshot()
+    assert row is not None
+    near = np.flatnonzero(snapshot.whereabouts.near(row, Neighborhood(0.5, 1)) & snapshot.alive)
+    return sorted(place.id for place in map_.places_at(near.tolist()) if place is not None)
 
 
 @pytest.mark.parametrize("kind", ["of everything", "compressed", "without local descriptors"])
@@ -49,12 +58,26 @@ def test_what_comes_back_is_what_was_there(
         np.testing.assert_array_equal(ours.locals_at(row), theirs.locals_at(other_row))
         assert copy.digest(place.id) == source.digest(place.id)
         assert copy.picture(place.id) == source.picture(place.id)
+        (ours_of,), (theirs_of,) = source.keypoints_at(row.tolist()), copy.keypoints_at(other_row.tolist())
+        assert (ours_of and ours_of.record()) == (theirs_of and theirs_of.record())
+        assert (ours_of is None) == (place.id == "roof")
+        assert same_place(copy, place.id) == same_place(source, place.id)
+    if kind == "of everything":
+        assert same_place(copy, "q1") == ["q1", "roof"] and same_place(copy, "q0") == ["p1", "p2", "p3", "q0"]
     assert copy.verify().ok
     # Written again it is the same file, to the last bit: nothing was lost, nothing added, no order changed.
     assert exported(copy, tmp_path / "again") == path.read_bytes()
     copy.enrol([frame("new", local_shape=copy.record.local_shape)])
     assert copy.verify().ok
     other.close()
+
+
+def test_damaged_keypoints_are_not_exported(full: Map, tmp_path: Path) -> None:
+    with full._writing() as write:
+        write.connection.execute("UPDATE keypoints SET record = zeroblob(length(record)) WHERE place = 1")
+    with pytest.raises(StorageFailure, match="The keypoints kept of place 'p0' do not match their checksum"):
+        full.exporter.write(tmp_path / "kept.tar")
+    assert not (tmp_path / "kept.tar").exists()
 
 
 def test_the_same_content_is_the_same_file(full: Map, tmp_path: Path) -> None:
@@ -103,7 +126,7 @@ def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 4)
     grouped = exported(full, tmp_path / "grouped")
     manifest, parts = parts_of(grouped)
-    assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 6 + [1] * 3
+    assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 8 + [1] * 4
     joined = b"".join(data for name, data in parts.items() if name.startswith("descriptors-"))
     assert joined == parts_of(whole)[1]["descriptors-000001.bin"]
     path = tmp_path / "grouped.tar"
@@ -234,6 +257,6 @@ def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: p
 
 def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
-    with pytest.raises(StorageFailure, match="too many places for one file: 5 parts"):
+    with pytest.raises(StorageFailure, match="too many places for one file: 6 parts"):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []
