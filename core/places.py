@@ -241,3 +241,16 @@ class Whereabouts:
             near = np.where(self.kind == kind, distance <= neighborhood.radius, near)
         near[row] = True
         return near
+
+    def others(self, row: int, neighborhood: Neighborhood) -> NDArray[np.bool_]:
+        """Which of the places are other places than ``row``, of those at one station only the first; bool [n].
+
+        So a place that several aligned traverses show counts once.
+        """
+        others = ~self.near(row, neighborhood)
+        if not (self.track != self.sequence).any():
+            return others
+        at = np.flatnonzero(others & (self.track != NO_SEQUENCE))
+        _, first = np.unique(np.stack([self.track[at], self.station[at]]), axis=1, return_index=True)
+        others[np.delete(at, first)] = False
+        return others

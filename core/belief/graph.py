@@ -47,6 +47,7 @@ class PlaceGraph:
     reach: metres within which neighbours were looked for.
     neighborhood: which places are the same place.
     whereabouts: of the n places, in the graph's order.
+    along_tracks: int64 [n], the places by track and station; none, if every place is on its own sequence's track.
     """
 
     rows: NDArray[np.int64]
@@ -63,6 +64,7 @@ class PlaceGraph:
     reach: float
     neighborhood: Neighborhood
     whereabouts: Whereabouts
+    along_tracks: NDArray[np.int64]
 
     @property
     def geographic(self) -> bool:
@@ -76,7 +78,7 @@ class PlaceGraph:
     def bytes(self) -> int:
         """Memory of its arrays, in bytes."""
         arrays = (self.rows, self.index, self.first, self.last, self.posed, self.coordinates, self.shrink)
-        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets))
+        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets, self.along_tracks))
 
     def places_at(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
         """The places at rows of the map, int32 [k]; -1 for rows without a living place, and for rows added since."""
@@ -88,8 +90,8 @@ class PlaceGraph:
     def same_place(self, place: int) -> NDArray[np.int64]:
         """The places that are the same place as one, itself included; int64 [m], ascending.
 
-        Only places that are joined to it and places beside it in its sequence are considered, so that the time does
-        not grow with the map.
+        Only places that are joined to it and places beside it in its sequence or on its track are considered, so that
+        the time does not grow with the map.
         """
         where = self.whereabouts
         found: NDArray[np.int64] = same_place(
@@ -103,7 +105,19 @@ class PlaceGraph:
             self.neighborhood.radius,
             self.neighborhood.frames if where.sequence[place] != NO_SEQUENCE else 0,
         )
-        return found
+        return np.union1d(found, self._beside_on_track(place)) if len(self.along_tracks) else found
+
+    def _beside_on_track(self, place: int) -> NDArray[np.int64]:
+        """The same places among those at few stations of one track; int64 [k]."""
+        where, order = self.whereabouts, self.along_tracks
+        track, station, frames = where.track[place], where.station[place], self.neighborhood.frames
+        if track == NO_SEQUENCE:
+            return np.empty(0, np.int64)
+        low, high = np.searchsorted(where.track, [track, track + 1], sorter=order)
+        on_track = order[low:high]
+        low, high = np.searchsorted(where.station[on_track], [station - frames, station + frames + 1])
+        beside = on_track[low:high]
+        return beside[where.take(np.append(place, beside)).near(0, self.neighborhood)[1:]]
 
 
 def place_graph(
@@ -137,6 +151,8 @@ def place_graph(
     reach = max(neighborhood.radius, SPACINGS * spacing)
     heading = _headings(where, coordinates, shrink, follows)
     starts, targets = _edges(where, first, last, reach)
+    aligned = (where.track != where.sequence).any()
+    along_tracks = np.lexsort((where.station, where.track)) if aligned else np.empty(0, np.int64)
     return PlaceGraph(
         rows=living,
         index=index,
@@ -152,6 +168,7 @@ def place_graph(
         reach=reach,
         neighborhood=neighborhood,
         whereabouts=where,
+        along_tracks=along_tracks,
     )
 
 

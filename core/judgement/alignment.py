@@ -96,7 +96,8 @@ def shared_stretches(
     Args:
         scores: of frames of the first traverse against frames of the second; frames are numbered from 0 in the order
             in which they were taken.
-        first, second: how many frames the traverses have.
+        first, second: how many frames the traverses have; the first may have at most ``LARGEST_STEP`` times fewer
+            frames of the same way.
         advance: is told how many pairs of frames were scored since it was last called; what it raises ends the search.
     """
     if min(first, second) < LEAST_FRAMES:

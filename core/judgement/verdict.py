@@ -282,7 +282,7 @@ class _Ranking:
     """A ranking, and which of its places are other than the best match.
 
     others: int64 [m], positions of the other places.
-    compared: int64 [k], those of them whose scores are compared with the best.
+    compared: int64 [k], those of them whose scores are compared with the best, one for each station.
     apart: bool [n], the places that cannot overlap with the best match.
     geometry: what verification found of the n places; None if none was verified.
     """
@@ -310,6 +310,7 @@ class _Ranking:
         others = np.flatnonzero(~whereabouts.near(0, neighborhood))
         closely = others[others < examined] if isinstance(examined, int) else others[examined[others]]
         compared = closely if np.any(examined) else others
+        compared = compared[whereabouts.others(0, neighborhood)[compared]]
         apart = np.ones(len(scores), np.bool_)
         if len(others) < FULL:  # nothing is estimated otherwise
             apart = ~whereabouts.near(0, neighborhood.times(GUARD_FACTOR))

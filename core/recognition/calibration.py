@@ -111,12 +111,12 @@ def queries_from_traverse(
 
     Args:
         pairs: for places of the sequence the id of a place of another sequence that shows the same, or None if there
-            is none; without ``pairs`` the poses tell which places are the same.
+            is none; without ``pairs`` the poses tell which places are the same, and alignment where there are none.
         most: the largest number of queries; they are spread evenly over the sequence.
 
     Raises:
         UnknownSequence, UnknownPlace: the map has no sequence of this name, or no place of one of the ids.
-        CalibrationImpossible: the frames have no poses, and ``pairs`` is None.
+        CalibrationImpossible: the frames have neither poses nor counterparts, and ``pairs`` is None.
     """
     members = _members(map_, sequence)
     queried = members if pairs is None else list(pairs)
@@ -127,10 +127,16 @@ def queries_from_traverse(
     own[[rows[place] for place in members]] = True
     near = _SamePlace(snapshot, neighborhood_of(map_))
     if pairs is None:
-        queried = [place for place in queried if snapshot.whereabouts.kind[rows[place]] != NO_POSE]
+        others = snapshot.alive & ~own
+        queried = [
+            place
+            for place in queried
+            if snapshot.whereabouts.kind[rows[place]] != NO_POSE or (near(rows[place]) & others).any()
+        ]
         if not queried:
             raise CalibrationImpossible(
-                f"The frames of the sequence {sequence[:128]!r} have no poses: state in pairs which places they show."
+                f"The frames of the sequence {sequence[:128]!r} have no poses: align the sequence with another one, or "
+                "state in pairs which places they show."
             )
     queried = _spread(queried, most)
     nothing = np.zeros(snapshot.rows, np.bool_)

@@ -246,7 +246,7 @@ def likeness(map_: Map, encoder: Encoder, candidates: Candidates, positions: Pos
 
 def _is_enough(candidates: Candidates, neighborhood: Neighborhood, has_second_stage: bool) -> bool:
     """Whether the candidates have as many places other than the best place as a verdict considers."""
-    others = ~candidates.whereabouts.near(0, neighborhood)
+    others = candidates.whereabouts.others(0, neighborhood)
     return int((others & candidates.examined if has_second_stage else others).sum()) >= TOP_PLACES
 
 
@@ -295,7 +295,7 @@ def examine(
         raised[ahead] += gains(ahead)
         done[ahead] = True
         best = int(np.flatnonzero(done)[np.argmax(raised[done])])
-        elsewhere = ~whereabouts.near(best, neighborhood)
+        elsewhere = whereabouts.others(best, neighborhood)
         missing = max(0, others - int((done & elsewhere).sum()))
         ahead = np.flatnonzero(elsewhere & ~done)[:missing]
     order = np.argsort(-raised, kind="stable")

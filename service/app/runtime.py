@@ -80,7 +80,7 @@ class Runtime:
         register(calibration.KIND, partial(calibration.run_job, engine))
         register(
             bulk_enrolment.KIND,
-            partial(bulk_enrolment.enrol_staged, engine, staging),
+            partial(bulk_enrolment.enrol_staged, engine, staging, alignment.align_enrolled),
             partial(bulk_enrolment.discard, staging),
         )
 

@@ -15,6 +15,7 @@ from rich.markup import escape
 from service.commands.connection.batches import Outcome, enrol_frames
 from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress, remark
+from service.commands.jobs import show_outcome, submit
 from service.commands.traverse import Frame, read_traverse, unlisted
 
 
@@ -56,6 +57,9 @@ def enroll(
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
+    align: Annotated[
+        bool, typer.Option("--align", help="Then find which frames show places that the map had already.")
+    ] = False,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
@@ -72,8 +76,31 @@ def enroll(
     began = time.monotonic()
     report = run(_enroll(Target(url, data_dir), map_id, frames, create, {"encoder": encoder, "keep": keep}))
     _show(report, map_id, frames, time.monotonic() - began)
+    if align:
+        body = {"sequence": frames[0].sequence}
+        _show_aligned(submit(Target(url, data_dir), path_of("maps", map_id, "align"), body, wait=True))
     if report.failures:
         raise typer.Exit(1)
+
+
+def _show_aligned(job: dict[str, Any]) -> None:
+    """Say what the job has found.
+
+    Raises:
+        Failure: it has failed or was cancelled.
+    """
+    if job["state"] != "succeeded":
+        show_outcome(job, as_json=False)
+        return
+    found = job["result"]
+    told = ", ".join(f"{one['sequence']}: {one['paired']}" for one in found["traverses"] if one["paired"])
+    output.print(
+        f"{found['paired']} of {found['frames']} frames show places of other traverses{f' ({told})' if told else ''}; "
+        f"{found['poses_handed_over']} poses were handed over.",
+        soft_wrap=True,
+        markup=False,
+        highlight=False,
+    )
 
 
 async def _enroll(

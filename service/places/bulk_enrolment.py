@@ -6,7 +6,7 @@ noted are recognized by their digest, and their places stay as they are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +43,17 @@ PART = "places"
 """The form's part with the JSON array of places."""
 
 
-async def receive(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request) -> Job:
+Align = Callable[[Engine, JobContext, Sequence[str]], list[dict[str, Any]]]
+"""Aligns traverses of a job's map with its others, and returns a report for each."""
+
+
+async def receive(
+    engine: Engine, jobs: Jobs, staging: Staging, map_: Map, request: Request, align: bool = False
+) -> Job:
     """Write a form to disk as it arrives, and submit a job for it; both are on disk when this returns.
+
+    Args:
+        align: whether the job aligns the traverses of the form with those that the map has.
 
     Raises:
         JobQueueFull, StagingFull: the form was not read.
@@ -63,15 +72,16 @@ async def receive(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, reque
     most = settings.max_bulk_items + FIELD_PARTS
     header = request.headers["content-type"]
     name = await staging.receive(request.stream(), header, announced, most, settings.max_image_bytes)
-    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name))
+    return await to_its_end(lambda: _submit(engine, jobs, staging, map_, name, align))
 
 
-def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str) -> Job:
+def _submit(engine: Engine, jobs: Jobs, staging: Staging, map_: Map, name: str, align: bool) -> Job:
     """Submit a job for a form; if that fails, the form is removed."""
     try:
         count = len(_read_form(engine, staging.open(name))[0])
         maps = {map_.record.id: creation_time(map_)}
-        return jobs.submit(KIND, map_.record.id, arguments={"form": name, "places": count}, maps=maps)
+        arguments = {"form": name, "places": count, "align": align}
+        return jobs.submit(KIND, map_.record.id, arguments=arguments, maps=maps)
     except BaseException:
         staging.remove(name)
         raise
@@ -99,8 +109,8 @@ def _read_form(engine: Engine, form: StagedForm) -> tuple[list[Any], dict[str, S
     return entries, {part.name: part for part in files}
 
 
-def enrol_staged(engine: Engine, staging: Staging, context: JobContext) -> Mapping[str, Any]:
-    """The work of a job: enrol the frames of its form, from where an earlier attempt stopped.
+def enrol_staged(engine: Engine, staging: Staging, align: Align, context: JobContext) -> Mapping[str, Any]:
+    """The work of a job: enrol the frames of its form, from where an earlier attempt stopped; then align them if asked.
 
     Returns:
         The result of the job.
@@ -110,7 +120,11 @@ def enrol_staged(engine: Engine, staging: Staging, context: JobContext) -> Mappi
             were stored before stay.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
-    return _BulkEnrolment(engine, staging, context).run()
+    enrolment = _BulkEnrolment(engine, staging, context)
+    result = enrolment.run()
+    if not context.arguments.get("align", False):
+        return result
+    return {**result, "aligned": align(engine, context, enrolment.sequences())}
 
 
 @dataclass
@@ -166,6 +180,11 @@ class _BulkEnrolment:
             "changes": outcome.changes,
             "failed": {"count": outcome.failed, "items": outcome.named},
         }
+
+    def sequences(self) -> list[str]:
+        """The names of the form's traverses, in the order of their first entries."""
+        names = [entry.get("sequence") for entry in self.entries if isinstance(entry, dict)]
+        return list(dict.fromkeys(name for name in names if isinstance(name, str)))
 
     def _enrol_some(self) -> None:
         """Encode and store the frames of one commit."""

@@ -90,6 +90,11 @@ class BatchParameters(Parameters):
 
     encoder: EncoderAssertion = None
     background: bool = Field(default=False, description="Answer 202 with a job as soon as all frames are on disk.")
+    align: bool = Field(
+        default=False,
+        description="With background: align the traverses of the form with those that the map has, once all frames "
+        "are enrolled, as POST …/align does; the job's result has the reports in `aligned`.",
+    )
     batch: BatchName = Field(
         default=None,
         description="A name for this batch, for example a random one, to which another batch can refer with after.",
@@ -107,6 +112,8 @@ class BatchParameters(Parameters):
             raise ValueError(
                 "batch and after cannot be used with background, only in requests that are answered once all is stored"
             )
+        if self.align and not self.background:
+            raise ValueError("align needs background: it takes longer than a request may wait")
         if self.batch is not None and self.batch == self.after:
             raise ValueError("a batch cannot come after itself")
         return self

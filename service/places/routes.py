@@ -159,7 +159,8 @@ async def enrol_places(
 
     With `background` the request may be as long as a traverse: it is written to disk as it arrives, and answered with
     `202` and a job once it has arrived completely. The job stores a few frames at a time, goes on after a restart of
-    the service, and reports the frames that failed in its result.
+    the service, and reports the frames that failed in its result. With `align` it then finds which of the enrolled
+    frames show places that the map had already.
 
     To go on with a traverse that was interrupted, first send only the `sha256` of each frame: only the frames answered
     with `frame-needed` have to be sent.
@@ -231,7 +232,7 @@ async def _enrol_later(
 ) -> Response:
     map_ = await engine.map(map_id)
     engine.assert_encoder(map_, options.encoder)
-    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request)
+    job = await bulk_enrolment.receive(engine, jobs, staging, map_, request, options.align)
     request.state.noted = {"map": map_id, "frames": job.arguments["places"], "job": job.id}
     return accepted(job, engine.settings)
 

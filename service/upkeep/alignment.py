@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
-from core.judgement.alignment import LEAST_FRAMES, shared_stretches
+from core.judgement.alignment import LARGEST_STEP, LEAST_FRAMES, shared_stretches
 from core.places import NO_POSE
 from core.storage import Map, Snapshot
 from core.storage.counterparts import Correspondence
@@ -23,6 +23,7 @@ from core.storage.transfer import Outline
 from core.upkeep.correspondence import common_stations, handed_over, on_its_own
 from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames
+from service.errors.problems import problem_of
 from service.jobs.context import JobContext, yield_to_requests
 
 KIND = "align"
@@ -87,6 +88,23 @@ def align_sequence(
         if not dry_run:
             map_.counterparts.store(change)
     return _report(traverses, sequence, first, found, change) | {"compared": total, "stored": not dry_run}
+
+
+def align_enrolled(engine: Engine, context: JobContext, sequences: Sequence[str]) -> list[dict[str, Any]]:
+    """Align traverses that the job has enrolled with all others of its map; a report for each.
+
+    Instead of the report of a traverse that is too short, or gone by now, there is the problem.
+
+    Raises:
+        As :func:`align`, without UnknownSequence and TooFewFrames.
+    """
+    reports: list[dict[str, Any]] = []
+    for sequence in sequences:
+        try:
+            reports.append(align_sequence(engine, context, sequence))
+        except (UnknownSequence, TooFewFrames) as error:
+            reports.append({"sequence": sequence, "problem": problem_of(error).model_dump(exclude_none=True)})
+    return reports
 
 
 def check_request(map_: Map, sequence: str, others: Sequence[str] | None) -> None:
@@ -157,14 +175,21 @@ class Shared:
 
 
 def _shared(snapshot: Snapshot, name: str, first: Rows, second: Rows, advance: Callable[[int], None]) -> Shared:
-    """Compare two traverses by the inner products of their descriptors."""
+    """Compare two traverses by the inner products of their descriptors.
+
+    If the other one has so many more frames that a path could not keep up with it, its frames are matched with those
+    of the first.
+    """
+    turned = len(second) > LARGEST_STEP * len(first)
+    along, beside = (second, first) if turned else (first, second)
 
     def scores(frames: Rows) -> Callable[[Rows], NDArray[np.float32]]:
-        asked = snapshot.descriptors_at(first[frames])
-        return lambda others: asked @ snapshot.descriptors_at(second[others]).T
+        asked = snapshot.descriptors_at(along[frames])
+        return lambda others: asked @ snapshot.descriptors_at(beside[others]).T
 
-    found = shared_stretches(scores, len(first), len(second), advance)
-    stretches = [np.stack([first[one.first], second[one.second]], axis=1) for one in found]
+    found = shared_stretches(scores, len(along), len(beside), advance)
+    stretches = [np.stack([along[one.first], beside[one.second]], axis=1) for one in found]
+    stretches = [pairs[:, ::-1] for pairs in stretches] if turned else stretches
     return Shared(name, second, stretches, [one.total for one in found])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from core.places import METRIC, NO_SEQUENCE, Neighborhood, Whereabouts
+from core.places import METRIC, NO_POSE, NO_SEQUENCE, Neighborhood, Whereabouts
 
 NEARBY = Neighborhood(5.0, 1)
 # Traverse 0 has four frames.  Of traverse 1 the second and third show what stations 1 and 2 of traverse 0 show, and a
@@ -63,3 +63,18 @@ def test_parts_are_taken_and_joined_with_all_columns() -> None:
         np.testing.assert_array_equal(getattr(again, name), column)
         assert getattr(again, name).dtype == column.dtype
     assert len(Whereabouts.joined([])) == 0
+
+
+def test_of_other_places_at_one_station_only_the_first_counts() -> None:
+    """A ranking of three traverses, of which the last two are aligned; one place belongs to no sequence."""
+    sequence = np.array([0, 1, 2, 2, 1, 1, NO_SEQUENCE, NO_SEQUENCE], np.int32)
+    ordinal = np.array([9, 5, 3, 0, 9, 6, 0, 1])
+    track = np.where(sequence == 2, 1, sequence).astype(np.int32)
+    station = np.array([9, 5, 5, 9, 9, 6, 0, 1])
+    count = len(sequence)
+    columns = (np.full(count, NO_POSE, np.int8), np.zeros((count, 3)), sequence, ordinal)
+    where = Whereabouts(*columns, track=track, station=station)
+    assert np.flatnonzero(where.others(0, Neighborhood(1, 0))).tolist() == [1, 3, 5, 6, 7]
+    assert np.flatnonzero(where.others(1, Neighborhood(1, 1))).tolist() == [0, 3, 6, 7]
+    alone = Whereabouts(*columns)
+    np.testing.assert_array_equal(alone.others(1, Neighborhood(1, 1)), ~alone.near(1, Neighborhood(1, 1)))

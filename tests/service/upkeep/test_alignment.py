@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -175,6 +176,17 @@ def test_a_third_traverse_aligns_with_either(runtime: Runtime, lab: Map, order: 
     assert all(there[f"a{n}"] == there[f"b{n - 5}"] == there[f"c{n - 10}"] for n in range(10, 40))
 
 
+def test_a_traverse_with_a_few_frames_of_a_long_way(runtime: Runtime, lab: Map) -> None:
+    """More than three frames of the other traverse go by from one of its frames to the next."""
+    way = walk(seed=5, count=20)
+    visit(lab, "dense", np.repeat(way, 5, axis=0), seed=3)
+    visit(lab, "sparse", way, seed=4)
+    only: dict[str, Any] = {"with": ["dense"]}
+    assert result(runtime, "sparse", **only)["paired"] >= 18
+    there = at(lab)
+    assert sum(there[f"sparse{n}"] in [there[f"dense{5 * n + k}"] for k in range(5)] for n in range(20)) >= 18
+
+
 def test_traverses_that_share_nothing(runtime: Runtime, lab: Map) -> None:
     visit(lab, "elsewhere", walk(seed=9), seed=3)
     before = state(runtime)
@@ -289,6 +301,30 @@ def test_aligning_over_http(server: Server) -> None:
     there = places(server, "aligned")
     assert there["t4"]["pose_of"] == "m6" and there["t4"]["pose"] == there["m6"]["pose"]
     assert there["m6"]["pose_of"] is None
+
+
+def test_enrolling_with_alignment(server: Server) -> None:
+    server.create_map("joined", encoder=COARSE)
+    enrol_frames(server, "joined", [encoded(scene(n)) for n in range(14)], "m", sequence="monday")
+    files = {f"f{n}": (f"f{n}", encoded(seen_again(scene(n), n)), "image/jpeg") for n in range(14)}
+    listed = [{"id": f"t{n}", "file": f"f{n}", "sequence": "tuesday"} for n in range(14)]
+    listed += [{"id": "w0", "file": "f0", "sequence": "wednesday"}]
+    form: dict[str, Any] = {"data": {"places": json.dumps(listed)}, "files": files}
+    address = "/v1/maps/joined/places"
+    assert_problem(server.client.post(f"{address}?align=true", **form), 422, "invalid-request")
+    done = finished(server, server.client.post(f"{address}?background=true&align=true", **form).json())
+    assert done["state"] == "succeeded", done
+    tuesday, wednesday = done["result"]["aligned"]
+    assert tuesday["sequence"] == "tuesday" and tuesday["paired"] >= 12
+    assert wednesday["problem"]["type"].endswith("too-few-frames")
+    assert places(server, "joined")["t4"]["pose_of"] == "m4"
+
+    again = finished(server, asked(server, "joined", "align", sequence="tuesday", poses=False))
+    assert again["result"]["poses_taken_back"] == tuesday["paired"]
+    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.7}}
+    calibrated = server.client.post("/v1/maps/joined/calibrate", json=order)
+    assert calibrated.status_code == 200, calibrated.text
+    assert calibrated.json()["measurement"]["known"] == tuesday["paired"], "counterparts stand in for poses"
 
 
 def test_what_cannot_be_aligned(server: Server) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.service.commands.conftest import Placerec
 from tests.service.encoders import COARSE, install_coarse_encoder
-from tests.service.scenes import encoded, scene
+from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import Server
 
 
@@ -67,6 +67,29 @@ def test_looking_after_maps(placerec: Placerec, where: list[str], monday: Path, 
     assert "succeeded" in placerec("jobs", "wait", listed[0]["id"], *where).stdout
     assert "already" in placerec("jobs", "cancel", listed[0]["id"], *where, status=1).stderr
     placerec("jobs", "show", "none", *where, status=1)
+
+
+def test_aligning_traverses(placerec: Placerec, where: list[str], tmp_path: Path) -> None:
+    name = f"aligned-{len(where)}"
+    placerec("maps", "create", name, "--encoder", COARSE, *where)
+    for day in range(2):
+        folder = tmp_path / f"day{day}"
+        folder.mkdir()
+        for index in range(12):
+            frame = scene(index) if not day else seen_again(scene(index), index)
+            (folder / f"{day}-{index}.jpg").write_bytes(encoded(frame))
+    first = placerec("enroll", tmp_path / "day0", "--map", name, "--align", *where).stdout
+    assert "0 of 12 frames show places of other traverses" in first
+    second = placerec("enroll", tmp_path / "day1", "--map", name, "--align", *where).stdout
+    assert "frames show places of other traverses (day0: 1" in second
+    asked = ("maps", "align", name, "--sequence", "day1", "--json", *where)
+    told = json.loads(placerec(*asked, "--with", "day0", "--no-poses", "--dry-run").stdout)
+    assert told["arguments"] == {"sequence": "day1", "with": ["day0"], "poses": False, "dry_run": True}
+    assert not told["result"]["stored"] and told["result"]["paired"] >= 10
+    undone = json.loads(placerec(*asked, "--undo").stdout)
+    assert undone["result"]["stations_changed"] >= 10
+    assert "day2" in placerec("maps", "align", name, "--sequence", "day2", *where, status=1).stderr
+    placerec(*asked, "--undo", "--with", "day0", status=2)
 
 
 def test_a_job_that_fails_ends_in_a_sentence(placerec: Placerec, where: list[str]) -> None:
