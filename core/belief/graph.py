@@ -1,12 +1,14 @@
 """The places of a map as a graph of ways from one to the next: along their sequences, and from pose to pose.
 
 A belief has one probability for each living place, in the order of this graph: by sequence, and within a sequence by
-ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.
+ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.  Places
+of several traverses that were aligned with each other are at one station of a track: they are the same place.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +49,8 @@ class PlaceGraph:
     reach: metres within which neighbours were looked for.
     neighborhood: which places are the same place.
     whereabouts: of the n places, in the graph's order.
+    stations: int32 [n], a number for each station of a track: places of several sequences with one number show the
+        same.  Empty if no two sequences share a station.
     """
 
     rows: NDArray[np.int64]
@@ -63,6 +67,14 @@ class PlaceGraph:
     reach: float
     neighborhood: Neighborhood
     whereabouts: Whereabouts
+    stations: NDArray[np.int32]
+
+    @cached_property
+    def _by_station(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The places in the order of track and station, and the key of each in that order; int64 [n] each."""
+        keys = _station_keys(self.whereabouts.track, self.whereabouts.station)
+        order = np.argsort(keys, kind="stable")
+        return order, keys[order]
 
     @property
     def geographic(self) -> bool:
@@ -76,7 +88,7 @@ class PlaceGraph:
     def bytes(self) -> int:
         """Memory of its arrays, in bytes."""
         arrays = (self.rows, self.index, self.first, self.last, self.posed, self.coordinates, self.shrink)
-        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets))
+        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets, self.stations))
 
     def places_at(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
         """The places at rows of the map, int32 [k]; -1 for rows without a living place, and for rows added since."""
@@ -103,7 +115,31 @@ class PlaceGraph:
             self.neighborhood.radius,
             self.neighborhood.frames if where.sequence[place] != NO_SEQUENCE else 0,
         )
-        return found
+        if not len(self.stations) or where.track[place] == NO_SEQUENCE:
+            return found
+        order, keys = self._by_station
+        reach = where.station[place] + np.array([-1, 1]) * self.neighborhood.frames
+        low, high = _station_keys(where.track[[place, place]], reach)
+        beside = order[np.searchsorted(keys, low) : np.searchsorted(keys, high, side="right")]
+        # Two poses of one kind are compared by their distance alone.
+        apart = (where.kind[beside] == where.kind[place]) & (where.kind[place] != NO_POSE)
+        return np.union1d(found, beside[~apart])
+
+
+def _station_keys(track: NDArray[np.int32], station: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers that order places by track, then by station; int64 [n]."""
+    return (track.astype(np.int64) << 40) + station
+
+
+def _stations(where: Whereabouts) -> NDArray[np.int32]:
+    """A number for each station, int32 [n]; empty if no two sequences share one."""
+    if not (where.track != where.sequence).any():
+        return np.empty(0, np.int32)
+    alone = np.flatnonzero(where.track == NO_SEQUENCE)
+    keys = _station_keys(where.track, where.station)
+    keys[alone] = -1 - np.arange(len(alone)) - (1 << 60)  # a place without a track is at a station of its own
+    _, numbers = np.unique(keys, return_inverse=True)
+    return numbers.astype(np.int32)
 
 
 def place_graph(
@@ -152,6 +188,7 @@ def place_graph(
         reach=reach,
         neighborhood=neighborhood,
         whereabouts=where,
+        stations=_stations(where),
     )
 
 
