@@ -1,12 +1,14 @@
 """The places of a map as a graph of ways from one to the next: along their sequences, and from pose to pose.
 
 A belief has one probability for each living place, in the order of this graph: by sequence, and within a sequence by
-ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.
+ordinal, so that "k frames later" is "k entries later".  Places with poses are also joined to those near them.  Places
+of several traverses that were aligned with each other are at one station of a track: they are the same place.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +49,8 @@ class PlaceGraph:
     reach: metres within which neighbours were looked for.
     neighborhood: which places are the same place.
     whereabouts: of the n places, in the graph's order.
-    along_tracks: int64 [n], the places by track and station; none, if every place is on its own sequence's track.
+    stations: int32 [n], a number for each station of a track: places of several sequences with one number show the
+        same.  Empty if no two sequences share a station.
     """
 
     rows: NDArray[np.int64]
@@ -64,7 +67,14 @@ class PlaceGraph:
     reach: float
     neighborhood: Neighborhood
     whereabouts: Whereabouts
-    along_tracks: NDArray[np.int64]
+    stations: NDArray[np.int32]
+
+    @cached_property
+    def _by_station(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """The places in the order of track and station, and the key of each in that order; int64 [n] each."""
+        keys = _station_keys(self.whereabouts.track, self.whereabouts.station)
+        order = np.argsort(keys, kind="stable")
+        return order, keys[order]
 
     @property
     def geographic(self) -> bool:
@@ -78,7 +88,7 @@ class PlaceGraph:
     def bytes(self) -> int:
         """Memory of its arrays, in bytes."""
         arrays = (self.rows, self.index, self.first, self.last, self.posed, self.coordinates, self.shrink)
-        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets, self.along_tracks))
+        return sum(array.nbytes for array in (*arrays, self.heading, self.starts, self.targets, self.stations))
 
     def places_at(self, rows: NDArray[np.int64]) -> NDArray[np.int32]:
         """The places at rows of the map, int32 [k]; -1 for rows without a living place, and for rows added since."""
@@ -90,8 +100,8 @@ class PlaceGraph:
     def same_place(self, place: int) -> NDArray[np.int64]:
         """The places that are the same place as one, itself included; int64 [m], ascending.
 
-        Only places that are joined to it and places beside it in its sequence or on its track are considered, so that
-        the time does not grow with the map.
+        Only places that are joined to it and places beside it in its sequence are considered, so that the time does
+        not grow with the map.
         """
         where = self.whereabouts
         found: NDArray[np.int64] = same_place(
@@ -105,19 +115,31 @@ class PlaceGraph:
             self.neighborhood.radius,
             self.neighborhood.frames if where.sequence[place] != NO_SEQUENCE else 0,
         )
-        return np.union1d(found, self._beside_on_track(place)) if len(self.along_tracks) else found
+        if not len(self.stations) or where.track[place] == NO_SEQUENCE:
+            return found
+        order, keys = self._by_station
+        reach = where.station[place] + np.array([-1, 1]) * self.neighborhood.frames
+        low, high = _station_keys(where.track[[place, place]], reach)
+        beside = order[np.searchsorted(keys, low) : np.searchsorted(keys, high, side="right")]
+        # Two poses of one kind are compared by their distance alone.
+        apart = (where.kind[beside] == where.kind[place]) & (where.kind[place] != NO_POSE)
+        return np.union1d(found, beside[~apart])
 
-    def _beside_on_track(self, place: int) -> NDArray[np.int64]:
-        """The same places among those at few stations of one track; int64 [k]."""
-        where, order = self.whereabouts, self.along_tracks
-        track, station, frames = where.track[place], where.station[place], self.neighborhood.frames
-        if track == NO_SEQUENCE:
-            return np.empty(0, np.int64)
-        low, high = np.searchsorted(where.track, [track, track + 1], sorter=order)
-        on_track = order[low:high]
-        low, high = np.searchsorted(where.station[on_track], [station - frames, station + frames + 1])
-        beside = on_track[low:high]
-        return beside[where.take(np.append(place, beside)).near(0, self.neighborhood)[1:]]
+
+def _station_keys(track: NDArray[np.int32], station: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers that order places by track, then by station; int64 [n]."""
+    return (track.astype(np.int64) << 40) + station
+
+
+def _stations(where: Whereabouts) -> NDArray[np.int32]:
+    """A number for each station, int32 [n]; empty if no two sequences share one."""
+    if not (where.track != where.sequence).any():
+        return np.empty(0, np.int32)
+    alone = np.flatnonzero(where.track == NO_SEQUENCE)
+    keys = _station_keys(where.track, where.station)
+    keys[alone] = -1 - np.arange(len(alone)) - (1 << 60)  # a place without a track is at a station of its own
+    _, numbers = np.unique(keys, return_inverse=True)
+    return numbers.astype(np.int32)
 
 
 def place_graph(
@@ -151,8 +173,6 @@ def place_graph(
     reach = max(neighborhood.radius, SPACINGS * spacing)
     heading = _headings(where, coordinates, shrink, follows)
     starts, targets = _edges(where, first, last, reach)
-    aligned = (where.track != where.sequence).any()
-    along_tracks = np.lexsort((where.station, where.track)) if aligned else np.empty(0, np.int64)
     return PlaceGraph(
         rows=living,
         index=index,
@@ -168,7 +188,7 @@ def place_graph(
         reach=reach,
         neighborhood=neighborhood,
         whereabouts=where,
-        along_tracks=along_tracks,
+        stations=_stations(where),
     )
 
 

@@ -2,7 +2,8 @@
 
 There are three models, each a transition matrix over the places: along the sequences (only the order of the frames is
 known), within reach (a speed limit and the time between frames are known), and by odometry (how far, which way and how
-surely).  The last two need poses; places without one always go along their sequence.  A matrix is not written out to
+surely).  The last two need poses; places without one always go along their sequence, and from there to their
+counterparts in traverses that were aligned with theirs.  A matrix is not written out to
 be applied: compiled loops (``core.kernels.belief``) go through the joined places alone.  ``matrix()`` of each model
 gives it in plain NumPy.
 """
@@ -37,6 +38,10 @@ HEADING_SPREAD = math.radians(20)
 
 TURN_NOTED = math.radians(15)
 """A robot that has turned by this much sees something else, even if it has not moved."""
+
+
+EXCHANGED = 0.1
+"""Share of a place's mass that is shared out among it and its counterparts in other traverses, at each step."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +183,26 @@ class AlongSequences:
         stays = ~self.moving | ~weights.any(axis=1)  # at rest, or in a sequence that is shorter than the stride
         weights[stays] = np.eye(len(places))[stays]
         return weights / weights.sum(axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, eq=False)
+class AcrossTraverses:
+    """Between the places of several traverses at one station, which show the same: EXCHANGED is shared out evenly.
+
+    So a robot goes on along another traverse where one ends.  The matrix is its own transpose.
+    """
+
+    graph: PlaceGraph
+
+    def __call__(self, masses: Masses, least: float, back: bool, outside: float, moved: Masses) -> tuple[float, float]:
+        stations = self.graph.stations
+        means = np.bincount(stations, weights=masses) / np.bincount(stations)
+        moved[:] = (1 - EXCHANGED) * masses + EXCHANGED * means[stations]
+        return 0.0, 0.0
+
+    def matrix(self) -> Matrix:
+        together = (self.graph.stations[:, np.newaxis] == self.graph.stations).astype(np.float64)
+        return (1 - EXCHANGED) * np.eye(len(self.graph)) + EXCHANGED * together / together.sum(axis=1, keepdims=True)
 
 
 def displacements(graph: PlaceGraph) -> NDArray[np.float64]:
@@ -328,6 +353,8 @@ def transition(graph: PlaceGraph, step: Step, stride: Stride, pending: Pending) 
     along = ~graph.posed if by_pose else np.ones(len(graph), np.bool_)
     if along.any():
         moves += [AlongSequences(graph, stride.kernel(), along)] * step.frames
+        if len(graph.stations):
+            moves.append(AcrossTraverses(graph))
     if by_pose:
         further = _by_pose(graph, step, pending)
         if further is None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,12 +20,12 @@ def test_the_same_place_is_what_the_verdict_takes_for_it(frames: int, aligned: b
     kinds = np.where(random.random(80) < 0.6, METRIC, NO_POSE).astype(np.int8)
     position = np.where(kinds[:, None] == METRIC, random.uniform(0, 30, (80, 3)) * (1, 1, 0), 0.0)
     ordinal = np.sort(random.choice(400, 80, replace=False))
-    sequence = random.integers(-1, 3, 80).astype(np.int32)
-    where = Whereabouts(kinds, position, sequence, ordinal)
-    if aligned:  # most frames of the sequences 1 and 2 show what some of the sequence 0 show
-        moved = (sequence > 0) & (random.random(80) < 0.7)
-        track, station = np.where(moved, 0, sequence).astype(np.int32), np.where(moved, ordinal // 2, ordinal)
-        where = Whereabouts(kinds, position, sequence, ordinal, track=track, station=station)
+    where = Whereabouts(kinds, position, random.integers(-1, 3, 80).astype(np.int32), ordinal)
+    if aligned:  # half of the places of sequence 1 are at stations of sequence 0
+        counterparts = (where.sequence == 1) & (random.random(80) < 0.5)
+        track = np.where(counterparts, 0, where.sequence).astype(np.int32)
+        station = np.where(counterparts, random.integers(0, 400, 80), ordinal)
+        where = replace(where, track=track, station=station)
     neighborhood = Neighborhood(3.0, frames)
     graph = graph_of(where, neighborhood)
     for place in range(80):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -123,3 +124,27 @@ def test_on_the_earth_headings_count_from_north(longitude: float) -> None:
     assert graph.spacing == pytest.approx(1, abs=1e-3)
     assert int(after(graph, 10, Step(odometry=Odometry(2.0)))[0].argmax()) == 12
     assert int(after(graph, 10, Step(odometry=Odometry(-3.0)))[0].argmax()) == 7
+
+
+def test_a_robot_goes_on_along_the_traverse_that_was_aligned() -> None:
+    where = walk(6, 6)  # the second begins at the fourth place of the first
+    shared = np.arange(12) >= 6
+    where = replace(
+        where,
+        track=np.where(shared, 0, where.sequence).astype(np.int32),
+        station=np.where(shared, where.ordinal + 3, where.ordinal),
+    )
+    graph = graph_of(where)
+    masses = np.zeros(12, np.float32)
+    masses[3] = 1
+    for _ in range(4):
+        moved = transition(graph, Step(), Stride(), Pending())
+        expected = masses @ moved.moves[0].matrix() @ moved.moves[1].matrix()
+        after, spread, gone = moved.forward(masses, 0.0)
+        np.testing.assert_allclose(after, expected, atol=1e-5)
+        assert (spread, gone) == (0, 0)
+        back = moved.backward(masses, 0.0)
+        np.testing.assert_allclose(back, moved.moves[0].matrix() @ moved.moves[1].matrix() @ masses, atol=1e-5)
+        masses = after
+    assert masses[9:].sum() > 0.05, "where the first has no place any more"
+    assert graph_of(walk(6, 6)).stations.size == 0
