@@ -54,6 +54,10 @@ class InvalidKeypoints(PlacerecError):
     """Arrays or a stored record cannot be the keypoints of a frame."""
 
 
+class UnfitIntrinsics(PlacerecError):
+    """A camera's intrinsics are of frames of another shape."""
+
+
 # Models
 
 

@@ -1,21 +1,56 @@
 """The pose of a query frame, estimated from the poses of the places that it matches.
 
-The estimate is the mean of the poses of the best match and of the matches within reach of it, weighted by their odds.
-Places further away that look alike are other answers and take no part.  On the Earth, the mean is taken of points in
-space and projected back to the surface, and headings are directions in space, so that nothing jumps at ±180° or at a
-pole.
+Without a look at the geometry, the estimate is the mean of the poses of the best match and of the matches within reach
+of it, weighted by their odds.  Places further away that look alike are other answers and take no part.  On the Earth,
+the mean is taken of points in space and projected back to the surface, and headings are directions in space, so that
+nothing jumps at ±180° or at a pole.
+
+Where verified places tell how the query's camera stands to theirs (:mod:`core.geometry.pose`), that mean is the prior
+of a least squares problem: the position x, the heading ψ and the logarithm of the scene's typical distance ζ are to
+agree with each place's shift s and turn t,
+
+    s = W^T (x - a) exp(-ζ),    t = ψ - φ,
+
+with the place's position a, its heading φ and its attitude W.  The errors of views are not independent, as they share
+the query, so n of them count as one (covariance intersection with equal weights; Julier and Uhlmann, 1997).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from core.geometry.pose import RelativeView
 from core.places import EARTH_RADIUS, GEOGRAPHIC, NO_POSE, Pose, Whereabouts
 
 Vectors = NDArray[np.float64]
+PoseSource = Literal["places", "intrinsics", "field-of-view"]
+
+UNKNOWN_HEIGHT = 1e6
+"""Variance of a height that nothing is known of, in m²."""
+UNKNOWN_ANGLE = float(np.pi**2 / 3)
+"""Variance of an angle that nothing is known of: that of a uniform distribution over the circle, in rad²."""
+TURN = float(np.radians(20))
+"""Deviation of a query's heading from that of a place which it matches, if no view of both tells it."""
+PLACE_HEADING = float(np.radians(2))
+"""Deviation of the errors of places' headings."""
+PLACE_POSITION = 0.05
+"""Deviation of the errors of places' positions, in metres."""
+LEVEL = float(np.radians(8))
+"""Deviation of a place's pitch and roll, which poses do not tell: it tilts a shift by as much."""
+DISTANCE, DISTANCE_DEVIATION = float(np.log(8)), 1.0
+"""Mean and deviation of the logarithm of the typical distance of a scene in metres: mostly 3 to 22 m."""
+CONTRADICTION = 30.0
+"""Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
+_STEPS = 8
+
+
+def _unknown() -> Vectors:
+    return np.diag([UNKNOWN_HEIGHT] * 3 + [UNKNOWN_ANGLE] * 3)
 
 
 @dataclass(frozen=True)
@@ -23,14 +58,32 @@ class PoseEstimate:
     """An estimated pose, with a heading if the places have any, and its uncertainty.
 
     spread: metres, the standard deviation of the distance; see :func:`estimate_pose`.
-    heading_spread: degrees, the circular standard deviation; None with fewer than two headings.
+    heading_spread: degrees.  The circular standard deviation of the places' headings, None with fewer than two; or, if
+        views tell the heading, the standard deviation of its error.
     places: how many places the estimate rests on.
+    covariance: float64 [6, 6], of errors in x, y, z (metres) and of rotations about x, y and z (radians), as in ROS.
+        The axes are those of the map's frame or, for a pose on the Earth, east, north and up at the pose.  The rotation
+        about z is counter-clockwise, also where headings are clockwise.  What is not known has a large variance.
+    heading_offset, offset_spread: degrees, by which the heading differs from that of the best match, counted as
+        headings are, and its standard deviation; None if no view tells it.
+    source: what the covariance rests on: the poses of places alone, or also views with intrinsics, or without.
     """
 
     pose: Pose
     spread: float
     heading_spread: float | None
     places: int
+    covariance: Vectors = field(default_factory=_unknown)
+    heading_offset: float | None = None
+    offset_spread: float | None = None
+    source: PoseSource = "places"
+
+    def without_height(self) -> PoseEstimate:
+        """The same where places have no height: the pose has none, and its variance is that of one not known."""
+        covariance = self.covariance.copy()
+        covariance[2], covariance[:, 2] = 0, 0
+        covariance[2, 2] = UNKNOWN_HEIGHT
+        return replace(self, pose=self.pose.model_copy(update={"z": None}), covariance=covariance)
 
 
 def circular_mean(degrees: ArrayLike, weights: ArrayLike) -> tuple[float, float]:
@@ -78,17 +131,26 @@ def _geographic_heading(places: Whereabouts, weights: Vectors, at: Vectors) -> t
     return float(np.degrees(np.arctan2(across, along))) % 360, _deviation(float(np.hypot(along, across)))
 
 
-def estimate_pose(places: Whereabouts, log_weights: ArrayLike, reach: float, used: int = 20) -> PoseEstimate | None:
+def estimate_pose(
+    places: Whereabouts,
+    log_weights: ArrayLike,
+    reach: float,
+    used: int = 20,
+    views: Sequence[RelativeView | None] | None = None,
+) -> PoseEstimate | None:
     """Estimate the pose of a frame from its matches.
 
-    The square of the spread is the weighted mean square distance of the poses from their mean, plus the square of half
-    the distance from the best match to its nearest neighbour among the places (half the reach if none is within it): a
-    frame taken between two places looks like one of them, and its distance from that one is not known.
+    Without views, the square of the spread is the weighted mean square distance of the poses from their mean, plus the
+    square of half the distance from the best match to its nearest neighbour among the places (half the reach if none is
+    within it): a frame taken between two places looks like one of them, and its distance from that one is not known.
+    With views, it is the sum of the variances of x and y.
 
     Args:
         places: of n matches, best first; only the first ``used`` count for the mean.
         log_weights: [n], the log odds of each match; only their differences matter.
         reach: metres from the best match within which other matches belong to its answer.
+        views: how the query's camera stands to those of the first places, in their order; None where a place was not
+            verified.  The heading of a place is taken for the direction in which its camera looks.
 
     Returns:
         None if there is no match, or the best one has no pose.
@@ -111,8 +173,118 @@ def estimate_pose(places: Whereabouts, log_weights: ArrayLike, reach: float, use
     apart = distance[(distance > 0) & (distance <= reach)]
     gap = float(apart.min()) if len(apart) else reach
     heading, heading_spread = _heading(chosen, weights, mean, on_earth)
+    axes = _axes(mean) if on_earth else np.eye(3)
+    local = (chosen.position - mean) @ axes.T
+    covariance = _unknown()
+    covariance[:3, :3] = local.T @ (weights[:, np.newaxis] * local) + np.eye(3) * (gap**2 / 8 + PLACE_POSITION**2)
+    if heading is not None:
+        covariance[5, 5] = np.radians(heading_spread or 0.0) ** 2 + TURN**2
     pose = _geographic(mean, heading) if on_earth else Pose(x=mean[0], y=mean[1], z=mean[2], heading=heading)
-    return PoseEstimate(pose, float(np.sqrt(squares + (gap / 2) ** 2)), heading_spread, len(part))
+    found = PoseEstimate(pose, float(np.sqrt(squares + (gap / 2) ** 2)), heading_spread, len(part), covariance)
+    seen = {row: view for row, view in enumerate(views or ()) if view is not None}
+    if 0 in seen:
+        sign = -1 if on_earth else 1
+        found = replace(found, heading_offset=sign * seen[0].heading_offset, offset_spread=seen[0].heading_spread)
+    directions = _directions(chosen, axes, on_earth)
+    rows = [place for place, row in enumerate(part) if row in seen and np.isfinite(directions[place])]
+    if rows and heading is not None:
+        yaw = float(np.radians(90 - heading if on_earth else heading))
+        standing = _Standing(local[rows], directions[rows], [seen[int(part[row])] for row in rows])
+        found = _fused(found, standing, yaw, mean, axes, on_earth)
+    return found.without_height() if on_earth else found
+
+
+@dataclass(frozen=True)
+class _Standing:
+    """Positions of n places from the mean, [n, 3], headings counter-clockwise from x, [n], and the views of them."""
+
+    positions: Vectors
+    directions: Vectors
+    views: list[RelativeView]
+
+
+def _fused(
+    found: PoseEstimate, standing: _Standing, yaw: float, mean: Vectors, axes: Vectors, on_earth: bool
+) -> PoseEstimate:
+    """The estimate together with what views tell; as it was if all of them contradict it."""
+    prior = np.zeros((5, 5))  # of x, y, z, ψ and ζ
+    prior[:3, :3] = found.covariance[:3, :3]
+    prior[3, 3], prior[4, 4] = found.covariance[5, 5], DISTANCE_DEVIATION**2
+    begin = np.r_[np.zeros(3), yaw, DISTANCE]
+    kept = [
+        number
+        for number in range(len(standing.views))
+        if _contradiction(begin, prior, standing, number) < CONTRADICTION
+    ]
+    if not kept:
+        return found
+    information = np.linalg.inv(prior)
+    state, normal = begin, information
+    for _ in range(_STEPS):
+        normal, gradient = information.copy(), information @ (state - begin)
+        for number in kept:
+            residual, jacobian, noise = _missed(state, standing, number)
+            weighed = jacobian.T @ np.linalg.inv(noise * len(kept))
+            normal, gradient = normal + weighed @ jacobian, gradient + weighed @ residual
+        state = state - np.linalg.solve(normal, gradient)
+    covariance = found.covariance.copy()
+    posterior = np.linalg.inv(normal)
+    which = [0, 1, 2, 5]
+    covariance[np.ix_(which, which)] = posterior[:4, :4]
+    position, degrees = mean + state[:3] @ axes, float(np.degrees(state[3]))
+    if on_earth:
+        pose = _geographic(position, (90 - degrees) % 360)
+    else:
+        pose = Pose(x=position[0], y=position[1], z=position[2], heading=degrees % 360)
+    sources = {standing.views[number].source for number in kept}
+    return replace(
+        found,
+        pose=pose,
+        spread=float(np.sqrt(covariance[0, 0] + covariance[1, 1])),
+        heading_spread=float(np.degrees(np.sqrt(covariance[5, 5]))),
+        covariance=covariance,
+        source="field-of-view" if "field-of-view" in sources else "intrinsics",
+    )
+
+
+def _missed(state: Vectors, standing: _Standing, number: int) -> tuple[Vectors, Vectors, Vectors]:
+    """By how much a state misses a view's shift and turn, [4], the derivatives, [4, 5], and the covariance, [4, 4]."""
+    position, angle, view = standing.positions[number], standing.directions[number], standing.views[number]
+    cos, sin, nearness = np.cos(angle), np.sin(angle), np.exp(-state[4])
+    back = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # W^T
+    shift = back @ (state[:3] - position) * nearness
+    turn = (state[3] - angle - np.radians(view.heading_offset) + np.pi) % (2 * np.pi) - np.pi
+    jacobian = np.zeros((4, 5))
+    jacobian[:3, :3], jacobian[:3, 4], jacobian[3, 3] = back * nearness, -shift, 1
+    which = [3, 4, 5, 2]
+    turned = np.r_[view.shift[1], -view.shift[0], 0, -1]  # by an error of the place's heading
+    noise = view.covariance[np.ix_(which, which)] + np.outer(turned, turned) * PLACE_HEADING**2
+    level = np.square(view.shift).sum() * LEVEL**2
+    noise = noise + np.diag([0, 0, level, 0]) + np.diag([1, 1, 1, 0]) * (PLACE_POSITION * nearness) ** 2
+    return np.r_[shift - view.shift, turn], jacobian, noise
+
+
+def _contradiction(state: Vectors, prior: Vectors, standing: _Standing, number: int) -> float:
+    """The squared Mahalanobis distance of a view from what a state with a prior lets expect."""
+    residual, jacobian, noise = _missed(state, standing, number)
+    return float(residual @ np.linalg.solve(jacobian @ prior @ jacobian.T + noise, residual))
+
+
+def _axes(at: Vectors) -> Vectors:
+    """Unit vectors to the east, to the north and up at a point of the sphere, [3, 3]."""
+    (north,), (east,) = _north_east(at[np.newaxis])
+    return np.stack([east, north, np.cross(east, north)])
+
+
+def _directions(places: Whereabouts, axes: Vectors, on_earth: bool) -> Vectors:
+    """Headings counter-clockwise from the first axis, in radians, [n]; NaN where they are not known."""
+    angles = np.radians(places.heading.astype(np.float64))
+    if not on_earth:
+        return angles
+    north, east = _north_east(places.position)
+    ahead = np.cos(angles)[:, np.newaxis] * north + np.sin(angles)[:, np.newaxis] * east
+    x, y, _ = (ahead @ axes.T).T
+    return np.asarray(np.arctan2(y, x))
 
 
 def _heading(places: Whereabouts, weights: Vectors, mean: Vectors, on_earth: bool) -> tuple[float | None, float | None]:

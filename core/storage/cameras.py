@@ -1,4 +1,4 @@
-"""The cameras of a map, and the masks that are ignored in their frames at enrolment and in queries."""
+"""The cameras of a map: what is ignored in their frames, and the intrinsics by which a pose is measured in them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
+from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.places import Camera, Timestamp
 from core.storage.database import row_checksums
@@ -30,6 +31,7 @@ class CameraRecord(BaseModel):
 
     name: Camera
     mask: Mask | None = Field(description="What to ignore in its frames; null: nothing.")
+    intrinsics: Intrinsics | None = Field(default=None, description="Of its upright frames; null: not known.")
     updated_at: Timestamp
 
 
@@ -76,21 +78,28 @@ class Cameras:
         """
         return None if name is None else self.find(name).mask
 
-    def put(self, name: str, mask: Mask | None) -> tuple[CameraRecord, bool]:
-        """Make a camera or replace its mask, durably; returns the camera and whether it is new.
+    def intrinsics(self, name: str | None) -> Intrinsics | None:
+        """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name.
+
+        A place may name a camera that was forgotten since.
+        """
+        found = None if name is None else self._records().get(name)
+        return None if found is None else found.intrinsics
+
+    def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.
 
         Raises:
             InvalidField: the map has too many cameras.
         """
-        made = CameraRecord(name=name, mask=mask, updated_at=datetime.now(UTC))
+        made = CameraRecord(name=name, mask=mask, intrinsics=intrinsics, updated_at=datetime.now(UTC))
         with self._writing() as write:
             known = _read(write.connection)
             if name not in known and len(known) >= MOST_CAMERAS:
                 raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
             write.connection.execute(
-                "INSERT INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)"
-                " ON CONFLICT (name) DO UPDATE SET mask = excluded.mask, updated_at = excluded.updated_at",
-                (name, None if mask is None else mask.model_dump_json(), moment_text(made.updated_at)),
+                "INSERT OR REPLACE INTO cameras (name, mask, intrinsics, updated_at) VALUES (?, ?, ?, ?)",
+                (name, _text(mask), _text(intrinsics), moment_text(made.updated_at)),
             )
             row_checksums.write_checksums(write.connection, "cameras", "name = ?", name)
         self._forget_known()
@@ -127,9 +136,17 @@ def _read(connection: sqlite3.Connection) -> dict[str, CameraRecord]:
     found = {}
     columns = ", ".join(row_checksums.CHECKED["cameras"])
     for *sealed, seal in connection.execute(f"SELECT {columns}, seal FROM cameras").fetchall():
-        name, mask, moment, _ = sealed
+        name, mask, moment, intrinsics = sealed
         if not row_checksums.is_sound(sealed, seal):
             raise Damage(f"map.sqlite: camera {name!r} does not match its checksum")
-        kept = None if mask is None else Mask.model_validate_json(mask)
-        found[name] = CameraRecord(name=name, mask=kept, updated_at=moment)
+        found[name] = CameraRecord(
+            name=name,
+            mask=None if mask is None else Mask.model_validate_json(mask),
+            intrinsics=None if intrinsics is None else Intrinsics.model_validate_json(intrinsics),
+            updated_at=moment,
+        )
     return found
+
+
+def _text(value: BaseModel | None) -> str | None:
+    return None if value is None else value.model_dump_json()

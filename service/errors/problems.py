@@ -79,6 +79,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.TooManyPixels: Kind(413, "too-many-pixels", "The frame has too many pixels"),
     errors.ImageTooSmall: Kind(422, "image-too-small", "The image is smaller than 16 pixels on one side"),
     errors.NoRegions: Kind(422, "no-regions", "The frame has no region of interest"),
+    errors.UnfitIntrinsics: Kind(422, "unfit-intrinsics", "The camera's intrinsics do not fit the frame"),
     # Models
     errors.InvalidKeypoints: Kind(500, "invalid-keypoints", "Keypoints of a place are damaged"),
     errors.InvalidModel: Kind(503, "invalid-model", "A model cannot be used"),

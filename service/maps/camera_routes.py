@@ -1,4 +1,4 @@
-"""Routes of a map's cameras: which part of their frames is ignored (a bonnet, a gantry, a time stamp)."""
+"""Routes of a map's cameras: what is ignored in their frames (a bonnet, a time stamp), and their intrinsics."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ CameraName = Annotated[
 def put_camera(
     map_id: MapId, name: CameraName, definition: CameraDefinition, engine: EngineDep, response: Response
 ) -> CameraView:
-    """Create or replace a camera: a mask of what is ignored in its frames, which name it with `?camera=`.
+    """Create or replace a camera: a mask of what is ignored in its frames, which name it with `?camera=`, and its
+    intrinsics, by which a pose is measured.
 
     The mask is applied to every frame from now on. Places that were enrolled with another mask stay as they are
-    until their frames are sent again.
+    until their frames are sent again. Intrinsics hold for all frames of the camera, enrolled ones included. What is
+    left out is removed.
     """
-    made, is_new = engine.atlas.get(map_id).cameras.put(name, definition.mask)
+    made, is_new = engine.atlas.get(map_id).cameras.put(name, definition.mask, definition.intrinsics)
     response.status_code = 201 if is_new else 200
     return CameraView(**made.__dict__)
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration
@@ -152,16 +153,32 @@ class MapChanges(BaseModel):
 CAMERA_EXAMPLE: dict[str, Any] = {
     "name": "front",
     "mask": {"polygons": [[[0, 0.85], [1, 0.85], [1, 1], [0, 1]]]},
+    "intrinsics": {
+        "width": 640,
+        "height": 480,
+        "fx": 554.3,
+        "fy": 554.3,
+        "cx": 319.5,
+        "cy": 239.5,
+        "distortion_model": "plumb_bob",
+        "distortion": [-0.28, 0.07, 0.0002, 0.0, 0.0],
+    },
     "updated_at": "2026-11-20T10:00:00Z",
 }
 
 
 class CameraDefinition(BaseModel):
-    """Which part of a camera's frames is ignored."""
+    """Which part of a camera's frames is ignored, and which direction each pixel looks in."""
 
-    model_config = ConfigDict(extra="forbid", json_schema_extra={"examples": [{"mask": CAMERA_EXAMPLE["mask"]}]})
+    model_config = ConfigDict(
+        extra="forbid",
+        json_schema_extra={"examples": [{"mask": CAMERA_EXAMPLE["mask"], "intrinsics": CAMERA_EXAMPLE["intrinsics"]}]},
+    )
 
     mask: Mask | None = Field(default=None, description="The part that is ignored; null if nothing is.")
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="Of the upright frame, as in ROS's CameraInfo; null if they are not known."
+    )
 
 
 class CameraView(BaseModel):
@@ -171,6 +188,7 @@ class CameraView(BaseModel):
 
     name: str
     mask: Mask | None
+    intrinsics: Intrinsics | None
     updated_at: Timestamp
 
 

@@ -116,14 +116,17 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedP
     """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none."""
     if estimate is None:
         return None
-    pose = estimate.pose
     if best.pose is not None and best.pose.z is None:
-        pose = pose.model_copy(update={"z": None})
+        estimate = estimate.without_height()
     return EstimatedPose(
-        **pose.model_dump(exclude_none=True),
+        **estimate.pose.model_dump(exclude_none=True),
         spread=estimate.spread,
         heading_spread=estimate.heading_spread,
         places=estimate.places,
+        heading_offset=estimate.heading_offset,
+        offset_spread=estimate.offset_spread,
+        source=estimate.source,
+        covariance=estimate.covariance.ravel().tolist(),
     )
 
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
+from core.judgement.position import PoseSource
 from core.judgement.verdict import Verdict
 from core.recognition.verification import VerificationState
 from service.errors.problems import Problem
@@ -136,12 +137,32 @@ class VerificationView(BaseModel):
     keypoints: int | None = Field(description="Keypoints of the frame; null if they were not needed.")
 
 
-class EstimatedPose(BaseModel):
-    """Where the frame was taken, from the poses of the best match and of the matches within its `same_place_radius`."""
+POSE_EXAMPLE: dict[str, Any] = {
+    "x": 1.62,
+    "y": 2.0,
+    "heading": 91.5,
+    "spread": 0.36,
+    "heading_spread": 2.3,
+    "places": 2,
+    "heading_offset": 1.5,
+    "offset_spread": 0.9,
+    "source": "intrinsics",
+    "covariance": [
+        *(0.09, 0.01, 0.0, 0.0, 0.0, 0.001),
+        *(0.01, 0.04, 0.0, 0.0, 0.0, 0.002),
+        *(0.0, 0.0, 1e6, 0.0, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 3.29, 0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0, 3.29, 0.0),
+        *(0.001, 0.002, 0.0, 0.0, 0.0, 0.0016),
+    ],
+}
 
-    model_config = ConfigDict(
-        json_schema_extra={"examples": [{"x": 1.62, "y": 2.0, "heading": 91.5, "spread": 0.6, "heading_spread": 2.1}]}
-    )
+
+class EstimatedPose(BaseModel):
+    """Where the frame was taken, from the poses of the best match and of the matches within its `same_place_radius`,
+    and from how the camera stood to theirs where places were verified."""
+
+    model_config = ConfigDict(json_schema_extra={"examples": [POSE_EXAMPLE]})
 
     x: float | None = Field(default=None, description="Metres in the map's frame, as are y and z.")
     y: float | None = None
@@ -150,11 +171,32 @@ class EstimatedPose(BaseModel):
     longitude: float | None = None
     heading: float | None = Field(default=None, description="Degrees, counted as the places' headings are.")
     spread: float = Field(
-        description="Standard deviation of the position in metres: of the poses that it is the mean of, and half the "
-        "distance from the best match to its nearest neighbour."
+        description="Standard deviation of the position in metres. With the source `places`: of the poses that it is "
+        "the mean of, and half the distance from the best match to its nearest neighbour."
     )
-    heading_spread: float | None = Field(description="Degrees; null where fewer than two of the places have a heading.")
+    heading_spread: float | None = Field(
+        description="Degrees: the standard deviation of the heading. With the source `places`: of the headings of "
+        "places, null where fewer than two have one."
+    )
     places: int = Field(description="How many places the estimate rests on.")
+    heading_offset: float | None = Field(
+        default=None,
+        description="Degrees by which the camera was turned from where that of the best match looked, counted as "
+        "headings are; left out if the best match was not verified.",
+    )
+    offset_spread: float | None = Field(default=None, description="Degrees: the standard deviation of the offset.")
+    source: PoseSource = Field(
+        default="places",
+        description="What the covariance rests on: the poses of `places` alone, or also the turn and the shift between "
+        "the pictures, by the cameras' `intrinsics` or, where one has none, by an assumed range of `field-of-view`.",
+    )
+    covariance: list[float] = Field(
+        min_length=36,
+        max_length=36,
+        description="6 x 6, row by row, as in ROS: of errors in x, y, z (metres) and of rotations about x, y and z "
+        "(radians), in the map's frame or, beside latitude and longitude, in that of east, north and up. The rotation "
+        "about z is counter-clockwise, also where headings are clockwise. What is not known has a large variance.",
+    )
 
     @model_serializer(mode="wrap")
     def _one_frame(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -187,7 +229,7 @@ class QueryAnswer(BaseModel):
                     "verdict": "recognized",
                     "place": PLACE_EXAMPLE,
                     "probability": 0.99,
-                    "pose": {"x": 1.5, "y": 2.0, "heading": 90.0, "spread": 0.9, "heading_spread": None, "places": 1},
+                    "pose": POSE_EXAMPLE,
                     "score": 0.41,
                     "margin": 0.12,
                     "decision": 0.29,
@@ -328,7 +370,7 @@ class SeveralAnswer(BaseModel):
                     "map": "lab",
                     "place": PLACE_EXAMPLE,
                     "probability": 0.98,
-                    "pose": {"x": 1.5, "y": 2.0, "heading": 90.0, "spread": 0.9, "heading_spread": None, "places": 1},
+                    "pose": POSE_EXAMPLE,
                     "matches": [{"rank": 1, "map": "lab", "probability": 0.99, "score": 0.41, "place": PLACE_EXAMPLE}],
                     "maps": [{"map": "lab", "status": 200, "verdict": "recognized", "probability": 0.99}],
                     "frames": [{"frame": "image", "camera": None, "status": 200, "regions": 600}],

@@ -143,13 +143,16 @@ def _new_names(
         conflicts.append(f"Both maps have the sequences {_listed(shared)}.")
     if taken := [name for name in sequences.values() if name in ours or len(name) > 128]:
         conflicts.append(f"The names {_listed(taken)} of sequences are taken or too long; choose another prefix.")
-    masks = {camera.name: camera.mask for camera in map_.cameras.all()}
+    kept = {camera.name: (camera.mask, camera.intrinsics) for camera in map_.cameras.all()}
     used = {place.camera for place in coming}
-    unlike = [c for c in other.cameras.all() if c.name in used and c.name in masks and masks[c.name] != c.mask]
+    shared = [camera for camera in other.cameras.all() if camera.name in used and camera.name in kept]
+    unlike = [camera for camera in shared if kept[camera.name] != (camera.mask, camera.intrinsics)]
     cameras = {camera.name: prefix + camera.name for camera in unlike} if rule == "rename" else {}
     if unlike and rule != "rename":
-        conflicts.append(f"The cameras {_listed([camera.name for camera in unlike])} have other masks here.")
-    if taken := [new for name, new in cameras.items() if len(new) > 64 or (new in masks and masks[new] is not None)]:
+        conflicts.append(
+            f"The cameras {_listed([camera.name for camera in unlike])} have other masks or intrinsics here."
+        )
+    if taken := [new for name, new in cameras.items() if len(new) > 64 or kept.get(new, (None, None)) != (None, None)]:
         conflicts.append(f"The names {_listed(taken)} of cameras are taken or too long; choose another prefix.")
     return sequences, cameras
 
@@ -237,7 +240,7 @@ def _copy_places(engine: Engine, context: JobContext, map_: Map, other: Map) -> 
         for camera in other.cameras.all():
             name = names["cameras"].get(camera.name, camera.name)
             if name in context.notes["cameras"]:
-                map_.cameras.put(name, camera.mask)
+                map_.cameras.put(name, camera.mask, camera.intrinsics)
         snapshot = other.snapshot()
         for first in range(0, len(due), PLACES_PER_COMMIT):
             yield_to_requests(engine, context)

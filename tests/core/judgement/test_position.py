@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
-from core.judgement.position import PoseEstimate, circular_mean, estimate_pose
+from core.geometry.pose import RelativeView
+from core.judgement.position import UNKNOWN_ANGLE, UNKNOWN_HEIGHT, PoseEstimate, circular_mean, estimate_pose
 from core.places import EARTH_RADIUS, Pose
 from tests.core.judgement.test_priors import places
 
@@ -110,3 +112,118 @@ def test_over_the_pole_a_heading_is_a_direction_in_space() -> None:
 def test_headings_that_cancel_out_are_none() -> None:
     found = estimate([Pose(x=0, y=0, heading=0), Pose(x=1, y=0, heading=180)])
     assert found.pose.heading is None and found.heading_spread is None
+
+
+def rotated(degrees: float) -> NDArray[np.float64]:
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def view_from(
+    place: Pose, x: float, y: float, heading: float, distance: float, random: np.random.Generator | None = None
+) -> RelativeView:
+    """How a camera at x, y stands to a place's, in units of the distance, with errors as it says."""
+    turn, shift = 0.02, 0.01
+    covariance = np.diag([turn**2] * 3 + [shift**2] * 3)
+    errors = np.zeros(6) if random is None else random.normal(size=6) * np.sqrt(np.diag(covariance))
+    assert place.x is not None and place.y is not None and place.heading is not None
+    offset = rotated(-place.heading) @ np.array([x - place.x, y - place.y, 0]) / distance + errors[3:]
+    degrees = heading - place.heading + math.degrees(errors[2])
+    return RelativeView(rotated(degrees), offset, covariance, 100, "intrinsics")
+
+
+def test_the_covariance_without_views_is_that_of_the_places_and_their_distance() -> None:
+    found = estimate([Pose(x=0, y=0, heading=90), Pose(x=4, y=0, heading=90)], [math.log(3), 0.0])
+    assert found.source == "places" and found.heading_offset is None and found.offset_spread is None
+    assert found.covariance == pytest.approx(found.covariance.T)
+    # Half the square of half the gap in each direction, and 3/4 · 1² + 1/4 · 3² along the places.
+    assert found.covariance[0, 0] == pytest.approx(3 + 2, rel=0.01)
+    assert found.covariance[1, 1] == pytest.approx(2, rel=0.01)
+    assert found.covariance[3, 3] == found.covariance[4, 4] == UNKNOWN_ANGLE
+    assert 15 < math.degrees(math.sqrt(found.covariance[5, 5])) < 30
+    assert estimate([Pose(x=0, y=0)]).covariance[5, 5] == UNKNOWN_ANGLE
+    assert found.without_height().covariance[2].tolist() == [0, 0, UNKNOWN_HEIGHT, 0, 0, 0]
+    assert found.without_height().pose.z is None
+
+
+@pytest.mark.parametrize("distance", [3.0, 8.0, 25.0])
+def test_two_views_put_the_query_between_their_places(distance: float) -> None:
+    poses: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=4, y=0, heading=10)]
+    views = [view_from(pose, 3, -0.5, 15, distance) for pose in poses if pose is not None]
+    found = estimate_pose(places(poses), [0, 0], REACH, views=views)
+    assert found is not None and found.source == "intrinsics" and found.places == 2
+    assert [found.pose.x, found.pose.y] == pytest.approx([3, -0.5], abs=0.6)
+    assert found.pose.heading == pytest.approx(15, abs=1) and found.heading_offset == pytest.approx(15)
+    assert found.spread < estimate(poses).spread
+    assert found.heading_spread is not None and 1 < found.heading_spread < 4
+
+
+def test_one_view_says_where_to_and_not_how_far() -> None:
+    place = Pose(x=10, y=5, heading=90)
+    found = estimate_pose(places([place]), [0], REACH, views=[view_from(place, 10, 6.5, 80, 8)])
+    assert found is not None and found.heading_offset == pytest.approx(-10)
+    assert found.pose.heading == pytest.approx(80, abs=2)
+    assert found.covariance[1, 1] > 4 * found.covariance[0, 0]  # along the shift, which is to +y
+    assert found.pose.y is not None and found.pose.y > 5.3
+
+
+def test_the_normalized_error_is_that_of_the_covariance() -> None:
+    """200 queries between places, with views whose errors are as large as they say."""
+    random = np.random.default_rng(5)
+    squares, both = [], [Pose(x=0, y=0, heading=0), Pose(x=3, y=0, heading=0)]
+    for _ in range(200):
+        x, y, heading = random.uniform(0, 3), random.normal(0, 0.7), random.normal(0, 10)
+        distance = math.exp(random.normal(math.log(8), 1))
+        views = [view_from(pose, x, y, heading, distance, random) for pose in both]
+        found = estimate_pose(places(list(both)), random.normal(size=2), REACH, views=views)
+        assert found is not None and found.pose.heading is not None
+        assert found.pose.x is not None and found.pose.y is not None
+        turn = (found.pose.heading - heading + 180) % 360 - 180
+        error = np.array([found.pose.x - x, found.pose.y - y, math.radians(turn)])
+        squares.append(float(error @ np.linalg.solve(found.covariance[np.ix_([0, 1, 5], [0, 1, 5])], error)))
+    # Views share their errors in part, so the covariance is larger than for independent ones.
+    assert 0.3 * 3 < np.mean(squares) < 3.8
+
+
+def test_a_view_that_contradicts_the_places_is_not_used() -> None:
+    pose = Pose(x=0, y=0, heading=0)
+    wrong = view_from(pose, 0, 0, 170, 8)
+    found = estimate_pose(places([pose]), [0], REACH, views=[wrong])
+    assert found is not None and found.source == "places" and found.pose.heading == 0
+
+
+@pytest.mark.parametrize("heading", [None, 30.0])
+def test_places_without_headings_only_have_an_offset(heading: float | None) -> None:
+    shown = view_from(Pose(x=0, y=0, heading=0), 1, 0, 12, 8)
+    found = estimate_pose(places([Pose(x=0, y=0, heading=heading)]), [0], REACH, views=[shown])
+    assert found is not None and found.heading_offset == pytest.approx(12)
+    assert (found.pose.heading is None) == (heading is None)
+    assert found.source == ("places" if heading is None else "intrinsics")
+
+
+@pytest.mark.parametrize("latitude", [-60.0, 0.0, 48.0])
+def test_on_the_earth_headings_are_clockwise_and_the_covariance_is_not(latitude: float) -> None:
+    """The same as in metres: east is x, north is y, and a heading of h is 90° - h from x."""
+    north = math.degrees(1 / EARTH_RADIUS)
+    flat = Pose(x=0, y=0, heading=60)
+    view = view_from(flat, 1, 1, 75, 8)
+    there = Pose(latitude=latitude, longitude=10, heading=30)
+    on_earth = estimate_pose(places([there]), [0], REACH, views=[view])
+    plain = estimate_pose(places([flat]), [0], REACH, views=[view])
+    assert on_earth is not None and plain is not None and plain.pose.heading is not None
+    assert on_earth.heading_offset == pytest.approx(-15) and plain.heading_offset == pytest.approx(15)
+    assert on_earth.pose.heading == pytest.approx(90 - plain.pose.heading, abs=0.01)
+    which = np.ix_([0, 1, 5], [0, 1, 5])
+    assert on_earth.covariance[which] == pytest.approx(plain.covariance[which], abs=1e-3)
+    assert on_earth.covariance[2, 2] == UNKNOWN_HEIGHT
+    assert on_earth.pose.latitude is not None and on_earth.pose.longitude is not None
+    assert (on_earth.pose.latitude - latitude) / north == pytest.approx(plain.pose.y, abs=0.01)
+    east = (on_earth.pose.longitude - 10) / north * math.cos(math.radians(latitude))
+    assert east == pytest.approx(plain.pose.x, abs=0.01)
+
+
+def test_views_of_places_out_of_reach_or_not_verified_take_no_part() -> None:
+    poses: list[Pose | None] = [Pose(x=0, y=0, heading=0), Pose(x=90, y=0, heading=0), Pose(x=1, y=0, heading=0)]
+    far = view_from(Pose(x=90, y=0, heading=0), 91, 0, 40, 8)
+    found = estimate_pose(places(poses), [0, 0, 0], REACH, views=[None, far])
+    assert found is not None and found.source == "places" and found.heading_offset is None

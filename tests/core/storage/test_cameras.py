@@ -5,16 +5,19 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from sqlite3 import Connection
 
 import pytest
 
 from core.errors import UnknownCamera
+from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.storage import Map
+from core.storage import Atlas, Map
 from core.storage.writing import Write
 
 MASK = Mask(polygons=(((0.0, 0.0), (1.0, 0.0), (1.0, 0.2)),))
+INTRINSICS = Intrinsics(width=64, height=48, fx=50.1, fy=50.2, cx=31.5, cy=23.5)
 SECONDS = 30.0
 
 
@@ -27,6 +30,19 @@ def test_what_was_put_is_known_at_once_and_what_was_forgotten_is_not(lab: Map) -
     lab.cameras.forget("front")
     with pytest.raises(UnknownCamera):
         lab.cameras.mask("front")
+
+
+def test_intrinsics_are_kept_beside_the_mask(directory: Path, atlas: Atlas, lab: Map) -> None:
+    lab.cameras.put("front", MASK, INTRINSICS)
+    lab.cameras.put("back", None)
+    atlas.close()
+    opened = Atlas(directory)
+    again = opened.get(lab.record.id).cameras
+    assert again.find("front").intrinsics == again.intrinsics("front") == INTRINSICS
+    assert again.intrinsics("back") is again.intrinsics("gone") is again.intrinsics(None) is None
+    again.put("front", None)
+    assert again.find("front").intrinsics is None
+    opened.close()
 
 
 def test_cameras_are_read_while_another_thread_waits_to_change_them(lab: Map, monkeypatch: pytest.MonkeyPatch) -> None:

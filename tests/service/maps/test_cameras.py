@@ -17,6 +17,18 @@ LOWER = 0.6
 MASK: dict[str, Any] = {"polygons": [[[0, LOWER], [1, LOWER], [1, 1], [0, 1]]]}
 
 
+INTRINSICS: dict[str, Any] = {
+    "width": 640,
+    "height": 480,
+    "fx": 554.3,
+    "fy": 554,
+    "cx": 319.5,
+    "cy": 239.5,
+    "distortion_model": "plumb_bob",
+    "distortion": [-0.28, 0.07, 0.0, 0.0, 0.0],
+}
+
+
 def behind(number: int, vehicle: int) -> bytes:
     """A scene whose lower part shows the vehicle of the camera."""
     pixels = scene(number)
@@ -128,6 +140,54 @@ def test_the_camera_of_a_place_cannot_be_patched(server: Server, map_id: str) ->
 )
 def test_a_bad_mask_is_refused_and_nothing_is_kept(client: httpx.Client, map_id: str, mask: Any) -> None:
     assert_problem(put(client, map_id, "front", mask), 422, "invalid-request")
+    assert client.get(f"/v1/maps/{map_id}/cameras").json()["items"] == []
+
+
+def test_a_camera_keeps_its_intrinsics(client: httpx.Client, map_id: str) -> None:
+    path = f"/v1/maps/{map_id}/cameras/front"
+    made = client.put(path, json={"mask": MASK, "intrinsics": INTRINSICS})
+    assert made.status_code == 201, made.text
+    shown = client.get(path).json()
+    assert (shown["mask"], shown["intrinsics"]) == (MASK, INTRINSICS)
+    assert client.put(path, json={"mask": MASK}).json()["intrinsics"] is None
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"fx": 0}, "fx"),
+        ({"fy": -500}, "fy"),
+        ({"fx": 1e-3}, "fx"),
+        ({"fx": 554, "fy": 60}, "factor of 4"),
+        ({"cx": 700}, "principal point"),
+        ({"cy": -3}, "principal point"),
+        ({"cx": "middle"}, "cx"),
+        ({"fx": None}, "fx"),
+        ({"width": 0}, "width"),
+        ({"distortion": [0.1]}, "coefficients"),
+        ({"distortion": [-5, 0, 0, 0, 0]}, "distortion"),
+        ({"distortion": [1e9, 0, 0, 0, 0]}, "distortion"),
+        ({"distortion": [0.0] * 1000}, "distortion"),
+        ({"distortion_model": "wavy"}, "distortion_model"),
+        ({"distortion_model": "none"}, "coefficients"),
+        ({"skew": 0.1}, "skew"),
+    ],
+)
+def test_impossible_intrinsics_are_refused_and_nothing_is_kept(
+    client: httpx.Client, map_id: str, change: dict[str, Any], told: str
+) -> None:
+    path = f"/v1/maps/{map_id}/cameras/front"
+    refused = client.put(path, json={"intrinsics": INTRINSICS | change})
+    assert_problem(refused, 422, "invalid-request")
+    assert told in refused.text
+    assert_problem(client.get(path), 404, "unknown-camera")
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "1e999"])
+def test_intrinsics_are_finite(client: httpx.Client, map_id: str, number: str) -> None:
+    body = json.dumps({"intrinsics": INTRINSICS}).replace("554.3", number)
+    refused = client.put(f"/v1/maps/{map_id}/cameras/front", content=body, headers={"Content-Type": "application/json"})
+    assert refused.status_code in (400, 422), refused.text
     assert client.get(f"/v1/maps/{map_id}/cameras").json()["items"] == []
 
 
