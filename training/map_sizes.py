@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
 from core.geometry import verification
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.judgement.background import Environment
 from core.judgement.geometry import Geometry, GeometryTerms, final_order
 from core.judgement.probability import Curve, sigmoid

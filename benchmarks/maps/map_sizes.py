@@ -92,7 +92,10 @@ def with_pairs(made: dict[str, Traverse], datasets: Path, cache: Path | None) ->
         kept = None if cache is None else cache / f"{name}-keypoints.npz"
         if kept is not None and kept.is_file():
             with np.load(kept) as read:
-                queries, references = ([keypoints_of(row) for row in read[side]] for side in ("queries", "references"))
+                queries, references = (
+                    [keypoints_of(record.tobytes()) for record in np.split(read[side], read[f"{side}_ends"])]
+                    for side in ("queries", "references")
+                )
                 pairs = Pairs(queries, references, read["evidence"], read["share"])
         else:
             pairs = Pairs(keypoints_of_frames(task.queries), keypoints_of_frames(task.references))
@@ -104,11 +107,13 @@ def keep_pairs(made: dict[str, Traverse], cache: Path) -> None:
     """Write keypoints, and what was found of their pairs."""
     for name, pairs in ((name, traverse.pairs) for name, traverse in made.items()):
         if pairs is not None:
-            queries, references = (np.array([one.row() for one in side]) for side in (pairs.queries, pairs.references))
+            sides = {"queries": pairs.queries, "references": pairs.references}
+            records = {side: [np.frombuffer(one.record(), np.uint8) for one in found] for side, found in sides.items()}
             np.savez(
                 cache / f"{name}-keypoints.npz",
-                queries=queries,
-                references=references,
+                allow_pickle=False,
+                **{side: np.concatenate(some) for side, some in records.items()},
+                **{f"{side}_ends": np.cumsum([len(one) for one in some])[:-1] for side, some in records.items()},
                 evidence=pairs.evidence,
                 share=pairs.share,
             )
