@@ -65,7 +65,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         verdict=judgement.verdict,
         place=matches[0].place if recognized else None,
         probability=judgement.probability,
-        pose=estimated_pose(found.pose, matches[0].place) if recognized else None,
+        pose=estimated_pose(found.pose, matches[0].place, found.note) if recognized else None,
         score=judgement.score,
         margin=judgement.margin,
         decision=judgement.decision,

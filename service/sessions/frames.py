@@ -69,7 +69,9 @@ async def process_frame(
             return repeated
         mask = await camera_mask(map_, session.options.camera)
         verify = session.options.verify
-        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask, verify)
+        recognized = await engine.recognize(
+            map_, data, deadline, options.k, session.selection, mask, verify, session.options.camera
+        )
         single = counted_answer(engine, statistics, map_, recognized)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
