@@ -144,6 +144,9 @@ class EstimatedPose(BaseModel):
         description="What the covariance rests on: the poses of `places` alone, or also the turn and the shift between "
         "the pictures, by the cameras' `intrinsics` or, where one has none, by an assumed range of `field-of-view`.",
     )
+    note: str | None = Field(
+        default=None, description="Why the intrinsics of the frame's camera were not used; left out if they were."
+    )
     covariance: list[float] = Field(
         min_length=36,
         max_length=36,
