@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from core.frames.images import decode
 from core.frames.traverses import find_images
-from core.judgement.alignment import shared_stretches
+from core.judgement.alignment import of_matrix, shared_stretches
 from core.judgement.curves import auc_pr
 from core.judgement.verdict import judge
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
@@ -135,10 +135,11 @@ def test_rivals_of_a_second_sequence_are_named_and_explain_the_verdict(
 def test_sequence_matching_pairs_the_two_traverses(
     pairs: tuple[NDArray[np.float32], NDArray[np.float32]], truth: NDArray[np.bool_]
 ) -> None:
-    (found,) = shared_stretches(pairs[0])
+    (found,) = shared_stretches(of_matrix(pairs[0]), *pairs[0].shape)
     assert len(found.first) >= 0.95 * len(truth)
     assert truth[found.first, found.second].mean() >= 0.95
-    assert shared_stretches(pairs[0][:40, 60:]) == [], "of these parts neither shows a place of the other"
+    apart = pairs[0][:40, 60:]
+    assert shared_stretches(of_matrix(apart), *apart.shape) == [], "neither part shows a place of the other"
 
 
 def test_verdicts_with_the_second_half_of_the_references_left_out(
