@@ -1,6 +1,6 @@
 """Sequence matching of two traverses: which frames are paired, how many rightly, and what unrelated parts give.
 
-    python -m benchmarks.maps.alignment [--encoder NAME] [--cache FOLDER] [--pieces 30]
+    python -m benchmarks.maps.alignment [--encoder NAME] [--cache FOLDER] [--pieces 30] [--long FRAMES OTHERS]
 
 Corridor, lip6 (truth put right) and two stretches of nordland_tiny, by the scores of the first stage, which the service
 uses, and of both.  *Whole*: all queries against all references.
@@ -12,6 +12,8 @@ The cache is that of ``benchmarks.maps.map_sizes``.
 
 from __future__ import annotations
 
+import resource
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -79,14 +81,41 @@ def overlaps(scores: Scores, truth: Truth, pieces: int) -> tuple[list[float], li
     return recall, right
 
 
+def cost(first: int, second: int, values: int = 32) -> dict[str, float]:
+    """What matching long traverses of made-up descriptors takes beside their inner products.
+
+    Args:
+        first, second: frames of the two, of which the first is a part of the second.
+    """
+    generator = np.random.default_rng(0)
+    way = generator.normal(size=(second, values)).astype(np.float32)
+    seen = way[second // 3 : second // 3 + first] + generator.normal(0, 1, (first, values)).astype(np.float32)
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    found = shared_stretches(lambda rows: lambda columns: seen[rows] @ way[columns].T, first, second)
+    seconds = time.process_time() - began
+    return {
+        "paired": sum(len(one.first) for one in found) / first,
+        "nanoseconds_a_pair": 1e9 * seconds / first / second,
+        "megabytes": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
+    }
+
+
 def main(
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
     cache: Annotated[Path | None, typer.Option(help="Folder where the scores are kept.")] = None,
     pieces: Annotated[int, typer.Option(min=1, help="Pairs of pieces of each kind.")] = 30,
+    long: Annotated[
+        tuple[int, int] | None, typer.Option(help="Instead: the cost for made-up traverses of so many frames.")
+    ] = None,
 ) -> None:
     """Measure and report."""
     share_cores(1)
+    if long is not None:
+        taken = cost(*long)
+        cells = [f"{long[0]} against {long[1]}", *(f"{value:.2f}" for value in taken.values())]
+        report("alignment-cost", "the cost of sequence matching", ["frames", *taken], [cells], taken)
+        return
     loaded = EncoderCatalogue().get(encoder)
     rows: list[list[Any]] = []
     figures: dict[str, Any] = {"encoder": loaded.identity, "traverses": {}}
