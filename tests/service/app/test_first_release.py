@@ -52,7 +52,8 @@ def check(server: Server, expected: dict[str, Any], pictures: Path) -> None:
             calibration["curve"] = {name: calibration["curve"][name] for name in known["curve"]}
             calibration.pop("environment")
         assert calibration == known
-        assert list(server.places(map_id).values()) == expected["places"][map_id]
+        known_places = [{**place, "pose_of": None} for place in expected["places"][map_id]]
+        assert list(server.places(map_id).values()) == known_places
     for name, known in expected["answers"].items():
         map_id, picture = name.split("/")
         answer = server.query(map_id, (pictures / "camera" / f"{picture}.jpg").read_bytes())
