@@ -99,23 +99,15 @@ def evidence(
     rest = values[others[listed]]
     ordinary, believable = believable_score(rest, int(others.sum()), calibration, values[apart[listed]])
     shares = (values - ordinary) / (believable - ordinary)
-<<<<<<< HEAD
-    gains: NDArray[np.floating] = STRENGTH * shares
-    if verified is not None:
-        found = np.log1p(verified[listed]) - np.log1p(VERIFIED)
-        gains += np.nan_to_num(0.5 * np.clip(found, LEAST_VERIFIED, MOST_VERIFIED))
-    gains = np.minimum(gains, STRONGEST)
-=======
     ratios = STRENGTH * shares
     if verified is not None:
         found = np.log1p(verified[listed]) - np.log1p(VERIFIED)
         ratios += np.nan_to_num(0.5 * np.clip(found, LEAST_VERIFIED, MOST_VERIFIED))
     gains = np.minimum(ratios, STRONGEST).astype(np.float32)
->>>>>>> sessions16
     gaining = gains > 0
     beside = others[listed] & gaining
     ordinarily = 1 + float((np.exp(gains[beside]) - 1).sum()) / max(int(others.sum()), 1)
-    return Evidence(rows[listed][gaining], gains[gaining].astype(np.float32), UNKNOWN + float(np.log(ordinarily)))
+    return Evidence(rows[listed][gaining], gains[gaining], UNKNOWN + float(np.log(ordinarily)))
 
 
 def believable_score(
