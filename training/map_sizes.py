@@ -25,13 +25,9 @@ from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
 from core.geometry import verification
-<<<<<<< HEAD
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
-=======
-from core.geometry.keypoints import Keypoints, find_keypoints
 from core.geometry.pairs import Pairs
->>>>>>> evidence16
 from core.judgement.background import Environment
 from core.judgement.geometry import Geometry, GeometryTerms, final_order
 from core.judgement.probability import Curve, sigmoid
