@@ -21,7 +21,8 @@ from core.baselines.system import stack
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
 from core.evaluation.protocol.comparison import SizePoint
 from core.evaluation.subject import Subject
-from core.geometry.keypoints import Keypoints, find_keypoints
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
 from core.geometry.pairs import Pairs
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.reliability import BINS

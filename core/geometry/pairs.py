@@ -40,5 +40,5 @@ class Pairs:
         found = verification.verify(self.queries[query], candidates) if candidates else []
         for place, one in zip(missing.tolist(), found, strict=True):
             self.evidence[query, place] = one.evidence
-            self.share[query, place] = one.inlier_count / max(1, min(one.keypoints))
+            self.share[query, place] = one.inlier_share
         return self.evidence[query, places], self.share[query, places]
