@@ -15,9 +15,9 @@ criterion (Torr, "Geometric motion segmentation and model selection", 1998).  An
 the two that one plane allows, make a mixture, whose mean and covariance are given.
 
 The covariance of an answer is the inverse of its normal equations, by the noise of its residuals.  How far the scene is
-is not known, so shifts are in units of its typical distance.  Without intrinsics the same is done for three fields of
-view that stand for a normal distribution of the logarithm of the focal length (Gauss-Hermite quadrature); what the
-three disagree in is a part of the covariance.
+is not known, so shifts are in units of its typical distance.  Without intrinsics a field of view of 68 degrees is assumed.
+A turn is in proportion to the focal length that is assumed, to first order, so the deviation of its logarithm times the
+turn is a part of the covariance.
 """
 
 from __future__ import annotations
@@ -68,8 +68,9 @@ NEGLIGIBLE = 1e-3
 """Weight from which on an answer is a part of the mixture."""
 INFLATION = 1.5
 """Factor of the covariance, as errors of keypoints are not independent; chosen on photographs that were turned."""
-FIELDS = ((0.741, 2 / 3), (0.404, 1 / 6), (1.36, 1 / 6))
-"""Focal lengths over the longer side, and their weights: fields of view of 68, 102 and 40 degrees."""
+FOCAL, FOCAL_DEVIATION = 0.741, 0.35
+"""Focal length over the longer side where it is not known, a field of view of 68 degrees, and the deviation of its
+logarithm: two deviations are fields of 37 and 107 degrees."""
 LEAST_AGREEMENT = 0.5
 """Cosine between most directions of the two cameras, turned: an essential matrix fits some answers with points behind a
 camera as well, in which they are opposed."""
@@ -144,22 +145,22 @@ def relative_view(
         None if camera is None else camera.of_size(frame.width, frame.height)
         for camera, frame in ((query_camera, query), (place_camera, place))
     ]
-    views = []
-    assumed = None in cameras
-    for focal, weight in FIELDS if assumed else ((0.0, 1.0),):
-        at, shown = (camera or _pinhole(frame, focal) for camera, frame in zip(cameras, (query, place), strict=True))
-        pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
-        view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
-        if view is not None:
-            views.append((weight, view))
-    if not views:
-        return None
-    return replace(_mixture(views), source="field-of-view") if assumed else views[0][1]
+    at, shown = (camera or _pinhole(frame) for camera, frame in zip(cameras, (query, place), strict=True))
+    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
+    view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
+    return _by_assumed_field(view) if view is not None and None in cameras else view
 
 
-def _pinhole(frame: Keypoints, focal: float) -> Intrinsics:
-    """The intrinsics of a camera without distortion, with a focal length over the longer side."""
-    length = focal * max(frame.width, frame.height)
+def _by_assumed_field(view: RelativeView) -> RelativeView:
+    """The view of a camera whose focal length was assumed, with what that leaves open of its turn."""
+    turn, covariance = _vector(view.turn), view.covariance.copy()
+    covariance[:3, :3] += np.outer(turn, turn) * FOCAL_DEVIATION**2
+    return replace(view, covariance=covariance, source="field-of-view")
+
+
+def _pinhole(frame: Keypoints) -> Intrinsics:
+    """The intrinsics of a camera without distortion, of the focal length that is assumed."""
+    length = FOCAL * max(frame.width, frame.height)
     middle = (frame.width - 1) / 2, (frame.height - 1) / 2
     return Intrinsics(width=frame.width, height=frame.height, fx=length, fy=length, cx=middle[0], cy=middle[1])
 

@@ -169,6 +169,9 @@ def relative_views(
             continue
         (known,) = map_.places_at([row])
         cameras = verifier.intrinsics(map_), intrinsics_of(map_, None if known is None else known.camera)
+        if None in cameras and told:  # only the best match's heading can be told without intrinsics
+            views.append(None)
+            continue
         try:
             view = relative_view(query, place, one, *cameras)
         except UnfitIntrinsics as error:
