@@ -157,6 +157,11 @@ HOSTILE: dict[str, tuple[Made, str]] = {
     "a camera twice": (counted(CAMERAS, 1, again), "UNIQUE"),
     "too many cameras": (counted(CAMERAS, 1, many), "at most 256"),
     "a mask of everything": (line(CAMERAS, 0, mask={"polygons": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}), "mask"),
+    "intrinsics without a focal length": (line(CAMERAS, 1, intrinsics={"width": 640, "height": 480}), "intrinsics.fx"),
+    "intrinsics of no lens": (
+        line(CAMERAS, 1, intrinsics={"width": 640, "height": 480, "fx": 0.0, "fy": 5.0, "cx": 1.0, "cy": 1.0}),
+        "intrinsics.fx",
+    ),
 }
 
 
