@@ -15,9 +15,9 @@ criterion (Torr, "Geometric motion segmentation and model selection", 1998).  An
 the two that one plane allows, make a mixture, whose mean and covariance are given.
 
 The covariance of an answer is the inverse of its normal equations, by the noise of its residuals.  How far the scene is
-is not known, so shifts are in units of its typical distance.  Without intrinsics a field of view of 68 degrees is assumed.
-A turn is in proportion to the focal length that is assumed, to first order, so the deviation of its logarithm times the
-turn is a part of the covariance.
+is not known, so shifts are in units of its typical distance.  Without intrinsics a field of view of 68 degrees is
+assumed.  A turn is in proportion to the focal length that is assumed, to first order, so the deviation of its logarithm
+times the turn is a part of the covariance.
 """
 
 from __future__ import annotations
