@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.service.map_jobs import asked, finished
@@ -138,3 +139,54 @@ def test_a_blank_frame_and_a_wrong_word_are_answered_clearly(server: Server, ver
         f"/v1/maps/{verified}/query?verify=sometimes", content=seen(1), headers={"Content-Type": "image/jpeg"}
     )
     assert_problem(response, 422, "invalid-request")
+
+
+INTRINSICS = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 160.0, "cy": 120.0}
+
+
+@pytest.fixture(scope="module")
+def posed(server: Server) -> str:
+    """A map of posed places, taken by a camera whose intrinsics it knows."""
+    server.create_map("posed")
+    assert server.client.put("/v1/maps/posed/cameras/front", json={"intrinsics": INTRINSICS}).status_code in (200, 201)
+    for seed in range(4):
+        server.enrol("posed", f"p{seed}", jpeg(seed), x=20 * seed, y=0, heading=90, camera="front")
+    return "posed"
+
+
+def test_geometry_tells_the_pose_where_the_intrinsics_are_known(server: Server, posed: str) -> None:
+    pose = server.query(posed, jpeg(2), verify="always", camera="front")["pose"]
+    assert pose["source"] == "intrinsics" and "note" not in pose
+    assert abs(pose["x"] - 40) < 1 and abs(pose["heading"] - 90) < 2 and abs(pose["heading_offset"]) < 2
+    covariance = np.array(pose["covariance"]).reshape(6, 6)
+    assert np.allclose(covariance, covariance.T) and (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+def test_auto_verifies_for_the_pose(server: Server, posed: str) -> None:
+    answer = server.query(posed, jpeg(2), camera="front")
+    assert answer["verification"]["state"] == "verified" and answer["pose"]["source"] == "intrinsics"
+
+
+def test_without_intrinsics_the_heading_has_an_offset_with_a_wider_spread(server: Server, posed: str) -> None:
+    known, assumed = (
+        server.query(posed, encoded(seen_again(scene(2))), verify="always", **camera)["pose"]
+        for camera in ({"camera": "front"}, {})
+    )
+    assert assumed["source"] == "field-of-view" and assumed["offset_spread"] >= known["offset_spread"]
+    places = server.query(posed, jpeg(2), verify="never")["pose"]
+    assert places["source"] == "places" and "heading_offset" not in places and len(places["covariance"]) == 36
+
+
+def test_a_frame_of_another_shape_is_answered_without_the_intrinsics(server: Server, posed: str) -> None:
+    pose = server.query(posed, jpeg(2, width=320, height=200), verify="always", camera="front")["pose"]
+    if pose is not None:  # the drawn scene of another shape is still recognized
+        assert pose["source"] != "intrinsics" and "320 x 240" in pose["note"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("fx", 0.0), ("cx", 1000.0), ("distortion", [0.1, 0.2, 0.3]), ("width", 0), ("fy", -300.0)]
+)
+def test_impossible_intrinsics_are_refused(server: Server, posed: str, name: str, value: object) -> None:
+    response = server.client.put(f"/v1/maps/{posed}/cameras/odd", json={"intrinsics": INTRINSICS | {name: value}})
+    assert_problem(response, 422, "invalid-request")
+    assert server.client.get(f"/v1/maps/{posed}/cameras/odd").status_code == 404
