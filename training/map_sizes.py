@@ -27,6 +27,7 @@ from core.frames.preprocessing import Pixels
 from core.geometry import verification
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
+from core.geometry.pairs import Pairs
 from core.judgement.background import Environment
 from core.judgement.geometry import Geometry, GeometryTerms, final_order
 from core.judgement.probability import Curve, sigmoid
@@ -73,35 +74,6 @@ With 0.25 to 0.75 the verdicts on corridor and lip6 stay within their bars."""
 
 STANDING = 1000
 """Two frames of camvid with more evidence than this were taken by a car that stood still, and count as one."""
-
-
-class Pairs:
-    """What verification finds of pairs of Q queries and R references, each of which is verified when it is needed.
-
-    evidence, share: float64 [Q, R], as in ``core.judgement.geometry.Geometry``; NaN where nobody has asked yet.
-    """
-
-    def __init__(
-        self,
-        queries: Sequence[Keypoints],
-        references: Sequence[Keypoints],
-        evidence: Values | None = None,
-        share: Values | None = None,
-    ) -> None:
-        unknown = np.full((len(queries), len(references)), np.nan)
-        self.queries, self.references = queries, references
-        self.evidence = unknown.copy() if evidence is None else evidence
-        self.share = unknown if share is None else share
-
-    def verified(self, query: int, places: Positions) -> Geometry:
-        """What was found of some references, int64 [n], in their order."""
-        missing = places[np.isnan(self.evidence[query, places])]
-        candidates = [self.references[place] for place in missing.tolist()]
-        found = verification.verify(self.queries[query], candidates) if candidates else []
-        for place, one in zip(missing.tolist(), found, strict=True):
-            self.evidence[query, place] = one.evidence
-            self.share[query, place] = one.inlier_count / max(1, min(one.keypoints))
-        return Geometry(self.evidence[query, places], self.share[query, places])
 
 
 class Judged(NamedTuple):
@@ -162,9 +134,9 @@ class Traverse:
         def of_three_stages(candidates: int) -> tuple[Judgement, int]:
             geometry, best = None, np.arange(count)
             if candidates and self.pairs is not None:
-                found = self.pairs.verified(query, ranked[:candidates])
-                behind = np.full(count - len(found.share), np.nan)
-                geometry = Geometry(np.append(found.evidence, behind), np.append(found.share, behind))
+                evidence, share = self.pairs.verified(query, ranked[:candidates])
+                behind = np.full(count - len(share), np.nan)
+                geometry = Geometry(np.append(evidence, behind), np.append(share, behind))
                 best = final_order(seen.scores, geometry.share)
                 geometry = geometry.take(best)
 

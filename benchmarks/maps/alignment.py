@@ -1,8 +1,9 @@
 """Sequence matching of two traverses: which frames are paired, how many rightly, and what unrelated parts give.
 
-    python -m benchmarks.maps.alignment [--encoder NAME] [--cache FOLDER] [--pieces 30]
+    python -m benchmarks.maps.alignment [--encoder NAME] [--cache FOLDER] [--pieces 30] [--long FRAMES OTHERS]
 
-Corridor, lip6 (truth put right) and two stretches of nordland_tiny.  *Whole*: all queries against all references.
+Corridor, lip6 (truth put right) and two stretches of nordland_tiny, by the scores of the first stage, which the service
+uses, and of both.  *Whole*: all queries against all references.
 *Nothing shared*: pieces of the queries against the longest run of references of which none is within twelve frames of
 a true one; the share of them in which a stretch is found.  *Overlap*: pieces that share 15 to 60 frames and are longer
 on one side; the share of the shared frames that is found, and how many of those found are right within three frames.
@@ -11,6 +12,8 @@ The cache is that of ``benchmarks.maps.map_sizes``.
 
 from __future__ import annotations
 
+import resource
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -78,33 +81,62 @@ def overlaps(scores: Scores, truth: Truth, pieces: int) -> tuple[list[float], li
     return recall, right
 
 
+def cost(first: int, second: int, values: int = 32) -> dict[str, float]:
+    """What matching long traverses of made-up descriptors takes beside their inner products.
+
+    Args:
+        first, second: frames of the two, of which the first is a part of the second.
+    """
+    generator = np.random.default_rng(0)
+    way = generator.normal(size=(second, values)).astype(np.float32)
+    seen = way[second // 3 : second // 3 + first] + generator.normal(0, 1, (first, values)).astype(np.float32)
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
+    found = shared_stretches(lambda rows: lambda columns: seen[rows] @ way[columns].T, first, second)
+    seconds = time.process_time() - began
+    return {
+        "paired": sum(len(one.first) for one in found) / first,
+        "nanoseconds_a_pair": 1e9 * seconds / first / second,
+        "megabytes": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
+    }
+
+
 def main(
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     encoder: str = DEFAULT_ENCODER,
     cache: Annotated[Path | None, typer.Option(help="Folder where the scores are kept.")] = None,
     pieces: Annotated[int, typer.Option(min=1, help="Pairs of pieces of each kind.")] = 30,
+    long: Annotated[
+        tuple[int, int] | None, typer.Option(help="Instead: the cost for made-up traverses of so many frames.")
+    ] = None,
 ) -> None:
     """Measure and report."""
     share_cores(1)
+    if long is not None:
+        taken = cost(*long)
+        cells = [f"{long[0]} against {long[1]}", *(f"{value:.2f}" for value in taken.values())]
+        report("alignment-cost", "the cost of sequence matching", ["frames", *taken], [cells], taken)
+        return
     loaded = EncoderCatalogue().get(encoder)
     rows: list[list[Any]] = []
     figures: dict[str, Any] = {"encoder": loaded.identity, "traverses": {}}
     for name, traverse in traverses(loaded, datasets, cache, fitted=True).items():
         if name.startswith("camvid"):
             continue  # it was driven once
-        scores, truth = traverse.both, traverse.truth
-        a, b = paired(scores)
-        recall, right = overlaps(scores, truth, pieces)
-        one = {
-            "frames_paired": len(a) / len(truth),
-            "right": float(truth[a, b].mean()) if len(a) else None,
-            "right_within_3": float(widened(truth, NEAR)[a, b].mean()) if len(a) else None,
-            "found_in_nothing_shared": float(np.mean(nothing_shared(scores, truth, pieces))),
-            "overlap_found": float(np.mean(recall)),
-            "overlap_right": float(np.mean(right)) if right else None,
-        }
-        figures["traverses"][name] = one
-        rows.append([name, *("" if value is None else f"{value:.3f}" for value in one.values())])
+        truth = traverse.truth
+        for stages, scores in (("first stage", traverse.first), ("both stages", traverse.both)):
+            a, b = paired(scores)
+            recall, right = overlaps(scores, truth, pieces)
+            one = {
+                "frames_paired": len(a) / len(truth),
+                "right": float(truth[a, b].mean()) if len(a) else None,
+                "right_within_3": float(widened(truth, NEAR)[a, b].mean()) if len(a) else None,
+                "found_in_nothing_shared": float(np.mean(nothing_shared(scores, truth, pieces))),
+                "overlap_found": float(np.mean(recall)),
+                "overlap_right": float(np.mean(right)) if right else None,
+            }
+            figures["traverses"][f"{name}, {stages}"] = one
+            cells = ["" if value is None else f"{value:.3f}" for value in one.values()]
+            rows.append([f"{name}, {stages}", *cells])
     columns = ["traverse", "paired", "right", "right ± 3", "nothing shared", "overlap found", "overlap right"]
     report("alignment", f"sequence matching, {encoder}", columns, rows, figures)
 

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from benchmarks.report import report, verdict
 from core.evaluation.map_sizes import balanced_error
 from core.geometry.keypoints import keypoints_of
+from core.geometry.pairs import Pairs
 from core.judgement.curves import auc_roc
 from core.judgement.reliability import reliability
 from core.judgement.verdict import Calibration
@@ -41,7 +42,6 @@ from training.map_sizes import (
     SMALL,
     Cut,
     Judged,
-    Pairs,
     Traverse,
     Verify,
     corridor_and_lip6,

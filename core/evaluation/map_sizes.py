@@ -2,13 +2,15 @@
 
 A map is a run of neighbouring references.  It is asked queries whose place it holds, and strangers: queries whose true
 references are all more than ``APART`` frames from any that it holds.  Both kinds count alike in the calibration error,
-as they did when the calibration was measured.
+as they did when the calibration was measured.  All of it is measured by two stages, and again with the best candidates
+verified geometrically.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +21,13 @@ from core.baselines.system import stack
 from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
 from core.evaluation.protocol.comparison import SizePoint
 from core.evaluation.subject import Subject
+from core.geometry.detection import find_keypoints
+from core.geometry.keypoints import Keypoints
+from core.geometry.pairs import Pairs
+from core.judgement.geometry import Geometry, final_order
 from core.judgement.reliability import BINS
 from core.judgement.verdict import Judgement, judge
+from core.networks.xfeat import load_xfeat
 from core.places import Neighborhood, Whereabouts
 from core.recognition.stages import examine
 from core.storage import MapSettings
@@ -38,6 +45,9 @@ MAPS = 6
 ASKED = 20
 """Queries of either kind that a map is asked at most; they are drawn at random."""
 
+CANDIDATES = 10
+"""Places that are verified."""
+
 
 def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[SizePoint]:
     """The points of one system by rising size; none for a system that ships no probabilities.
@@ -52,6 +62,7 @@ def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[S
         "map-sizes",
         seed=seed,
         calibration=system.encoder.calibration.model_dump(),
+        candidates=CANDIDATES,
         truth=arrays_digest(subject.pair.truth),
         kept=subject.pair.kept.tolist(),
     )
@@ -77,32 +88,36 @@ class _Maps:
         cells = bool(encoder.candidates)
         empty = np.zeros((len(references), 0, 0), np.int8), np.zeros((len(queries), 0, 0), np.int8)
         self.local, self.asked = (local_of(references), local_of(queries)) if cells else empty
+        self.pairs = _pairs(subject) if encoder.calibration.geometry is not None else None
         settings = MapSettings()
         self.neighborhood = Neighborhood(settings.same_place_radius, settings.same_place_frames)
 
     def point(self, size: int, generator: np.random.Generator) -> SizePoint | None:
         """The figures of maps of one size; None if no query has its place in one."""
-        rows: list[tuple[bool, bool, bool, float]] = []
+        knowns: list[bool] = []
+        outcomes: list[list[tuple[bool, bool, float]]] = []
         for start in generator.integers(0, len(self.kept) - size + 1, MAPS if size < len(self.kept) else 1).tolist():
             part = np.arange(start, start + size)
             for queries, there in self._queries(part):
                 for query in generator.permutation(queries)[:ASKED].tolist():
-                    found, best = self._judged(query, part)
-                    right = there and bool(np.isin(best, self.truth[query]))
-                    rows.append((there, right, found.verdict == "recognized", found.probability or 0.0))
-        if not any(there for there, *_ in rows):
+                    knowns.append(there)
+                    outcomes.append(
+                        [
+                            (
+                                there and bool(np.isin(best, self.truth[query])),
+                                found.verdict == "recognized",
+                                found.probability or 0.0,
+                            )
+                            for found, best in self._judged(query, part)
+                        ]
+                    )
+        known = np.array(knowns, np.bool_)
+        if not known.any():
             return None
-        known, hits, believed = (np.array([row[column] for row in rows], np.bool_) for column in range(3))
-        strangers = int((~known).sum())
-        return SizePoint(
-            system=self.name,
-            places=size,
-            known=int(known.sum()),
-            strangers=strangers,
-            known_recognized=float((believed & hits)[known].mean()),
-            strangers_recognized=float(believed[~known].mean()) if strangers else None,
-            calibration_error=balanced_error(np.array([row[3] for row in rows]), hits, known) if strangers else None,
-        )
+        figures = [_figures(list(stage), known) for stage in zip(*outcomes, strict=True)]
+        two, three = figures[0], figures[1] if len(figures) > 1 else (None, None, None)
+        assert two[0] is not None
+        return SizePoint(self.name, size, int(known.sum()), int((~known).sum()), two[0], two[1], two[2], *three)
 
     def _queries(self, part: Positions) -> Iterator[tuple[Positions, bool]]:
         """The queries whose place is among the references, and the strangers; int64 each."""
@@ -111,8 +126,11 @@ class _Maps:
         yield np.flatnonzero([bool(np.isin(true, held).any()) for true in self.truth]), True
         yield np.flatnonzero([bool(len(true)) and not np.isin(true, around).any() for true in self.truth]), False
 
-    def _judged(self, query: int, part: Positions) -> tuple[Judgement, int]:
-        """The judgement of a query against the references ``part``, and the index of the best match."""
+    def _judged(self, query: int, part: Positions) -> list[tuple[Judgement, int]]:
+        """The judgement of a query against the references ``part``, and the index of the best match.
+
+        By two stages; and by three, if candidates can be verified.
+        """
         encoder = self.encoder
         scores = np.asarray(encoder.scores_from_inner_products(self.products[query, part]), np.float32)
         order = np.argsort(-scores, kind="stable")
@@ -123,8 +141,51 @@ class _Maps:
             return encoder.agreement(self.asked[query], self.local[rows[at]])
 
         seen = examine(scores[order], places, self.neighborhood, encoder.candidates, gains)
-        judged = judge(seen.scores, places.take(seen.order), encoder.calibration, self.neighborhood, seen.examined)
-        return judged, int(self.kept[rows[seen.order[0]]])
+        ranked, places = rows[seen.order], places.take(seen.order)
+        judged = judge(seen.scores, places, encoder.calibration, self.neighborhood, seen.examined)
+        found = [(judged, int(self.kept[ranked[0]]))]
+        if self.pairs is not None:
+            evidence, share = self.pairs.verified(query, ranked[:CANDIDATES])
+            behind = np.full(len(ranked) - len(share), np.nan)
+            geometry = Geometry(np.append(evidence, behind), np.append(share, behind))
+            best = final_order(seen.scores, geometry.share)
+            judged = judge(
+                seen.scores[best],
+                places.take(best),
+                encoder.calibration,
+                self.neighborhood,
+                seen.examined[best],
+                geometry=geometry.take(best),
+            )
+            found.append((judged, int(self.kept[ranked[best[0]]])))
+        return found
+
+
+def _pairs(subject: Subject) -> Pairs:
+    """The keypoints of the queries and of the kept references."""
+    network = load_xfeat()
+
+    def keypoints(paths: Sequence[Path]) -> list[Keypoints]:
+        return [find_keypoints(network, subject.frame(path)) for path in paths]
+
+    return Pairs(keypoints(subject.pair.queries), keypoints(subject.pair.kept_references))
+
+
+def _figures(
+    outcomes: Sequence[tuple[bool, bool, float]], known: NDArray[np.bool_]
+) -> tuple[float, float | None, float | None]:
+    """Shares of the known that are recognized and right, and of the strangers that are recognized, and the error.
+
+    Args:
+        outcomes: of each query whether the best match is right, whether it was recognized, and the probability.
+        known: bool [n], whether its place was in the map.
+    """
+    hits, believed = (np.array([one[column] for one in outcomes], np.bool_) for column in range(2))
+    right = float((believed & hits)[known].mean())
+    if known.all():
+        return right, None, None
+    error = balanced_error(np.array([one[2] for one in outcomes]), hits, known)
+    return right, float(believed[~known].mean()), error
 
 
 def balanced_error(probabilities: NDArray[np.float64], right: NDArray[np.bool_], known: NDArray[np.bool_]) -> float:

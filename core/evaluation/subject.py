@@ -122,6 +122,14 @@ class Subject:
         """The descriptions of the undisturbed queries."""
         return self.describe(self.pair.queries)
 
+    def frame(self, path: Path) -> Pixels:
+        """One image of the traverses, decoded.
+
+        Raises:
+            Others: what decoding it raises.
+        """
+        return self._load(path)
+
     def describe(self, paths: Sequence[Path], change: Change | None = None) -> Described:
         """Describe images one after another; decoding them is not timed."""
         self._train()

@@ -15,9 +15,9 @@ criterion (Torr, "Geometric motion segmentation and model selection", 1998).  An
 the two that one plane allows, make a mixture, whose mean and covariance are given.
 
 The covariance of an answer is the inverse of its normal equations, by the noise of its residuals.  How far the scene is
-is not known, so shifts are in units of its typical distance.  Without intrinsics the same is done for three fields of
-view that stand for a normal distribution of the logarithm of the focal length (Gauss-Hermite quadrature); what the
-three disagree in is a part of the covariance.
+is not known, so shifts are in units of its typical distance.  Without intrinsics a field of view of 68 degrees is assumed.
+A turn is in proportion to the focal length that is assumed, to first order, so the deviation of its logarithm times the
+turn is a part of the covariance.
 """
 
 from __future__ import annotations
@@ -62,12 +62,15 @@ PER_MATCH, PER_VALUE = float(np.log(4)), 4.0
 λ1 and λ2)."""
 TEMPERATURE = 4.0
 """Answers are weighed by the exponential of half their criterion over this, as matches are no independent evidence."""
+HOPELESS = 150.0
+"""Answers whose criterion is worse by more at first are not looked at again."""
 NEGLIGIBLE = 1e-3
 """Weight from which on an answer is a part of the mixture."""
 INFLATION = 1.5
 """Factor of the covariance, as errors of keypoints are not independent; chosen on photographs that were turned."""
-FIELDS = ((0.741, 2 / 3), (0.404, 1 / 6), (1.36, 1 / 6))
-"""Focal lengths over the longer side, and their weights: fields of view of 68, 102 and 40 degrees."""
+FOCAL, FOCAL_DEVIATION = 0.741, 0.35
+"""Focal length over the longer side where it is not known, a field of view of 68 degrees, and the deviation of its
+logarithm: two deviations are fields of 37 and 107 degrees."""
 LEAST_AGREEMENT = 0.5
 """Cosine between most directions of the two cameras, turned: an essential matrix fits some answers with points behind a
 camera as well, in which they are opposed."""
@@ -142,22 +145,22 @@ def relative_view(
         None if camera is None else camera.of_size(frame.width, frame.height)
         for camera, frame in ((query_camera, query), (place_camera, place))
     ]
-    views = []
-    assumed = None in cameras
-    for focal, weight in FIELDS if assumed else ((0.0, 1.0),):
-        at, shown = (camera or _pinhole(frame, focal) for camera, frame in zip(cameras, (query, place), strict=True))
-        pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
-        view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
-        if view is not None:
-            views.append((weight, view))
-    if not views:
-        return None
-    return replace(_mixture(views), source="field-of-view") if assumed else views[0][1]
+    at, shown = (camera or _pinhole(frame) for camera, frame in zip(cameras, (query, place), strict=True))
+    pixel = np.hypot(at.pixel * _enlargement(query), shown.pixel * _enlargement(place)) / np.sqrt(2)
+    view = view_of_bearings(shown.bearings(known), at.bearings(seen), pixel)
+    return _by_assumed_field(view) if view is not None and None in cameras else view
 
 
-def _pinhole(frame: Keypoints, focal: float) -> Intrinsics:
-    """The intrinsics of a camera without distortion, with a focal length over the longer side."""
-    length = focal * max(frame.width, frame.height)
+def _by_assumed_field(view: RelativeView) -> RelativeView:
+    """The view of a camera whose focal length was assumed, with what that leaves open of its turn."""
+    turn, covariance = _vector(view.turn), view.covariance.copy()
+    covariance[:3, :3] += np.outer(turn, turn) * FOCAL_DEVIATION**2
+    return replace(view, covariance=covariance, source="field-of-view")
+
+
+def _pinhole(frame: Keypoints) -> Intrinsics:
+    """The intrinsics of a camera without distortion, of the focal length that is assumed."""
+    length = FOCAL * max(frame.width, frame.height)
     middle = (frame.width - 1) / 2, (frame.height - 1) / 2
     return Intrinsics(width=frame.width, height=frame.height, fx=length, fy=length, cx=middle[0], cy=middle[1])
 
@@ -185,7 +188,9 @@ def view_of_bearings(place: Array, query: Array, pixel: float) -> RelativeView |
     fits = _distinct([_minimized(p, q, start, NOISE * pixel) for start in _starts(p, q, pixel)])
     noise = min(_noise(p, q, fit, pixel) for fit in fits)
     plane = min((fit for fit in fits if isinstance(fit, _Plane)), key=lambda fit: _criterion(p, q, fit, noise))
-    fits = _distinct([_minimized(p, q, fit, noise) for fit in [*fits, *plane.twins(p)]])
+    good = min(_criterion(p, q, fit, noise) for fit in fits) + HOPELESS
+    fits = [fit for fit in [*fits, *plane.twins(p)] if _criterion(p, q, fit, noise) < good]
+    fits = _distinct([_minimized(p, q, fit, noise) for fit in fits])
     criteria = [_criterion(p, q, fit, noise) for fit in fits]
     views = []
     for criterion, fit in sorted(zip(criteria, fits, strict=True), key=lambda pair: pair[0]):
@@ -280,11 +285,11 @@ class _RigidScene:
     def linearized(self, p: Array, q: Array) -> tuple[Array, Array]:
         """Residuals, float64 [n, 1], and their derivatives, [n, 1, 5]: Sampson's error, on the sphere an angle."""
         turned = q @ self.rotation
-        normal = np.cross(self.centre, p)
-        plane = np.cross(p, turned)
-        size = np.sqrt(np.square(normal).sum(axis=1) + np.square(np.cross(self.centre, turned)).sum(axis=1))
+        normal = _cross(self.centre, p)
+        plane = _cross(p, turned)
+        size = np.sqrt(np.square(normal).sum(axis=1) + np.square(_cross(self.centre, turned)).sum(axis=1))
         size = np.maximum(size, 1e-6)[:, np.newaxis]
-        jacobian = np.hstack([-np.cross(q, normal @ self.rotation.T), plane @ _across(self.centre)]) / size
+        jacobian = np.hstack([-_cross(q, normal @ self.rotation.T), plane @ _across(self.centre)]) / size
         return (plane @ self.centre)[:, np.newaxis] / size, jacobian[:, np.newaxis]
 
     def shift(self, p: Array, q: Array, covariance: Array) -> tuple[Array, Array]:
@@ -366,19 +371,29 @@ def _planes_of(matrix: Array, p: Array) -> list[_Plane]:
 
 def _best_direction(p: Array, turned: Array) -> Array:
     """The unit vector c for which the squares of c · (p x u) are least, float64 [3]."""
-    planes = np.cross(p, turned)
+    planes = _cross(p, turned)
     return np.asarray(np.linalg.eigh(planes.T @ planes)[1][:, 0])
 
 
 def _distances(p: Array, turned: Array, centre: Array) -> Array:
     """How far along p the point is at which both rays are nearest to each other, float64 [n]."""
-    across = np.cross(p, turned)
-    return (np.cross(centre, turned) * across).sum(axis=1) / np.maximum(np.square(across).sum(axis=1), 1e-12)
+    across = _cross(p, turned)
+    return (_cross(centre, turned) * across).sum(axis=1) / np.maximum(np.square(across).sum(axis=1), 1e-12)
 
 
 def _across(direction: Array) -> Array:
-    """Two unit vectors at right angles to one, float64 [3, 2]."""
-    return np.asarray(np.linalg.svd(direction[np.newaxis])[2][1:].T)
+    """Two unit vectors at right angles to one, float64 [3, 2] (Duff et al., Building an orthonormal basis, 2017)."""
+    x, y, z = direction.tolist()
+    sign = 1.0 if z >= 0 else -1.0
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.array([[1 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """a × b, float64 [n, 3], of [n, 3] and [n, 3] or [3]; several times as fast as NumPy's for so few vectors."""
+    (x, y, z), (u, v, w) = a.T, b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def _cross_matrices(vectors: Array) -> Array:

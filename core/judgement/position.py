@@ -44,6 +44,9 @@ LEVEL = float(np.radians(8))
 """Deviation of a place's pitch and roll, which poses do not tell: it tilts a shift by as much."""
 DISTANCE, DISTANCE_DEVIATION = float(np.log(8)), 1.0
 """Mean and deviation of the logarithm of the typical distance of a scene in metres: mostly 3 to 22 m."""
+UNUSED = 1e4
+"""Variance by which the shift of a view without intrinsics takes no part: on real traverses it was further off than its
+covariance says."""
 CONTRADICTION = 30.0
 """Squared Mahalanobis distance from which on a view of four values contradicts the places, and is not used."""
 _STEPS = 8
@@ -261,6 +264,8 @@ def _missed(state: Vectors, standing: _Standing, number: int) -> tuple[Vectors, 
     noise = view.covariance[np.ix_(which, which)] + np.outer(turned, turned) * PLACE_HEADING**2
     level = np.square(view.shift).sum() * LEVEL**2
     noise = noise + np.diag([0, 0, level, 0]) + np.diag([1, 1, 1, 0]) * (PLACE_POSITION * nearness) ** 2
+    if view.source == "field-of-view":
+        noise = noise + np.diag([UNUSED, UNUSED, UNUSED, 0])
     return np.r_[shift - view.shift, turn], jacobian, noise
 
 

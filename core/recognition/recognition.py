@@ -22,15 +22,23 @@ from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
+from core.geometry.pose import RelativeView
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
-from core.places import Place, PlaceFields
+from core.places import NO_POSE, Place, PlaceFields
 from core.recognition.selection import Selection
 from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, rank_places
-from core.recognition.verification import NOT_VERIFIED, ThirdStage, Verifier, Verify, third_stage
+from core.recognition.verification import (
+    NOT_VERIFIED,
+    ThirdStage,
+    Verifier,
+    Verify,
+    relative_views,
+    third_stage,
+)
 from core.storage import Enrolment, Map
 
 ATTEMPTS = 3
@@ -64,7 +72,9 @@ class Answer:
     calibration: the calibration by which the query was judged.
     search: milliseconds spent on the first two stages of the search, the judgement and the look-up of the places; for
         several queries that were searched for together, the mean.
-    pose: the estimated pose of the query, from the poses of the best match and its neighbours; None if they have none.
+    pose: the estimated pose of the query, from the poses of the best match and its neighbours, and from the geometry
+        where they were verified; None if they have none.
+    note: why the camera's intrinsics were not used for the pose; None if they were, or if there are none.
     encoding: the encoded query.
     candidates: the best places of the ranking; the matches are the first of them.
     third_stage: whether the candidates were verified geometrically.
@@ -81,6 +91,7 @@ class Answer:
     candidates: Candidates
     third_stage: ThirdStage = NOT_VERIFIED
     rivals: tuple[RivalGroup, ...] = ()
+    note: str | None = None
 
     @property
     def place(self) -> Place | None:
@@ -123,7 +134,7 @@ def recognize(
     encoding = encoder.encode(pixels, mask)  # descriptor float32 [D], local descriptors int8 [C, L]
     if len(encoding.regions) == 0:
         raise NoRegions("The picture has no region of interest: it is blank, or nearly so.")
-    verifier = Verifier(verify, lambda: find_keypoints(packaged_xfeat(), pixels, mask))
+    verifier = Verifier(verify, lambda: find_keypoints(packaged_xfeat(), pixels, mask), camera)
     (answer,) = locate(map_, encoder, [encoding], k, selection, [verifier])
     return answer
 
@@ -284,7 +295,7 @@ def _answer(
         ranked = ranked.take(np.flatnonzero(present))
         judgement = judged(ranked)
     found = [place for place in places if place is not None]
-    return _told(map_, encoder, encoding, ranked, found, judgement, stage)
+    return _told(map_, encoder, encoding, ranked, found, judgement, stage, verifier)
 
 
 def _places(map_: Map, candidates: Candidates, k: int) -> list[Place | None]:
@@ -299,6 +310,7 @@ def _told(
     places: list[Place],
     judgement: Judgement,
     stage: ThirdStage,
+    verifier: Verifier | None,
 ) -> Answer:
     """The answer by the judged candidates, of which ``places`` are the best."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
@@ -306,10 +318,14 @@ def _told(
     if matches:
         judgement = replace(judgement, score=matches[0][0])
     log_odds = decision_slope(calibration) * candidates.values.astype(np.float64)
-    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius)
+    views: list[RelativeView | None] = []
+    note = None
+    if judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE:
+        views, note = relative_views(map_, candidates, stage, verifier)
+    pose = estimate_pose(candidates.whereabouts, log_odds, neighborhood.radius, views=views)
     weights = None if candidates.weights is None else np.exp(candidates.weights[: len(matches)]).tolist()
     rivals = _rivals(map_, candidates, judgement)
-    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, stage, rivals)
+    return Answer(judgement, matches, weights, calibration, 0.0, pose, encoding, candidates, stage, rivals, note)
 
 
 def _rivals(map_: Map, candidates: Candidates, judgement: Judgement) -> tuple[RivalGroup, ...]:

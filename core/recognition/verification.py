@@ -8,19 +8,24 @@ keeps none, stays where the first two stages have put it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
+from core.errors import UnfitIntrinsics, UnknownCamera
+from core.frames.intrinsics import Intrinsics
 from core.geometry.keypoints import Keypoints
+from core.geometry.pose import RelativeView, relative_view
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.verdict import Judgement, worth_verifying
 from core.method.encoder import Encoder
-from core.recognition.stages import Candidates, calibration_of
+from core.places import NO_POSE
+from core.recognition.stages import Candidates, calibration_of, neighborhood_of
 from core.storage import Map
 
 Verify = Literal["auto", "always", "never"]
@@ -29,6 +34,9 @@ Verify = Literal["auto", "always", "never"]
 VerificationState = Literal["verified", "not-needed", "no-keypoints", "never"]
 """Whether they were: ``not-needed`` if two stages settle the answer, ``no-keypoints`` if no candidate has any, or the
 frame so few that they would say nothing."""
+
+MOST_VIEWS = 3
+"""Of so many places the geometry tells the pose: further neighbours add little, and each takes milliseconds."""
 
 CANDIDATES = 10
 """How many places are verified at most: five lose 0.027 of the recall@1 on lip6, and fifteen gain 0.002."""
@@ -40,11 +48,16 @@ class Verifier:
     Args:
         when: see :data:`Verify`.
         find: finds the keypoints of the query's frame.
+        camera: the name of the map's camera that took it, whose intrinsics tell the pose; None: not known.
     """
 
-    def __init__(self, when: Verify, find: Callable[[], Keypoints]) -> None:
-        self.when = when
+    def __init__(self, when: Verify, find: Callable[[], Keypoints], camera: str | None = None) -> None:
+        self.when, self.camera = when, camera
         self._find = find
+
+    def intrinsics(self, map_: Map) -> Intrinsics | None:
+        """Those of the query's camera; None if they are not known."""
+        return intrinsics_of(map_, self.camera)
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -52,16 +65,25 @@ class Verifier:
         return self._find()
 
 
+def intrinsics_of(map_: Map, camera: str | None) -> Intrinsics | None:
+    """The intrinsics of one of a map's cameras; None without a name, and for a camera that has none or is gone."""
+    with suppress(UnknownCamera):
+        return None if camera is None else map_.cameras.find(camera).intrinsics
+    return None
+
+
 @dataclass(frozen=True)
 class ThirdStage:
     """What came of the third stage.
 
     keypoints: of the query; None if its candidates were not verified.
+    stored: of the places that were verified, by their rows.
     milliseconds: how long it took.
     """
 
     state: VerificationState
     keypoints: Keypoints | None = None
+    stored: Mapping[int, Keypoints] = field(default_factory=dict)
     milliseconds: float = 0.0
 
 
@@ -91,7 +113,9 @@ def third_stage(
     if verifier is None or verifier.when == "never" or not len(candidates.rows):
         return candidates, judgement, NOT_VERIFIED
     calibration, automatic = calibration_of(map_, encoder), verifier.when == "auto"
-    if automatic and not worth_verifying(judgement, calibration):
+    if automatic and not (
+        worth_verifying(judgement, calibration) or _tells_pose(map_, candidates, judgement, verifier)
+    ):
         return candidates, judgement, ThirdStage("not-needed")
     began = time.perf_counter()
     count = min(CANDIDATES, len(candidates.rows))
@@ -110,7 +134,51 @@ def third_stage(
             ranked = verified(candidates, found)
             judgement = judged(ranked)
     milliseconds = 1e3 * (time.perf_counter() - began)
-    return ranked, judgement, ThirdStage("verified", verifier.keypoints, milliseconds)
+    kept = {
+        row: keypoints
+        for row, keypoints, one in zip(candidates.rows.tolist(), stored, found, strict=False)
+        if keypoints is not None and one is not None
+    }
+    return ranked, judgement, ThirdStage("verified", verifier.keypoints, kept, milliseconds)
+
+
+def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifier: Verifier) -> bool:
+    """Whether the geometry of the best match tells the robot's pose, which its scores alone do not."""
+    posed = judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE
+    return bool(posed) and verifier.intrinsics(map_) is not None
+
+
+def relative_views(
+    map_: Map, candidates: Candidates, stage: ThirdStage, verifier: Verifier | None
+) -> tuple[list[RelativeView | None], str | None]:
+    """How the query's camera stands to those of the places that were verified and belong to the best match's answer.
+
+    Returns:
+        One for each of the first candidates, and why intrinsics were not used, if they do not fit a frame.
+    """
+    query = stage.keypoints
+    if verifier is None or query is None:
+        return [], None
+    near = candidates.whereabouts.near(0, neighborhood_of(map_))
+    views: list[RelativeView | None] = []
+    note, told = None, 0
+    for row, one, belongs in zip(candidates.rows.tolist(), candidates.verifications, near.tolist(), strict=False):
+        place = stage.stored.get(row)
+        if one is None or place is None or not belongs or told == MOST_VIEWS:
+            views.append(None)
+            continue
+        (known,) = map_.places_at([row])
+        cameras = verifier.intrinsics(map_), intrinsics_of(map_, None if known is None else known.camera)
+        if None in cameras and told:  # only the best match's heading can be told without intrinsics
+            views.append(None)
+            continue
+        try:
+            view = relative_view(query, place, one, *cameras)
+        except UnfitIntrinsics as error:
+            view, note = relative_view(query, place, one), str(error)
+        views.append(view)
+        told += view is not None
+    return views, note
 
 
 def verified(candidates: Candidates, found: Sequence[Verification | None]) -> Candidates:

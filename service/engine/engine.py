@@ -229,6 +229,7 @@ class Engine:
         selection: Selection | None = None,
         mask: Mask | None = None,
         verify: Verify = "never",
+        camera: str | None = None,
     ) -> Recognized:
         """Find where one frame was taken: wait in the queue, decode, encode, search, compare cells, verify, judge.
 
@@ -238,6 +239,7 @@ class Engine:
             selection: what is known of the place; None: nothing.
             mask: the part of the frame that is ignored.
             verify: when the geometry of the best candidates is verified.
+            camera: the name of the camera that took the frame; None: not known.
 
         Raises:
             QueueFull: too many requests are waiting.
@@ -245,8 +247,10 @@ class Engine:
             Others: see ``encode_for``.
         """
         with self.queue.place():
-            encoded = await self.encode_for(map_, data, deadline, mask, search_ahead(map_, k, selection, verify))
-        (recognized,) = await self.searches.recognize(map_, [encoded], k, selection, verify)
+            encoded = await self.encode_for(
+                map_, data, deadline, mask, search_ahead(map_, k, selection, verify, camera)
+            )
+        (recognized,) = await self.searches.recognize(map_, [encoded], k, selection, verify, camera)
         return recognized
 
     async def encode_many(

@@ -50,26 +50,29 @@ class SearchAhead:
     map_: Map
     k: int
     verify: Verify = "never"
+    camera: str | None = None
 
     def __call__(self, encoded: Encoded) -> Answer | None:
         """The answer for a frame; None for a frame that is left to :meth:`Searches.recognize`."""
         if not len(encoded.encoding.regions) or not self.map_.snapshot().holds:  # it would have to read from the disk
             return None
-        verifiers = _verifiers([encoded], self.verify)
+        verifiers = _verifiers([encoded], self.verify, self.camera)
         (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k, None, verifiers)
         return answer
 
 
-def _verifiers(frames: Sequence[Encoded], verify: Verify) -> list[Verifier | None]:
+def _verifiers(frames: Sequence[Encoded], verify: Verify, camera: str | None) -> list[Verifier | None]:
     """What ``locate`` needs to verify the candidates of each frame."""
-    return [None if verify == "never" else Verifier(verify, frame.find_keypoints) for frame in frames]
+    return [None if verify == "never" else Verifier(verify, frame.find_keypoints, camera) for frame in frames]
 
 
-def search_ahead(map_: Map, k: int, selection: Selection | None, verify: Verify = "never") -> SearchAhead | None:
+def search_ahead(
+    map_: Map, k: int, selection: Selection | None, verify: Verify = "never", camera: str | None = None
+) -> SearchAhead | None:
     """The search to do in the encoder's thread, or None if other frames would wait too long for it."""
     if selection is not None or map_.count_places() > MOST_AHEAD:
         return None
-    return SearchAhead(map_, k, verify)
+    return SearchAhead(map_, k, verify, camera)
 
 
 @dataclass(frozen=True)
@@ -107,13 +110,15 @@ class Searches:
         k: int,
         selection: Selection | None = None,
         verify: Verify = "never",
+        camera: str | None = None,
     ) -> list[Recognized]:
         """Search a map for frames that its encoder has encoded; a result of ``SearchAhead`` is taken as it is.
 
         Args:
             k: how many matches to list.
             selection: what is known of the place; None: nothing.
-            verify: when the candidates are verified; the frames have their pixels or their views then.
+            verify: when the candidates are verified; the frames have their pixels then, or are kept scaled.
+            camera: the name of the camera that took the frames; None: not known.
 
         Raises:
             StorageFailure: the map's files cannot be read.
@@ -123,7 +128,7 @@ class Searches:
             answers: list[Answer] = [seen[0].search_result]
         else:
             encodings = [frame.encoding for frame in seen]
-            verifiers = _verifiers(seen, verify)
+            verifiers = _verifiers(seen, verify, camera)
             answers = await self.locate(map_, seen[0].encoder, encodings, k, selection, verifiers) if seen else []
         remaining = iter(answers)
         return [Recognized(frame, next(remaining) if len(frame.encoding.regions) else None) for frame in frames]

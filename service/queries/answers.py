@@ -65,7 +65,7 @@ def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:
         verdict=judgement.verdict,
         place=matches[0].place if recognized else None,
         probability=judgement.probability,
-        pose=estimated_pose(found.pose, matches[0].place) if recognized else None,
+        pose=estimated_pose(found.pose, matches[0].place, found.note) if recognized else None,
         score=judgement.score,
         margin=judgement.margin,
         decision=judgement.decision,
@@ -112,8 +112,13 @@ def verification_view(found: Answer) -> VerificationView:
     return VerificationView(state=stage.state, candidates=verified, keypoints=keypoints)
 
 
-def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedPose | None:
-    """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none."""
+def estimated_pose(estimate: PoseEstimate | None, best: PlaceView, note: str | None = None) -> EstimatedPose | None:
+    """The JSON view of an estimated pose; it has no ``z`` if the pose of the best match has none.
+
+    Args:
+        note: why the camera's intrinsics were not used, as ``core.errors.UnfitIntrinsics`` says it; None if they were,
+            or if there are none.
+    """
     if estimate is None:
         return None
     if best.pose is not None and best.pose.z is None:
@@ -126,6 +131,7 @@ def estimated_pose(estimate: PoseEstimate | None, best: PlaceView) -> EstimatedP
         heading_offset=estimate.heading_offset,
         offset_spread=estimate.offset_spread,
         source=estimate.source,
+        note=note,
         covariance=estimate.covariance.ravel().tolist(),
     )
 

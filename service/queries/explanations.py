@@ -66,7 +66,7 @@ async def explain_match(
     found = await in_thread(_stored_place, map_, place_id)
     if found is None:
         return None
-    inliers = await in_thread(_inliers, map_, answer)
+    inliers = _inliers(answer)
     stored, place, picture = found
     encoder, encoded = query.encoder, None
     if picture is not None:
@@ -87,11 +87,11 @@ async def explain_match(
     )
 
 
-def _inliers(map_: Map, answer: Answer) -> list[KeypointPair]:
+def _inliers(answer: Answer) -> list[KeypointPair]:
     """The keypoints of the query and of its best match that fit one rigid scene; none if they were not verified."""
-    candidates, ours = answer.candidates, answer.third_stage.keypoints
+    candidates, stage = answer.candidates, answer.third_stage
     verified = candidates.verifications[0] if candidates.verifications else None
-    (theirs,) = map_.keypoints_at(candidates.rows[:1].tolist())
+    ours, theirs = stage.keypoints, stage.stored.get(int(candidates.rows[0]))
     if verified is None or ours is None or theirs is None:
         return []
     pairs = verified.matches[verified.inliers]

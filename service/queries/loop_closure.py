@@ -89,7 +89,7 @@ def close_loop(
             raise PlaceTaken(f"The place {frame.id!r} has another frame; PUT replaces it.")
         if known is not None:
             selection = replace(selection or Selection(), excluded=frame.id)
-        verifier = Verifier(verify, encoded.find_keypoints)
+        verifier = Verifier(verify, encoded.find_keypoints, frame.fields.camera)
         (answer,) = locate(map_, encoded.encoder, [encoded.encoding], k, selection, [verifier])
         if known is not None:
             return Closure(answer, map_.place(frame.id), created=False)

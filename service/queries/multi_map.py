@@ -124,7 +124,11 @@ async def locate_in_maps(
             try:
                 looks = None
                 if verify != "never" and len(seen) == 1:
-                    looks = [verifiers.setdefault(_key(seen[0].mask), Verifier(verify, seen[0].find_keypoints))]
+                    looks = [
+                        verifiers.setdefault(
+                            _key(seen[0].mask), Verifier(verify, seen[0].find_keypoints, frames[0].camera)
+                        )
+                    ]
                 answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection, looks)
                 report = replace(report, answer=answer)
             except MAP_ERRORS as error:

@@ -76,7 +76,9 @@ async def query(
     """
     map_, data, options = await frame_for_map(request, engine, map_id, options)
     mask = await camera_mask(map_, options.camera)
-    recognized = await engine.recognize(map_, data, deadline, options.k, options.selection(), mask, options.verify)
+    recognized = await engine.recognize(
+        map_, data, deadline, options.k, options.selection(), mask, options.verify, options.camera
+    )
     answer = counted_answer(engine, statistics, map_, recognized)
     if options.explain and recognized.answer is not None and recognized.answer.matches:
         encoded = await in_thread(scaled_for_drawing, recognized.encoded)
@@ -131,7 +133,9 @@ async def query_batch(
             except Exception as error:
                 problem = frame_problem(request, error)
                 items[index] = BatchAnswer(file=part.name, status=problem.status, problem=problem)
-    recognized = await engine.searches.recognize(map_, list(encoded.values()), options.k, selection, options.verify)
+    recognized = await engine.searches.recognize(
+        map_, list(encoded.values()), options.k, selection, options.verify, options.camera
+    )
     for index, one in zip(encoded, recognized, strict=True):
         items[index].answer = counted_answer(engine, statistics, map_, one)
     request.state.noted = {"map": map_id, "frames": len(files)}

@@ -188,7 +188,11 @@ class EstimatedPose(BaseModel):
     source: PoseSource = Field(
         default="places",
         description="What the covariance rests on: the poses of `places` alone, or also the turn and the shift between "
-        "the pictures, by the cameras' `intrinsics` or, where one has none, by an assumed range of `field-of-view`.",
+        "the pictures by the cameras' `intrinsics` or, where one has none, the turn alone, by an assumed range of "
+        "`field-of-view`.",
+    )
+    note: str | None = Field(
+        default=None, description="Why the intrinsics of the frame's camera were not used; left out if they were."
     )
     covariance: list[float] = Field(
         min_length=36,

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
-from core.judgement.geometry import final_values
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
 from core.storage import Map
@@ -69,7 +68,9 @@ async def process_frame(
             return repeated
         mask = await camera_mask(map_, session.options.camera)
         verify = session.options.verify
-        recognized = await engine.recognize(map_, data, deadline, options.k, session.selection, mask, verify)
+        recognized = await engine.recognize(
+            map_, data, deadline, options.k, session.selection, mask, verify, session.options.camera
+        )
         single = counted_answer(engine, statistics, map_, recognized)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
@@ -193,8 +194,16 @@ def _evidence(map_: Map, found: Answer | None) -> Evidence:
     if found is None:
         return NOTHING
     ranked = found.candidates
-    scores = ranked.scores if ranked.geometry is None else final_values(ranked.scores, ranked.geometry.share)
-    return evidence(ranked.rows, scores, ranked.whereabouts, found.calibration, neighborhood_of(map_), ranked.examined)
+    verified = None if ranked.geometry is None else ranked.geometry.evidence
+    return evidence(
+        ranked.rows,
+        ranked.scores,
+        ranked.whereabouts,
+        found.calibration,
+        neighborhood_of(map_),
+        ranked.examined,
+        verified,
+    )
 
 
 def _believed(map_: Map, candidates: Sequence[Candidate]) -> list[BelievedPlace]:

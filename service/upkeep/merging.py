@@ -145,8 +145,8 @@ def _new_names(
         conflicts.append(f"The names {_listed(taken)} of sequences are taken or too long; choose another prefix.")
     kept = {camera.name: (camera.mask, camera.intrinsics) for camera in map_.cameras.all()}
     used = {place.camera for place in coming}
-    common = [camera for camera in other.cameras.all() if camera.name in used and camera.name in kept]
-    unlike = [camera for camera in common if kept[camera.name] != (camera.mask, camera.intrinsics)]
+    known = [camera for camera in other.cameras.all() if camera.name in used and camera.name in kept]
+    unlike = [camera for camera in known if kept[camera.name] != (camera.mask, camera.intrinsics)]
     cameras = {camera.name: prefix + camera.name for camera in unlike} if rule == "rename" else {}
     if unlike and rule != "rename":
         conflicts.append(

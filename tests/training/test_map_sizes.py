@@ -7,6 +7,7 @@ import pytest
 
 from core.geometry import verification
 from core.geometry.keypoints import Keypoints
+from core.geometry.pairs import Pairs
 from core.judgement.background import Environment
 from core.judgement.geometry import TERMS
 from core.judgement.probability import Curve
@@ -15,7 +16,6 @@ from training.map_sizes import (
     APART,
     CANDIDATES,
     SMALL,
-    Pairs,
     Traverse,
     cut,
     fit_geometry,
@@ -109,8 +109,8 @@ def test_a_pair_is_verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verification, "verify", verify)
     blank = [Keypoints(8, 8, np.zeros((0, 2), np.uint16), np.zeros((0, 64), np.int8))] * 4
     pairs = Pairs(blank, blank)
-    assert pairs.verified(1, np.array([3, 0])).evidence.tolist() == [7.0, 7.0]
-    assert pairs.verified(1, np.array([0, 2, 3])).share.tolist() == [0.0, 0.0, 0.0]
+    assert pairs.verified(1, np.array([3, 0]))[0].tolist() == [7.0, 7.0]
+    assert pairs.verified(1, np.array([0, 2, 3]))[1].tolist() == [0.0, 0.0, 0.0]
     assert asked == [2, 1]
 
 

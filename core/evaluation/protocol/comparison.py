@@ -65,6 +65,8 @@ class SizePoint:
     known_recognized: share of the known that are recognized and right.
     strangers_recognized: share of the strangers that are recognized; None without any.
     calibration_error: of the probabilities, known and strangers counting alike; None without strangers.
+    verified_known, verified_strangers, verified_error: the same after the candidates were verified geometrically; None
+        also for a calibration that cannot weigh evidence.
     """
 
     system: str
@@ -74,6 +76,9 @@ class SizePoint:
     known_recognized: float
     strangers_recognized: float | None
     calibration_error: float | None
+    verified_known: float | None = None
+    verified_strangers: float | None = None
+    verified_error: float | None = None
 
 
 @dataclass(frozen=True)

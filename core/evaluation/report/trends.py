@@ -102,6 +102,9 @@ def plot_map_sizes(points: Sequence[SizePoint], cast: Cast) -> list[Chart]:
         ("sizes-error", "Probabilities by size of map", "calibration error", lambda point: point.calibration_error),
         ("sizes-known", "Known places by size of map", "recognized, right", lambda point: point.known_recognized),
         ("sizes-strangers", "Strangers by size of map", "recognized", lambda point: point.strangers_recognized),
+        ("verified-error", "Probabilities, verified", "calibration error", lambda point: point.verified_error),
+        ("verified-known", "Known places, verified", "recognized, right", lambda point: point.verified_known),
+        ("verified-strangers", "Strangers, verified", "recognized", lambda point: point.verified_strangers),
     ]
     plots = []
     for name, title, what, value in asked:

@@ -175,8 +175,11 @@ class _Building:
         reader = self.archive.part(part)
         for line, _ in _lines(reader, part, CameraLine):
             mask = None if line.mask is None else line.mask.model_dump_json()
-            values = (line.name, mask, moment_text(line.updated_at))
-            self.connection.execute("INSERT INTO cameras (name, mask, updated_at) VALUES (?, ?, ?)", values)
+            intrinsics = None if line.intrinsics is None else line.intrinsics.model_dump_json()
+            values = (line.name, mask, intrinsics, moment_text(line.updated_at))
+            self.connection.execute(
+                "INSERT INTO cameras (name, mask, intrinsics, updated_at) VALUES (?, ?, ?, ?)", values
+            )
         row_checksums.write_checksums(self.connection, "cameras")
         reader.finish()
 

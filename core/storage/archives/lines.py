@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from core.errors import InvalidArchive
+from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.geometry.keypoints import MOST, count_of
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
@@ -43,10 +44,11 @@ class SequenceLine(_Line):
 
 
 class CameraLine(_Line):
-    """A camera and what is ignored in its frames."""
+    """A camera, what is ignored in its frames, and its intrinsics; files of format 1 have none."""
 
     name: Camera
     mask: Mask | None
+    intrinsics: Intrinsics | None = None
     updated_at: Timestamp
 
 
@@ -106,7 +108,7 @@ class PlaceLine(_Line):
 
 Kind = TypeVar("Kind", bound=_Line)
 
-_WITHIN: dict[str, type[BaseModel]] = {"pose": Pose, "picture": Picture, "mask": Mask}
+_WITHIN: dict[str, type[BaseModel]] = {"pose": Pose, "picture": Picture, "mask": Mask, "intrinsics": Intrinsics}
 
 
 def read_line(text: bytes, kind: type[Kind], where: str) -> Kind:
@@ -149,8 +151,11 @@ def sequence_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
 
 def camera_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
     """The lines of cameras by name."""
-    for name, mask, updated_at in connection.execute("SELECT name, mask, updated_at FROM cameras ORDER BY name"):
-        yield _line({"name": name, "mask": None if mask is None else json.loads(mask), "updated_at": updated_at})
+    query = "SELECT name, mask, intrinsics, updated_at FROM cameras ORDER BY name"
+    for name, mask, intrinsics, updated_at in connection.execute(query):
+        kept = {"mask": mask, "intrinsics": intrinsics}
+        parsed = {field: None if text is None else json.loads(text) for field, text in kept.items()}
+        yield _line({"name": name, **parsed, "updated_at": updated_at})
 
 
 _POSE = ("x", "y", "z", "latitude", "longitude", "heading")

@@ -55,3 +55,14 @@ def test_tiny_maps() -> None:
     assert len(nothing.rows) == 0 and nothing.unknown == 0
     assert told([0.5], 1)[0] > STRENGTH
     assert 0 not in told([0.01], 1)
+
+
+def test_what_verification_found_raises_and_lowers_a_places_evidence() -> None:
+    scores = np.array([0.16, 0.15, 0.14, *np.linspace(0.08, 0.06, 60)], np.float32)
+    verified = np.full(len(scores), np.nan)
+    verified[:2] = 200.0, 0.0
+    rows, where, marks = np.arange(len(scores)), walk(len(scores)), np.arange(len(scores)) < 30
+    plain, changed = (evidence(rows, scores, where, CALIBRATION, APART, marks, found) for found in (None, verified))
+    before, after = (dict(zip(seen.rows.tolist(), seen.gains.tolist(), strict=True)) for seen in (plain, changed))
+    assert after[0] > before[0] + 0.5 and after[1] < before[1] - 0.5
+    assert after[2] == before[2], "it was not verified"

@@ -138,8 +138,8 @@ def test_sequence_matching_pairs_the_two_traverses(
     (found,) = shared_stretches(of_matrix(pairs[0]), *pairs[0].shape)
     assert len(found.first) >= 0.95 * len(truth)
     assert truth[found.first, found.second].mean() >= 0.95
-    part = pairs[0][:40, 60:]
-    assert shared_stretches(of_matrix(part), *part.shape) == [], "of these parts neither shows a place of the other"
+    apart = pairs[0][:40, 60:]
+    assert shared_stretches(of_matrix(apart), *apart.shape) == [], "neither part shows a place of the other"
 
 
 def test_verdicts_with_the_second_half_of_the_references_left_out(

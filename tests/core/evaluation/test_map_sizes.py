@@ -48,6 +48,13 @@ def test_known_places_and_strangers_are_asked_in_maps_of_every_size(walk: Traver
     assert points[-1].strangers == 0 and points[-1].calibration_error is None
     assert points[0].known == 6 and points[-1].known == 20
     assert points[-1].known_recognized > 0.9
+    for point in points:
+        assert point.verified_known is not None and point.verified_known >= 0.9, "the scenes are rigid"
+        assert (point.verified_error is None) == (point.strangers == 0)
+    fitting = points[0].verified_strangers
+    assert fitting is not None and fitting <= 1 / 8, (
+        "only scenes that show the same word in the same spot, one in eight"
+    )
     again = map_sizes(Subject(system, walk, Training([], "nothing"), load), cache)
     assert again == points, "from the cache, without reading an image"
 

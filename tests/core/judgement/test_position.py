@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -183,6 +184,16 @@ def test_the_normalized_error_is_that_of_the_covariance() -> None:
         squares.append(float(error @ np.linalg.solve(found.covariance[np.ix_([0, 1, 5], [0, 1, 5])], error)))
     # Views share their errors in part, so the covariance is larger than for independent ones.
     assert 0.3 * 3 < np.mean(squares) < 3.8
+
+
+def test_without_intrinsics_a_view_turns_and_does_not_shift() -> None:
+    place = Pose(x=10, y=5, heading=90)
+    view = replace(view_from(place, 10, 6.5, 80, 8), source="field-of-view")
+    found, alone = estimate_pose(places([place]), [0], REACH, views=[view]), estimate([place])
+    assert found is not None and found.source == "field-of-view"
+    assert found.pose.heading == pytest.approx(80, abs=2)
+    assert [found.pose.x, found.pose.y] == pytest.approx([alone.pose.x, alone.pose.y], abs=0.05)
+    assert found.covariance[:2, :2] == pytest.approx(alone.covariance[:2, :2], rel=0.02, abs=0.02)
 
 
 def test_a_view_that_contradicts_the_places_is_not_used() -> None:

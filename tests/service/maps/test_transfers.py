@@ -298,9 +298,12 @@ def large(server: Server) -> bytes:
     made["sequences.jsonl"] = json.dumps({"name": None, "next_ordinal": MANY}).encode() + b"\n"
     listed = manifest["parts"][:2]
     for group, first in enumerate(range(0, MANY, 1000)):
-        lines = [json.dumps({**line, "id": f"p{n}", "ordinal": n}) + "\n" for n in range(first, first + 1000)]
+        lines = [
+            json.dumps({**line, "id": f"p{n}", "ordinal": n, "keypoints": None}) + "\n"
+            for n in range(first, first + 1000)
+        ]
         halves = random.standard_normal((1000, width // 2)).astype("<f2")
-        for name, data in zip(group_names(group), ("".join(lines).encode(), halves.tobytes(), b""), strict=True):
+        for name, data in zip(group_names(group), ("".join(lines).encode(), halves.tobytes(), b"", b""), strict=True):
             made[name] = data
             listed.append({"name": name, "rows": 1000})
     return sealed({**manifest, "places": MANY, "parts": listed}, made)

@@ -231,6 +231,22 @@ def test_a_robot_that_leaves_the_map_or_is_carried_off(server: Server, map_id: s
     assert not answer["lost"]
 
 
+def test_a_robot_that_stands_and_a_covered_camera(server: Server, traverse: str) -> None:
+    session = begin(server, traverse)
+    for number in range(4):
+        answer = send(server, traverse, session, again(number))
+        assert answer["view"] is None
+    for _ in range(3):
+        stands = send(server, traverse, session, again(3))
+        assert (stands["view"], stands["verdict"]) == ("constant", "recognized")
+        assert stands["probability"] == pytest.approx(answer["probability"], abs=1e-3)
+    covered = [send(server, traverse, session, encoded(blank(320, 240))) for _ in range(4)]
+    assert {one["view"] for one in covered} == {"covered"}
+    assert (covered[-1]["verdict"], covered[-1]["place"]) == ("unknown", None)
+    uncovered = send(server, traverse, session, again(5))
+    assert (uncovered["view"], uncovered["verdict"]) == (None, "recognized")
+
+
 def test_only_the_sequences_that_are_named(server: Server, map_id: str) -> None:
     for day in ("monday", "tuesday"):
         for number in range(4):

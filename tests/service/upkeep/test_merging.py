@@ -67,8 +67,9 @@ def conflicting(server: Server, one: str, other: str) -> None:
     for name, shift in ((one, 0), (other, 10)):
         server.create_map(name, encoder=COARSE)
         polygon = [[0, 0.9], [1, 0.9], [1, 1 - shift / 100]]
-        mask = {"mask": {"polygons": [polygon]}}
-        assert server.client.put(f"/v1/maps/{name}/cameras/front", json=mask).status_code == 201
+        lens = {"width": 64, "height": 48, "fx": 50 + shift, "fy": 50, "cx": 31.5, "cy": 23.5}
+        camera = {"mask": {"polygons": [polygon]}, "intrinsics": lens}
+        assert server.client.put(f"/v1/maps/{name}/cameras/front", json=camera).status_code == 201
         enrol_frames(server, name, [jpeg(n + shift) for n in range(3)], sequence="monday", camera="front")
 
 
@@ -97,11 +98,11 @@ def test_conflicts_are_refused_renamed_or_skipped(server: Server) -> None:
     after = places(server, "ours")
     assert list(after) == ["p0", "p1", "p2", "t.p0", "t.p1", "t.p2"]
     assert after["t.p1"]["sequence"] == "t.monday" and after["t.p1"]["camera"] == "t.front"
-    masks = [
-        server.client.get(f"/v1/maps/{m}/cameras/{c}").json()["mask"]
-        for m, c in (("ours", "t.front"), ("theirs", "front"))
-    ]
-    assert masks[0] == masks[1]
+    copy, original = (
+        server.client.get(f"/v1/maps/{m}/cameras/{c}").json() for m, c in (("ours", "t.front"), ("theirs", "front"))
+    )
+    assert (copy["mask"], copy["intrinsics"]) == (original["mask"], original["intrinsics"])
+    assert copy["intrinsics"]["fx"] == 60
 
 
 def test_sequences_of_one_name_are_joined_in_order_when_skipping(server: Server) -> None:

@@ -56,6 +56,10 @@ def test_sizes_without_strangers_have_no_error(tmp_path: Path) -> None:
     assert "from 0.250 at 1 to 0.750 at 111" in plots["sizes-known"]
     assert "from 0.050 at 1 to 0.000 at 10" in plots["sizes-strangers"]
     assert plot_map_sizes([], cast) == []
+    verified = [SizePoint("system-0", n, 5, 60, 0.25, 0.05, 0.2, 0.75, 0.0, 0.1) for n in (1, 10)]
+    plots = {plot.name: plot.alt for plot in plot_map_sizes(verified, cast)}
+    assert list(plots)[3:] == ["verified-error", "verified-known", "verified-strangers"]
+    assert "from 0.750 at 1 to 0.750 at 10" in plots["verified-known"]
 
 
 def test_two_plots_for_each_disturbance(tmp_path: Path) -> None:
