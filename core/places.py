@@ -206,6 +206,11 @@ class Whereabouts:
     def __len__(self) -> int:
         return len(self.kind)
 
+    @property
+    def aligned(self) -> bool:
+        """Whether any place is at another station than its own."""
+        return bool((self.track != self.sequence).any() or (self.station != self.ordinal).any())
+
     @classmethod
     def along_sequence(cls, ordinals: ArrayLike) -> Whereabouts:
         """Places of one sequence without poses, by their order in it, int64 [n]."""
@@ -248,7 +253,7 @@ class Whereabouts:
         So a place that several aligned traverses show counts once.
         """
         others = ~self.near(row, neighborhood)
-        if not (self.track != self.sequence).any():
+        if not self.aligned:
             return others
         at = np.flatnonzero(others & (self.track != NO_SEQUENCE))
         _, first = np.unique(np.stack([self.track[at], self.station[at]]), axis=1, return_index=True)

@@ -133,7 +133,7 @@ def _station_keys(track: NDArray[np.int32], station: NDArray[np.int64]) -> NDArr
 
 def _stations(where: Whereabouts) -> NDArray[np.int32]:
     """A number for each station, int32 [n]; empty if no two sequences share one."""
-    if not (where.track != where.sequence).any():
+    if not where.aligned:
         return np.empty(0, np.int32)
     alone = np.flatnonzero(where.track == NO_SEQUENCE)
     keys = _station_keys(where.track, where.station)

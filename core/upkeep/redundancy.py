@@ -34,7 +34,7 @@ def neighbour_pairs(where: Whereabouts, neighborhood: Neighborhood) -> NDArray[n
         there = apart.reshape(-1) <= neighborhood.radius
         pairs.append(np.stack([members[first[there]], members[second[there]]], axis=1))
     pairs += _along(where, where.sequence, where.ordinal, neighborhood.frames, min(neighborhood.frames, _STEPS))
-    if (where.track != where.sequence).any():
+    if where.aligned:
         # Several traverses may have a frame at each station.
         pairs += _along(where, where.track, where.station, neighborhood.frames, _STEPS)
     ordered = np.sort(np.concatenate(pairs), axis=1)

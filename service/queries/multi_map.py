@@ -109,7 +109,7 @@ async def locate_in_maps(
             masks[map_id] = [await camera_mask(maps[map_id], frame.camera) for frame in frames]
         except MAP_ERRORS as error:
             reports[map_id] = MapReport(map_id, maps.pop(map_id, None), error=error)
-    encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=verify != "never" and len(frames) == 1)
+    encoded = await _encode(engine, maps, masks, frames, deadline, keep_scaled=verify != "never")
     verifiers: dict[str, Verifier] = {}  # by mask: the keypoints of one frame are the same for every encoder
     for map_id, map_ in maps.items():
         outcome = encoded[map_id]
@@ -124,11 +124,9 @@ async def locate_in_maps(
             try:
                 looks = None
                 if verify != "never" and len(seen) == 1:
-                    looks = [
-                        verifiers.setdefault(
-                            _key(seen[0].mask), Verifier(verify, seen[0].find_keypoints, frames[0].camera)
-                        )
-                    ]
+                    camera = frames[outcome.index(seen[0])].camera
+                    made = Verifier(verify, seen[0].find_keypoints, camera)
+                    looks = [verifiers.setdefault(_key(seen[0].mask), made)]
                 answer = await in_thread(locate_rig, map_, seen[0].encoder, encodings, k, selection, looks)
                 report = replace(report, answer=answer)
             except MAP_ERRORS as error:

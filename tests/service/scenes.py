@@ -30,6 +30,11 @@ def scene(seed: int, width: int = 320, height: int = 240) -> Pixels:
     return np.asarray(np.clip(picture + noise, 0, 255), np.uint8)
 
 
+def stranger(seed: int) -> Pixels:
+    """A place that no other seed shows: mirrored, for scenes share eight words, which fit one another geometrically."""
+    return np.ascontiguousarray(scene(seed)[:, ::-1])
+
+
 def seen_again(pixels: Pixels, seed: int = 0) -> Pixels:
     """The same place another day: a little shifted, darker, noisier."""
     random = np.random.default_rng(seed)

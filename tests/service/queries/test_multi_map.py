@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.service.encoders import COARSE, install_coarse_encoder
-from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server, assert_item_problem, assert_problem, text, typed
 
 HALL, YARD = range(8), range(20, 28)
@@ -218,8 +218,8 @@ def test_answers_count_for_the_health_of_the_map_that_has_the_place(fleet: Serve
 
     before = {name: counted(name) for name in ("hall", "twin")}
     assert ask(fleet, again(5), maps="hall,twin")["map"] == "hall"
-    assert ask(fleet, again(63), maps="hall")["verdict"] == "unknown"
+    assert ask(fleet, encoded(stranger(63)), maps="hall")["verdict"] == "unknown"
     assert ask(fleet, encoded(blank()), maps="hall")["verdict"] == "unknown"
-    assert ask(fleet, again(40), maps="hall,twin")["verdict"] == "unknown", "nowhere, so of no map"
+    assert ask(fleet, encoded(stranger(40)), maps="hall,twin")["verdict"] == "unknown", "nowhere, so of no map"
     assert counted("hall") == (before["hall"][0] + 3, before["hall"][1] + 1)
     assert counted("twin") == before["twin"]

@@ -10,7 +10,7 @@ import pytest
 from core.frames.images import Limits, decode
 from core.method.catalogue import EncoderCatalogue
 from tests.service.encoders import COARSE, SECOND_STAGE, TWO_STAGES
-from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
+from tests.service.scenes import blank, encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server, assert_problem
 
 
@@ -43,7 +43,7 @@ def test_the_margin_is_over_the_best_rival(server: Server, traverse: str) -> Non
 def test_a_place_that_was_never_enrolled_is_unknown(server: Server, traverse: str) -> None:
     verdicts = []
     for seed in range(100, 110):
-        answer = server.query(traverse, jpeg(seed))
+        answer = server.query(traverse, encoded(stranger(seed)))
         verdicts.append(answer["verdict"])
         if answer["verdict"] != "recognized":
             assert answer["place"] is None

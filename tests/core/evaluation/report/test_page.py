@@ -130,6 +130,9 @@ def test_files_beside_the_page_are_pictures(written: Written) -> None:
         "sizes-error.png",
         "sizes-known.png",
         "sizes-strangers.png",
+        "verified-error.png",
+        "verified-known.png",
+        "verified-strangers.png",
     ]
     for name in names:
         if name.endswith(".png"):
