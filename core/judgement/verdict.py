@@ -59,9 +59,9 @@ MOST_RIVALS = 8
 MOSTLY_IMAGINED = 0.5
 """A map of which more of the background than this is imagined has few places."""
 
-DOUBT = (0.2, 0.5)
+DOUBT = (0.1, 0.5)
 """Between these probabilities an answer is in doubt.  Of the frames of corridor and lip6, asked of the whole other
-traverse, two stages leave 0.26 and 0.12 there."""
+traverse, two stages leave 0.27 and 0.23 there."""
 
 
 class Calibration(BaseModel):

@@ -47,9 +47,7 @@ def check(server: Server, expected: dict[str, Any], pictures: Path) -> None:
         assert {name: found[name] for name in record if name != "calibration"} == {
             name: value for name, value in record.items() if name != "calibration"
         }
-        if (
-            known["source"] == "encoder-default"
-        ):  # today's says more about small maps and geometry
+        if known["source"] == "encoder-default":  # today's says more about small maps and geometry
             assert calibration["environment"] is not None
             calibration["curve"] = {name: calibration["curve"][name] for name in known["curve"]}
             calibration.pop("environment")
