@@ -82,7 +82,8 @@ LEAST_AHEAD = 0.1
 """Cosine of the angle to the optical axis from which on a direction is ahead."""
 SAME = 1e-3
 """Rotations and shifts that differ by less are one."""
-MOST_STEPS = 15
+FIRST_STEPS, MOST_STEPS = 5, 15
+"""Towards a minimum: from each start, and from those that are worth it."""
 ENOUGH = 0.05
 """The cost is twice a logarithm of a likelihood; a step that lowers it by less is the last."""
 
@@ -185,7 +186,7 @@ def view_of_bearings(place: Array, query: Array, pixel: float) -> RelativeView |
         return None
     known = known[np.linspace(0, len(known) - 1, min(len(known), MOST_MATCHES)).round().astype(np.int64)]
     p, q = place[known], query[known]
-    fits = _distinct([_minimized(p, q, start, NOISE * pixel) for start in _starts(p, q, pixel)])
+    fits = _distinct([_minimized(p, q, start, NOISE * pixel, FIRST_STEPS) for start in _starts(p, q, pixel)])
     noise = min(_noise(p, q, fit, pixel) for fit in fits)
     plane = min((fit for fit in fits if isinstance(fit, _Plane)), key=lambda fit: _criterion(p, q, fit, noise))
     good = min(_criterion(p, q, fit, noise) for fit in fits) + HOPELESS
@@ -403,11 +404,11 @@ def _cross_matrices(vectors: Array) -> Array:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
-def _minimized(p: Array, q: Array, model: _Model, noise: float) -> _Model:
+def _minimized(p: Array, q: Array, model: _Model, noise: float, steps: int = MOST_STEPS) -> _Model:
     """The model at the minimum of the robust cost that is reached from it (Levenberg and Marquardt)."""
     residuals, jacobian = model.linearized(p, q)
     cost, damping = _cost(residuals, model, noise), 1e-3
-    for _ in range(MOST_STEPS):
+    for _ in range(steps):
         normal, gradient = _normal_equations(residuals, jacobian, model, noise)
         damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
         step = -np.asarray(np.linalg.solve(damped, gradient), np.float64)
