@@ -99,22 +99,22 @@ def test_the_inliers_are_explained_and_drawn(server: Server, verified: str) -> N
 
 
 def test_a_map_without_keypoints_says_so_and_answers_by_two_stages(server: Server) -> None:
-    server.create_map("bare", verification=False, keep="thumbnail")
+    server.create_map("without-keypoints", verification=False, keep="thumbnail")
     for seed in range(3):
-        server.enrol("bare", f"p{seed}", jpeg(seed))
-    answers = {verify: server.query("bare", seen(1), verify=verify) for verify in ("never", "always")}
+        server.enrol("without-keypoints", f"p{seed}", jpeg(seed))
+    answers = {verify: server.query("without-keypoints", seen(1), verify=verify) for verify in ("never", "always")}
     assert answers["always"]["verification"] == {"state": "no-keypoints", "candidates": 0, "keypoints": None}
     for name in ("verdict", "probability", "score", "margin", "decision"):
         assert answers["always"][name] == answers["never"][name]
-    result = finished(server, asked(server, "bare", "keypoints"))["result"]
+    result = finished(server, asked(server, "without-keypoints", "keypoints"))["result"]
     assert result["found"] == 0  # the setting says that it keeps none
-    edited = server.client.patch("/v1/maps/bare", json={"verification": True})
+    edited = server.client.patch("/v1/maps/without-keypoints", json={"verification": True})
     assert edited.status_code == 200, edited.text
-    job = finished(server, asked(server, "bare", "keypoints"))
+    job = finished(server, asked(server, "without-keypoints", "keypoints"))
     assert job["state"] == "succeeded" and job["result"]["found"] == 3 and job["result"]["without"] == 0, job["result"]
-    answer = server.query("bare", seen(1), verify="always")
+    answer = server.query("without-keypoints", seen(1), verify="always")
     assert answer["verification"]["state"] == "verified" and answer["place"]["id"] == "p1"
-    assert finished(server, asked(server, "bare", "keypoints"))["result"]["found"] == 0
+    assert finished(server, asked(server, "without-keypoints", "keypoints"))["result"]["found"] == 0
 
 
 def test_a_loop_closure_is_verified_and_enrols_keypoints(server: Server, map_id: str) -> None:
