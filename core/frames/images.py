@@ -39,6 +39,10 @@ class Limits:
     min_side: int = 16
 
 
+ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
+"""Of a picture that was accepted, whatever today's limits are; no service can be set to accept a larger one."""
+
+
 def decode(data: bytes, limits: Limits = Limits()) -> Pixels:
     """Decode a JPEG, PNG or WebP file, upright by its EXIF orientation.
 

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 
-from core.errors import UnfitIntrinsics, UnknownCamera
-from core.frames.intrinsics import Intrinsics
+from core.errors import UnfitIntrinsics
 from core.geometry.keypoints import Keypoints
 from core.geometry.pose import RelativeView, relative_view
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
@@ -55,21 +53,10 @@ class Verifier:
         self.when, self.camera = when, camera
         self._find = find
 
-    def intrinsics(self, map_: Map) -> Intrinsics | None:
-        """Those of the query's camera; None if they are not known."""
-        return intrinsics_of(map_, self.camera)
-
     @cached_property
     def keypoints(self) -> Keypoints:
         """The keypoints of the query's frame."""
         return self._find()
-
-
-def intrinsics_of(map_: Map, camera: str | None) -> Intrinsics | None:
-    """The intrinsics of one of a map's cameras; None without a name, and for a camera that has none or is gone."""
-    with suppress(UnknownCamera):
-        return None if camera is None else map_.cameras.find(camera).intrinsics
-    return None
 
 
 @dataclass(frozen=True)
@@ -145,7 +132,7 @@ def third_stage(
 def _tells_pose(map_: Map, candidates: Candidates, judgement: Judgement, verifier: Verifier) -> bool:
     """Whether the geometry of the best match tells the robot's pose, which its scores alone do not."""
     posed = judgement.verdict == "recognized" and candidates.whereabouts.kind[0] != NO_POSE
-    return bool(posed) and verifier.intrinsics(map_) is not None
+    return bool(posed) and map_.cameras.intrinsics(verifier.camera) is not None
 
 
 def relative_views(
@@ -168,7 +155,8 @@ def relative_views(
             views.append(None)
             continue
         (known,) = map_.places_at([row])
-        cameras = verifier.intrinsics(map_), intrinsics_of(map_, None if known is None else known.camera)
+        names = verifier.camera, None if known is None else known.camera
+        cameras = [map_.cameras.intrinsics(name) for name in names]
         if None in cameras and told:  # only the best match's heading can be told without intrinsics
             views.append(None)
             continue

@@ -22,7 +22,7 @@ from core.errors import (
     UnknownMap,
     UnknownSequence,
 )
-from core.frames.images import Limits, decode, encode_thumbnail
+from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints
 from core.places import Place, PlaceFields
 from core.storage.archives.exporter import Exporter
@@ -60,9 +60,6 @@ MOST_RECENT = 1024
 
 LONGEST_METADATA = 1000
 """… unless their metadata has more characters, so that all together take five megabytes at most."""
-
-_ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
-"""A picture that was accepted is shown whatever today's limits are; no service can be set to accept a larger one."""
 
 
 class RecentPlaces:
@@ -530,7 +527,7 @@ class Map:
         if stored.place.picture == "thumbnail":
             return kept
         try:
-            return encode_thumbnail(decode(kept, _ANY_SIZE))
+            return encode_thumbnail(decode(kept, ANY_SIZE))
         except InvalidImage as error:
             raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
 

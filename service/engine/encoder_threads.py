@@ -68,7 +68,7 @@ class Encoded:
 
     def find_keypoints(self) -> Keypoints:
         """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
-        return self.keypoints or keypoints_in(packaged_xfeat(), self.scaled)
+        return keypoints_in(packaged_xfeat(), self.scaled) if self.keypoints is None else self.keypoints
 
     def without_pixels(self, keep_scaled: bool = False) -> Encoded:
         """A copy with 0 x 0 pixels, for frames that stay in memory for a while.

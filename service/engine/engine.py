@@ -283,20 +283,18 @@ class Engine:
         frames: Sequence[bytes],
         deadline: RequestDeadline,
         masks: Sequence[Mask | None] | None = None,
-        keypoints: bool = False,
         keep_scaled: bool = False,
     ) -> list[Encoded | Exception]:
         """Encode many frames: each frame, without its pixels, or the error that kept it from being encoded.
 
         Args:
-            keypoints: whether the frames' keypoints are wanted, too.
             keep_scaled: keep of each frame what keypoints are found in.
 
         Raises:
             EncoderNotInstalled: the encoder is not installed.
         """
         made: dict[int, Encoded | Exception] = {}
-        async with aclosing(self.encode_many(identity, frames, deadline, masks, keypoints)) as outcomes:
+        async with aclosing(self.encode_many(identity, frames, deadline, masks)) as outcomes:
             async for some in outcomes:
                 for index, outcome in some:
                     made[index] = outcome if isinstance(outcome, Exception) else outcome.without_pixels(keep_scaled)

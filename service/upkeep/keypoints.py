@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any
 
 from core.errors import InvalidImage, StorageFailure, UnknownCamera
-from core.frames.images import Limits, decode
+from core.frames.images import ANY_SIZE, decode
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
@@ -28,9 +28,6 @@ PLACES_PER_COMMIT = 32
 
 MOST_LISTED = 20
 """How many of the places whose picture cannot be read the result lists at most."""
-
-_ANY_SIZE = Limits(max_bytes=1 << 30, max_pixels=1_000_000_000, min_side=1)
-"""A picture that was accepted is read whatever today's limits are."""
 
 
 def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
@@ -82,4 +79,4 @@ def _keypoints(map_: Map, place: KeptFrame) -> Keypoints:
     mask: Mask | None = None
     with suppress(UnknownCamera):  # it was forgotten since the place was enrolled
         mask = map_.cameras.mask(place.camera)
-    return find_keypoints(packaged_xfeat(), decode(map_.picture(place.id) or b"", _ANY_SIZE), mask)
+    return find_keypoints(packaged_xfeat(), decode(map_.picture(place.id) or b"", ANY_SIZE), mask)
