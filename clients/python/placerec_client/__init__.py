@@ -18,6 +18,7 @@ from placerec_client._sync.client import Client
 from placerec_client._sync.jobs import Job
 from placerec_client._sync.maps import Map
 from placerec_client._sync.sessions import Session
+from placerec_client.batches import Enrolled, Located, NewPlace
 from placerec_client.errors import (
     ConnectionFailed,
     DeadlineExceeded,
@@ -42,11 +43,14 @@ __all__ = [
     "Client",
     "ConnectionFailed",
     "DeadlineExceeded",
+    "Enrolled",
     "Frame",
     "InvalidFrame",
     "Job",
     "JobCancelled",
+    "Located",
     "Map",
+    "NewPlace",
     "Picture",
     "PlacerecError",
     "Problem",
