@@ -103,7 +103,11 @@ def allowed(path: Path) -> set[str]:
 
 
 def test_what_is_imported_is_declared() -> None:
-    known = set(sys.stdlib_module_names) | {Path(folder).name for folder in FOLDERS} | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    known = (
+        set(sys.stdlib_module_names)
+        | {Path(folder).name for folder in FOLDERS}
+        | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    )
     distributions = packages_distributions()
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"

@@ -268,6 +268,23 @@ class ListSequences(TypedDict, total=False):
     """Most items on a page."""
 
 
+class FollowMap(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/events``."""
+
+    kinds: str | Sequence[str] | None
+    """The kinds of events, separated by commas: query, enrolment, session, job, map; all if left out."""
+
+    verdicts: str | Sequence[str] | None
+    """Only queries with these verdicts, separated by commas: recognized, ambiguous, unknown; all if left out. Events
+    of other kinds are not affected.
+    """
+
+    pictures: bool
+    """Tell queries with a small picture of the frame, if the map keeps pictures of its places. This needs a key of
+    the role `enrol`.
+    """
+
+
 class QueryOrEnrol(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/query:enrol``."""
 

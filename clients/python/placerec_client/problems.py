@@ -9,6 +9,10 @@ from placerec_client import errors
 from placerec_client.errors import Problem
 
 
+class BadRequest(Problem):
+    """400 ``bad-request``: The request cannot be understood."""
+
+
 class MalformedBody(Problem):
     """400 ``malformed-body``: The body cannot be parsed."""
 
@@ -57,6 +61,10 @@ class UnknownMap(Problem):
     """404 ``unknown-map``: The map does not exist."""
 
 
+class UnknownPath(Problem):
+    """404 ``unknown-path``: There is no such resource."""
+
+
 class UnknownPlace(Problem):
     """404 ``unknown-place``: The place does not exist."""
 
@@ -67,6 +75,10 @@ class UnknownSequence(Problem):
 
 class UnknownSession(Problem):
     """404 ``unknown-session``: The session does not exist."""
+
+
+class MethodNotAllowed(Problem):
+    """405 ``method-not-allowed``: The resource does not support this method."""
 
 
 class HeadTooSlow(Problem):
@@ -261,6 +273,10 @@ class ClientGone(Problem):
     """499 ``client-gone``: The client closed the connection."""
 
 
+class InternalError(Problem):
+    """500 ``internal-error``: The service failed."""
+
+
 class InvalidKeypoints(Problem):
     """500 ``invalid-keypoints``: Keypoints of a place are damaged."""
 
@@ -353,6 +369,10 @@ class TooManyImports(Problem):
     """503 ``too-many-imports``: Too many maps are being imported."""
 
 
+class TooManyListeners(Problem):
+    """503 ``too-many-listeners``: Too many clients listen to events."""
+
+
 class TooManyWatchers(Problem):
     """503 ``too-many-watchers``: Too many clients follow jobs."""
 
@@ -366,6 +386,7 @@ class StorageFull(Problem):
 
 
 BY_SLUG: dict[str, type[Problem]] = {
+    "bad-request": BadRequest,
     "malformed-body": MalformedBody,
     "malformed-head": MalformedHead,
     "key-needed": KeyNeeded,
@@ -378,9 +399,11 @@ BY_SLUG: dict[str, type[Problem]] = {
     "unknown-explanation": UnknownExplanation,
     "unknown-job": UnknownJob,
     "unknown-map": UnknownMap,
+    "unknown-path": UnknownPath,
     "unknown-place": UnknownPlace,
     "unknown-sequence": UnknownSequence,
     "unknown-session": UnknownSession,
+    "method-not-allowed": MethodNotAllowed,
     "head-too-slow": HeadTooSlow,
     "batch-out-of-order": BatchOutOfOrder,
     "frame-needed": FrameNeeded,
@@ -429,6 +452,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "too-many-sessions": TooManySessions,
     "head-too-large": HeadTooLarge,
     "client-gone": ClientGone,
+    "internal-error": InternalError,
     "invalid-keypoints": InvalidKeypoints,
     "storage-failure": StorageFailure,
     "data-directory-locked": DataDirectoryLocked,
@@ -452,6 +476,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "too-many-connections": TooManyConnections,
     "too-many-exports": TooManyExports,
     "too-many-imports": TooManyImports,
+    "too-many-listeners": TooManyListeners,
     "too-many-watchers": TooManyWatchers,
     "wrong-vocabulary": WrongVocabulary,
     "storage-full": StorageFull,

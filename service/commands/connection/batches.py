@@ -7,7 +7,6 @@ from contextlib import aclosing
 from dataclasses import dataclass
 
 from placerec_client import Enrolled, NewPlace
-
 from service.commands.connection.client import Service, failures
 from service.commands.traverse import Frame
 
