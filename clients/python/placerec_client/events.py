@@ -64,7 +64,7 @@ class Reader:
         Raises:
             UnexpectedAnswer: an event is longer than any service sends.
         """
-        self._waiting += chunk.replace(b"\r\n", b"\n")
+        self._waiting = (self._waiting + chunk).replace(b"\r\n", b"\n")
         *whole, self._waiting = self._waiting.split(b"\n\n")
         if len(self._waiting) > MOST_BYTES:
             raise UnexpectedAnswer("An event is too long.")
