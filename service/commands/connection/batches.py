@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from core.errors import PlacerecError
 from service.commands.connection.client import Refused, Service, media_type, path_of
 from service.commands.traverse import Frame
 
@@ -55,7 +56,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Read:
-    """A frame that was read from disk; ``data`` is empty if only its digest is sent, or if it cannot be read."""
+    """A frame that was read; ``data`` is empty if only its digest is sent, or if it cannot be read."""
 
     frame: Frame
     entry: dict[str, Any] = field(default_factory=dict)
@@ -113,7 +114,7 @@ class _Sender:
 
     async def ask(self, frames: Sequence[Frame]) -> set[str]:
         """Update the places that have these frames; return the ids of the frames that have to be sent."""
-        read = await asyncio.gather(*(asyncio.to_thread(_read, frame, digest=True) for frame in frames))
+        read = await asyncio.to_thread(lambda: [_read(frame, digest=True) for frame in frames])
         needed = set()
         for one, item in await self._post(read):
             if item is not None and item.get("problem", {}).get("type", "").endswith(":frame-needed"):
@@ -216,9 +217,11 @@ def _outcome(one: _Read, item: dict[str, Any] | None, uploaded: bool) -> Outcome
 def _read(frame: Frame, digest: bool = False) -> _Read:
     """Read a frame and make its entry; with ``digest`` only the digest of its bytes is kept."""
     try:
-        data = frame.path.read_bytes()
+        data = frame.taken.load()
     except OSError as error:
         return _Read(frame, refusal=f"the file cannot be read: {error.strerror}.")
+    except PlacerecError as error:
+        return _Read(frame, refusal=str(error))
     entry = {"id": frame.id, **frame.parameters(data)}
     if digest:
         return _Read(frame, {**entry, "sha256": hashlib.sha256(data).hexdigest()})

@@ -10,6 +10,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from core.recordings import Frame as TakenFrame
 from service.commands.connection import batches
 from service.commands.connection.batches import Outcome, enrol_frames
 from service.commands.connection.client import Refused, Service
@@ -61,7 +62,7 @@ def enrol(server: Server, map_id: str, folder: Path, count: int, way: Mischief) 
     frames = []
     for index in range(count):
         (folder / f"{index}.jpg").write_bytes(jpeg(index, 64, 48))
-        frames.append(Frame(folder / f"{index}.jpg", f"p{index}", "walk", listed=True))
+        frames.append(Frame(TakenFrame(f"p{index}", f"{index}.jpg", (folder / f"{index}.jpg").read_bytes), "walk"))
     told: list[Outcome] = []
 
     async def work() -> None:
