@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from core.storage import Atlas
 from tests.core.recordings.bags import (
     CAMERA,
     ODOMETRY,
+    ROS2,
     SECOND,
     START,
     WRITERS,
@@ -30,7 +32,7 @@ from tests.core.recordings.bags import (
 )
 from tests.core.recordings.test_video import write_video
 from tests.service.commands.conftest import Placerec
-from tests.service.scenes import encoded, jpeg, scene
+from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import ROOT, Server
 
 
@@ -235,3 +237,96 @@ def test_memory_does_not_grow_with_the_bag(tmp_path: Path) -> None:
         )
         peaks.append(int(done.stdout))
     assert peaks[1] < peaks[0] + 16_000, peaks  # kilobytes
+
+
+def test_frames_of_bags_videos_and_folders_are_queried(placerec: Placerec, tmp_path: Path) -> None:
+    bag = write_mcap(tmp_path / "walk.mcap", walk(4))
+    placerec("enroll", bag, "--map", "lab", "--create")
+    (tmp_path / "again.bmp").write_bytes(encoded(seen_again(scene(2)), ".bmp"))
+    words = ("query", tmp_path / "again.bmp", bag, "--map", "lab", "--every-seconds", 2, "--json")
+    done = placerec(*words)
+    single, first, last = (json.loads(line) for line in done.stdout.splitlines())
+    assert single["place"]["id"].endswith("1700000002.000000000") and "frame" not in single
+    assert [one["frame"] for one in (first, last)] == [one["place"]["id"] for one in (first, last)]
+    assert last["frame"].endswith("1700000002.000000000")
+
+    write_video(tmp_path / "walk.avi")
+    table = placerec("query", tmp_path / "walk.avi", "--map", "lab", "--every-change", 0.3)
+    assert "4 of 12 frames are keyframes" in table.stderr and "walk.avi, frame 3 at 0.750 s" in table.stdout
+    bad = placerec("query", bag, "--map", "lab", "--topic", "/rear", status=1)
+    assert "has no topic '/rear'" in bad.stderr
+
+
+def test_a_map_is_calibrated_by_labelled_frames_of_a_bag(placerec: Placerec, tmp_path: Path) -> None:
+    placerec("enroll", write_mcap(tmp_path / "walk.mcap", small_walk(11)), "--map", "lab", "--create")
+    again = [
+        compressed(START + (100 + index) * SECOND, encoded(seen_again(scene(index, 96, 72), index)), "/rear")
+        for index in range(22)  # half of them the map lacks
+    ]
+    bag = write_ros1(tmp_path / "again.bag", again)
+    rows = [
+        f"rear-{1_700_000_100 + index}.000000000,"
+        + (f"camera-image_raw-compressed-{1_700_000_000 + index}.000000000" if index < 11 else "")
+        for index in range(22)
+    ]
+    (tmp_path / "labels.csv").write_text("\n".join(["file,place", *rows]))
+    words = (
+        "calibrate",
+        "lab",
+        "--frames",
+        tmp_path / "labels.csv",
+        "--recording",
+        bag,
+        "--precision",
+        0.8,
+        "--dry-run",
+        "--json",
+    )
+    report = json.loads(placerec(*words).stdout)
+    assert (report["measurement"]["frames"], report["measurement"]["known"]) == (22, 11)
+    (tmp_path / "labels.csv").write_text("file,place\nrear-1,\n")
+    assert "has no frame 'rear-1'" in placerec(*words, status=1).stderr
+    assert "--recording needs --frames" in placerec("calibrate", "lab", "--itself", "--recording", bag, status=2).stderr
+
+
+def test_recordings_are_evaluated_as_their_frames_are(placerec: Placerec, tmp_path: Path) -> None:
+    again = [
+        *(compressed(START + index * SECOND, encoded(seen_again(scene(index)))) for index in range(6)),
+        *(moved(START + index * SECOND, index, 0.1) for index in range(7)),
+    ]
+    bag, other = write_mcap(tmp_path / "walk.mcap", walk(6)), write_ros1(tmp_path / "again.bag", again)
+    for name, said in (("walk", walk(6)), ("again", again)):
+        (tmp_path / name).mkdir()
+        seen = [one for one in said if one.topic == CAMERA]
+        for index, one in enumerate(seen):
+            (tmp_path / name / f"{index}.jpg").write_bytes(bytes(one.make(ROS2).data))
+
+    def figures(reference: Path, query: Path, *words: object) -> Any:
+        out = tmp_path / "out.json"
+        placerec("evaluate", "--reference", reference, "--query", query, *words, "--encoder", "hog", "--json", out)
+        return json.loads(out.read_text())
+
+    of_bags = figures(bag, other, "--tolerance", 0)
+    of_folders = figures(tmp_path / "walk", tmp_path / "again", "--tolerance", 0)
+    for name in ("queries", "references", "recall_at", "auc_pr", "right"):
+        assert of_bags[name] == of_folders[name]
+    poses = ("--pose-topic", ODOMETRY, "--query-pose-topic", ODOMETRY, "--poses", "--metres", 0.5)
+    assert figures(bag, other, *poses)["recall_at"] == of_folders["recall_at"]
+    few = figures(bag, other, *poses, "--every-metres", 2)
+    assert (few["queries"], few["references"]) == (3, 3)
+    mixed = figures(bag, tmp_path / "again", "--tolerance", 0)
+    assert mixed["recall_at"] == of_folders["recall_at"]
+    wrong = ("evaluate", "--reference", bag, "--query", other, "--tolerance", 0, "--query-topic", "/rear")
+    assert "again.bag has no topic '/rear'" in placerec(*wrong, status=1).stderr
+
+
+def test_pictures_of_other_formats_are_evaluated(placerec: Placerec, tmp_path: Path) -> None:
+    for folder, suffix in (("known", ".pgm"), ("asked", ".tif")):
+        (tmp_path / folder).mkdir()
+        for index in range(4):
+            grey = np.asarray(cv2.cvtColor(scene(index), cv2.COLOR_BGR2GRAY), np.uint8)
+            (tmp_path / folder / f"{index}{suffix}").write_bytes(encoded(grey, suffix))
+    words = ("--reference", tmp_path / "known", "--query", tmp_path / "asked", "--tolerance", 0, "--encoder", "hog")
+    placerec("evaluate", *words, "--json", tmp_path / "out.json", "--report", tmp_path / "report")
+    assert json.loads((tmp_path / "out.json").read_text())["recall_at"]["1"] == 1.0
+    assert "data:image/jpeg" in (tmp_path / "report/index.html").read_text()
