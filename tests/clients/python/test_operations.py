@@ -97,12 +97,12 @@ def tour(client: Client, folder: Path) -> None:
     assert lab.view and lab.view.keep == "image"
     assert lab.cameras.put("front", mask={"polygons": [[(0, 0.9), (1, 0.9), (1, 1)]]}).name == "front"
     assert lab.cameras.read("front").mask and [one.name for one in lab.cameras] == ["front"]
-    for number in range(8):
+    for number in range(12):
         frame: Any = scene(number) if number else jpeg(0)
         place = lab.places.put(f"p{number}", frame, x=2 * number, y=0.0, sequence="monday", metadata={"floor": number})
         assert (place.change, place.sequence, place.metadata) == ("created", "monday", {"floor": number})
     assert {one.change for one in lab.enrol(NewPlace(f"q{n}", jpeg(30 + n)) for n in range(3))} == {"created"}
-    assert [one.id for one in lab.places.list(sequence="monday")] == [f"p{number}" for number in range(8)]
+    assert [one.id for one in lab.places.list(sequence="monday")] == [f"p{number}" for number in range(12)]
     assert lab.places.read("p1").pose == models.Pose(x=2, y=0)
     assert lab.places.edit("p1", {"pose": {"heading": 90}}).pose == models.Pose(x=2, y=0, heading=90)
     assert lab.places.thumbnail("p1").startswith(b"\xff\xd8")
@@ -152,9 +152,9 @@ def jobs(client: Client, folder: Path) -> None:
     told: list[models.JobView] = []
     assert lab.keypoints().wait(told.append).state == "succeeded" and told[-1].state == "succeeded"
     assert [job.state for job in lab.rebuild().events()][-1] == "succeeded"
-    sent = lab.enrol_by_job([NewPlace(f"t{n}", jpeg(n), {"sequence": "tuesday"}) for n in range(8)], align=True)
+    sent = lab.enrol_by_job([NewPlace(f"t{n}", jpeg(n), {"sequence": "tuesday"}) for n in range(12)], align=True)
     result = sent.wait().result
-    assert result and result["changes"] == {"created": 8}
+    assert result and result["changes"] == {"created": 12}
     assert lab.align("tuesday", dry_run=True).wait().result
     assert lab.prune(max_recall_loss=0.1).wait().state == "succeeded"
     assert lab.reencode("tour-2").wait().state == "succeeded"

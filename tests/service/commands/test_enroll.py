@@ -17,7 +17,7 @@ import httpx
 import pytest
 from PIL import ExifTags, Image
 
-from service.commands.connection.batches import FIRST_BATCH
+from placerec_client.batches import FIRST_BATCH
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
