@@ -189,7 +189,7 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
         type(self).taken += 1
         if self.taken == 1:
             items = [{"id": None, "status": 201, "change": "created"}] * frames
-            self.answer(200, "application/json", {"items": items})
+            self.answer(200, "application/json", {"items": items, "encoder": "coarse@0"})
         else:
             problem = {"type": "urn:placerec:problem:storage-full", "detail": "The disk is full."}
             self.answer(507, "application/problem+json", problem)
