@@ -104,6 +104,13 @@ OPERATIONS: dict[str, Rule] = {
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
     "read_metrics": Rule("query", "all"),  # its series name all maps
+    # Keys and the audit trail: they tell of all maps, and of everybody
+    "read_own_key": Rule("query", "none"),
+    "list_keys": Rule("admin", "all"),
+    "create_key": Rule("admin", "all", changes=True),
+    "read_key": Rule("admin", "all"),
+    "narrow_key": Rule("admin", "all", changes=True),
+    "revoke_key": Rule("admin", "all", changes=True),
     # Maps
     "list_maps": Rule("query", "shown"),
     "read_map": Rule("query", "path"),

@@ -19,6 +19,7 @@ from service.access.audit import audit_file
 from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
+from service.administration import key_routes
 from service.app import routes as root
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
@@ -71,6 +72,7 @@ TAGS = [
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
+    {"name": "keys", "description": "A key says who asks, what its holder may do, and with which maps."},
     {"name": "service", "description": "Health, metrics and version of the service."},
 ]
 
@@ -91,6 +93,8 @@ ROUTERS = (
     upkeep.router,
     transfer_routes.router,
     jobs.router,
+    key_routes.own,
+    key_routes.router,
     root.encoders,
 )
 
@@ -200,7 +204,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     for router in ROUTERS:
         app.include_router(router)
     app.router.default = _not_found
-    app.state.gate = gate
+    app.state.gate, app.state.key_store = gate, store
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
     app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics)
