@@ -111,6 +111,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_key": Rule("admin", "all"),
     "narrow_key": Rule("admin", "all", changes=True),
     "revoke_key": Rule("admin", "all", changes=True),
+    "read_audit": Rule("admin", "all"),
     # Maps
     "list_maps": Rule("query", "shown"),
     "read_map": Rule("query", "path"),

@@ -19,7 +19,7 @@ from service.access.audit import audit_file
 from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
-from service.administration import key_routes
+from service.administration import audit_routes, key_routes
 from service.app import routes as root
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
@@ -73,6 +73,7 @@ TAGS = [
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
     {"name": "keys", "description": "A key says who asks, what its holder may do, and with which maps."},
+    {"name": "audit", "description": "The audit trail says who changed what, and who was refused."},
     {"name": "service", "description": "Health, metrics and version of the service."},
 ]
 
@@ -95,6 +96,7 @@ ROUTERS = (
     jobs.router,
     key_routes.own,
     key_routes.router,
+    audit_routes.router,
     root.encoders,
 )
 
@@ -175,7 +177,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with audit_file(chosen.audit_file), keyring or nullcontext():
+        with audit_file(chosen.audit_file) as latest_lines, keyring or nullcontext():
+            app.state.audit_lines = latest_lines
             warn_if_exposed(gate, chosen)
             runtime = await to_thread.run_sync(Runtime, chosen, metrics)
             runtime.publish(app.state)
