@@ -103,6 +103,7 @@ OPERATIONS: dict[str, Rule] = {
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
+    "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
     "read_metrics": Rule("query", "all"),  # its series name all maps
     # Keys and the audit trail: they tell of all maps, and of everybody
     "read_own_key": Rule("query", "none"),

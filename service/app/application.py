@@ -21,6 +21,7 @@ from service.access.keyring import Keyring
 from service.access.keys import KeyStore
 from service.administration import audit_routes, key_routes
 from service.app import routes as root
+from service.app import service_state
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
 from service.errors.problems import install_problems, problem_response
@@ -97,6 +98,7 @@ ROUTERS = (
     key_routes.own,
     key_routes.router,
     audit_routes.router,
+    service_state.router,
     root.encoders,
 )
 
