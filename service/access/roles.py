@@ -125,6 +125,7 @@ OPERATIONS: dict[str, Rule] = {
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
     "forget_place": Rule("enrol", "path", changes=True),
+    "forget_places": Rule("enrol", "path", changes=True),
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path"),
