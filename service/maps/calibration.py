@@ -52,6 +52,7 @@ from service.http.uploads import FORM, check_part, is_file, json_part, media_typ
 from service.jobs.context import JobContext, creation_time, yield_to_requests
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
+from service.maps.map_events import tell_map
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import QueryStatistics, map_key
@@ -154,6 +155,7 @@ async def calibrate_map(
     await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
+        tell_map(engine, map_, "calibrated")
     return report
 
 
@@ -329,4 +331,5 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
     if not order.dry_run:
         context.remember(report=result)
         store(map_, report.calibration, None if replaces is None else Calibration.model_validate(replaces), expected)
+        tell_map(engine, map_, "calibrated")
     return result

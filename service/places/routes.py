@@ -51,6 +51,7 @@ from service.places.batches import check_batch, entry_id, frame_problem, read_en
 from service.places.enrolment import FrameToEnrol, enrol
 from service.places.filters import MOST_FORGOTTEN, Forgetting, ForgottenPlaces, PlacePageQuery
 from service.places.parameters import BatchParameters, EnrolParameters, check_metadata
+from service.places.place_events import tell_change, tell_deletion, tell_enrolment
 from service.places.schemas import (
     BatchResult,
     BatchResults,
@@ -262,6 +263,8 @@ def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: En
     map_, wanted = engine.atlas.get(map_id), order.wanted()
     choose = map_.ids_of if order.dry_run else map_.forget_all
     found = choose(wanted, MOST_FORGOTTEN)
+    if not order.dry_run:
+        tell_change(engine, map_, "deleted", len(found))
     changed = {} if found and not order.dry_run else {"change": None}
     request.state.noted = {"map": map_id, "places": len(found), **changed}
     there = set(found)
@@ -287,13 +290,17 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
     with engine.writing(map_id):
         if changes.metadata is not None:
             check_metadata(merge_patch(map_.place(place_id).metadata, changes.metadata), engine.settings)
-        return PlaceView.of(map_.patch(place_id, changes.model_dump(exclude_unset=True)))
+        place = map_.patch(place_id, changes.model_dump(exclude_unset=True))
+    tell_enrolment(engine, map_, [(place, "updated")])
+    return PlaceView.of(place)
 
 
 @router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
 def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     """Delete a place: no later query finds it."""
-    engine.atlas.get(map_id).forget(place_id)
+    map_ = engine.atlas.get(map_id)
+    map_.forget(place_id)
+    tell_deletion(engine, map_, place_id)
 
 
 @router.get(
@@ -320,6 +327,8 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
 @traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
 def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
     """Delete all places of a traverse at once."""
-    count = engine.atlas.get(map_id).forget_sequence(sequence)
+    map_ = engine.atlas.get(map_id)
+    count = map_.forget_sequence(sequence)
+    tell_change(engine, map_, "deleted", count, sequence)
     request.state.noted = {"places": count}
     return ForgottenSequence(name=sequence, places=count)
