@@ -57,6 +57,10 @@ class UnknownJob(Problem):
     """404 ``unknown-job``: The job does not exist."""
 
 
+class UnknownKey(Problem):
+    """404 ``unknown-key``: The key does not exist."""
+
+
 class UnknownMap(Problem):
     """404 ``unknown-map``: The map does not exist."""
 
@@ -75,6 +79,10 @@ class UnknownSequence(Problem):
 
 class UnknownSession(Problem):
     """404 ``unknown-session``: The session does not exist."""
+
+
+class UnknownTopic(Problem):
+    """404 ``unknown-topic``: The bag has no such topic."""
 
 
 class MethodNotAllowed(Problem):
@@ -105,6 +113,22 @@ class JobEnded(Problem):
     """409 ``job-ended``: The job has already ended."""
 
 
+class KeyEnded(Problem):
+    """409 ``key-ended``: The key is revoked or has expired."""
+
+
+class KeyExists(Problem):
+    """409 ``key-exists``: Another key has this name."""
+
+
+class KeyWidened(Problem):
+    """409 ``key-widened``: A key can only be narrowed."""
+
+
+class LastAdminKey(Problem):
+    """409 ``last-admin-key``: No key could manage the service any more."""
+
+
 class MapExists(Problem):
     """409 ``map-exists``: A map of this id already exists."""
 
@@ -119,6 +143,10 @@ class PlaceTaken(Problem):
 
 class StreamTaken(Problem):
     """409 ``stream-taken``: Another connection streams into the session."""
+
+
+class TooManyKeys(Problem):
+    """409 ``too-many-keys``: No more keys can be created."""
 
 
 class TooManyMaps(Problem):
@@ -217,12 +245,20 @@ class InvalidImage(Problem):
     """422 ``invalid-image``: The frame cannot be used."""
 
 
+class InvalidRecording(Problem):
+    """422 ``invalid-recording``: The recording cannot be used."""
+
+
 class InvalidRequest(Problem):
     """422 ``invalid-request``: The request is not valid."""
 
 
 class InvalidResults(Problem):
     """422 ``invalid-results``: The results cannot be used."""
+
+
+class InvalidTrajectory(Problem):
+    """422 ``invalid-trajectory``: The trajectory cannot be used."""
 
 
 class InvalidTraverse(Problem):
@@ -241,8 +277,16 @@ class NothingToMeasure(Problem):
     """422 ``nothing-to-measure``: The map has no frames to measure the recall with."""
 
 
+class PlanTooLarge(Problem):
+    """422 ``plan-too-large``: The plan would list too many places."""
+
+
 class TooFewFrames(Problem):
     """422 ``too-few-frames``: The sequence is too short to be aligned."""
+
+
+class TooManyToForget(Problem):
+    """422 ``too-many-to-forget``: Too many places would be forgotten at once."""
 
 
 class TruncatedImage(Problem):
@@ -398,11 +442,13 @@ BY_SLUG: dict[str, type[Problem]] = {
     "unknown-camera": UnknownCamera,
     "unknown-explanation": UnknownExplanation,
     "unknown-job": UnknownJob,
+    "unknown-key": UnknownKey,
     "unknown-map": UnknownMap,
     "unknown-path": UnknownPath,
     "unknown-place": UnknownPlace,
     "unknown-sequence": UnknownSequence,
     "unknown-session": UnknownSession,
+    "unknown-topic": UnknownTopic,
     "method-not-allowed": MethodNotAllowed,
     "head-too-slow": HeadTooSlow,
     "batch-out-of-order": BatchOutOfOrder,
@@ -410,10 +456,15 @@ BY_SLUG: dict[str, type[Problem]] = {
     "frame-out-of-order": FrameOutOfOrder,
     "images-missing": ImagesMissing,
     "job-ended": JobEnded,
+    "key-ended": KeyEnded,
+    "key-exists": KeyExists,
+    "key-widened": KeyWidened,
+    "last-admin-key": LastAdminKey,
     "map-exists": MapExists,
     "merge-conflict": MergeConflict,
     "place-taken": PlaceTaken,
     "stream-taken": StreamTaken,
+    "too-many-keys": TooManyKeys,
     "too-many-maps": TooManyMaps,
     "too-many-places": TooManyPlaces,
     "wrong-encoder": WrongEncoder,
@@ -438,13 +489,17 @@ BY_SLUG: dict[str, type[Problem]] = {
     "invalid-ground-truth": InvalidGroundTruth,
     "invalid-identifier": InvalidIdentifier,
     "invalid-image": InvalidImage,
+    "invalid-recording": InvalidRecording,
     "invalid-request": InvalidRequest,
     "invalid-results": InvalidResults,
+    "invalid-trajectory": InvalidTrajectory,
     "invalid-traverse": InvalidTraverse,
     "no-regions": NoRegions,
     "not-an-image": NotAnImage,
     "nothing-to-measure": NothingToMeasure,
+    "plan-too-large": PlanTooLarge,
     "too-few-frames": TooFewFrames,
+    "too-many-to-forget": TooManyToForget,
     "truncated-image": TruncatedImage,
     "unfit-intrinsics": UnfitIntrinsics,
     "unknown-encoder": UnknownEncoder,
