@@ -1,4 +1,4 @@
-"""Robots that use the Python client beside those of the load tool, which only count bytes; and how long an import takes.
+"""Robots that use the Python client beside those of the load tool, which only count bytes; and the time of an import.
 
     python -m benchmarks.client
 
