@@ -954,3 +954,58 @@ class Label(TypedDict):
 
     camera: NotRequired[str | None]
     """The camera of the map that took the frame; its mask is applied."""
+
+
+class NewKey(TypedDict, total=False):
+    """A key to create."""
+
+    maps: Sequence[str] | None
+    """Limit it to these maps; null or left out: all maps."""
+
+    expires_at: datetime | str | None
+    """When it expires; null or left out: never."""
+
+
+class KeyChanges(TypedDict, total=False):
+    """A merge patch (RFC 7396) of a key; what is left out stays. The key can only be narrowed."""
+
+    role: Literal["query", "enrol", "admin"] | None
+    """Not higher than now."""
+
+    maps: Sequence[str] | None
+    """Some of the present ones; null: all maps."""
+
+    expires_at: datetime | str | None
+    """Not later than now; null: never."""
+
+
+class Forgetting(TypedDict, total=False):
+    """Which places to forget: those of some ids, or those that fulfil some conditions."""
+
+    ids: Sequence[str] | None
+    """Ids of places; those that are gone are told."""
+
+    filter: PlaceConditions | None
+    """Conditions, at least one."""
+
+    dry_run: bool
+    """Only say which places would be forgotten."""
+
+
+class PlaceConditions(TypedDict):
+    """Conditions on a place; all that are given have to hold."""
+
+    sequence: NotRequired[str | None]
+    """It belongs to this traverse."""
+
+    camera: NotRequired[str | None]
+    """This camera took its frame."""
+
+    after: NotRequired[datetime | str | None]
+    """It has this timestamp or a later one."""
+
+    before: NotRequired[datetime | str | None]
+    """It has this timestamp or an earlier one."""
+
+    where: NotRequired[Mapping[str, Any] | None]
+    """Its metadata has these values under these keys, at its top level."""
