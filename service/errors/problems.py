@@ -134,6 +134,9 @@ KINDS: dict[type[Exception], Kind] = {
     faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
     faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
     # Traverses on disk, which only the command line reads
+    errors.InvalidRecording: Kind(422, "invalid-recording", "The recording cannot be used"),
+    errors.UnknownTopic: Kind(404, "unknown-topic", "The bag has no such topic"),
+    errors.InvalidTrajectory: Kind(422, "invalid-trajectory", "The trajectory cannot be used"),
     errors.MissingExtra: Kind(503, "missing-extra", "A package is not installed"),
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is not a traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
