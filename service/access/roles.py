@@ -142,6 +142,7 @@ OPERATIONS: dict[str, Rule] = {
     "align_map": Rule("enrol", "path", changes=True),  # it changes of places what an edit of each could change
     # Upkeep: it changes the answers to all robots, or takes long
     "calibrate_map": Rule("admin", "path", changes=True),
+    "compare_traverses": Rule("query", "path"),
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),
