@@ -45,6 +45,8 @@ from core.storage.records import (
     patched_fields,
     patched_record,
 )
+from core.storage.review import FILE as REVIEW_FILE
+from core.storage.review import ReviewFrames
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import IndexStatus, KeypointsStatus, StorageStatus, storage_of, unopened
@@ -118,6 +120,7 @@ class Map:
         self.attributes = Attributes(self._reading)
         self.counterparts = Counterparts(self._reading, self._writing)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
+        self.review = ReviewFrames(folder / REVIEW_FILE, self._expect_open)
         self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
@@ -156,6 +159,7 @@ class Map:
                 )
         if (indexer := self.indexer) is not None:
             indexer.stop()
+        self.review.close()
         with self._lock:
             opened, last, self._opened, self._snapshot = self._opened, self._snapshot, None, None
             if opened is None:

@@ -97,6 +97,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.MapExists: Kind(409, "map-exists", "A map of this id already exists"),
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
+    errors.UnknownFrame: Kind(404, "unknown-frame", "The frame is not kept for review"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
     errors.NoThumbnail: Kind(404, "no-thumbnail", "The map keeps no picture of the place"),
