@@ -126,7 +126,7 @@ class ReviewFrames:
         with self._using() as connection:
             with transaction(connection):
                 _drop_oldest(connection, setting)
-            connection.execute("PRAGMA incremental_vacuum").fetchall()
+            connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
         """The latest frames, newest first.

@@ -132,6 +132,11 @@ OPERATIONS: dict[str, Rule] = {
     "query_maps": Rule("query", "named"),  # without names it asks the key's maps
     "query_or_enrol": Rule("enrol", "path", changes=True),
     "see_explanation": Rule("query", "path"),
+    # Review: its frames are what robots saw, and labels change how the map is calibrated
+    "list_review": Rule("enrol", "path"),
+    "see_review_picture": Rule("enrol", "path"),
+    "export_labels": Rule("enrol", "path"),
+    "label_frame": Rule("enrol", "path", changes=True),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
     "list_sessions": Rule("query", "path"),
