@@ -4,7 +4,8 @@
 
 A service has a map of the first walk, which keeps frames for review.  It is asked one half of the second walk, and as
 many strangers again by half: frames of the other data set.  The kept frames are labelled through the API by the truth
-of the data set, as a person would, and the map is calibrated: by its own frames, by the labels, by both.  Then it is
+of the data set, as a person would, first those that were answered ambiguous or unknown, then all; and the map is
+calibrated by its own frames, by the labels, by both, or by the labels beside the encoder's calibration.  Then it is
 asked the other half of the walk, and strangers that it has not seen.  Both halves take their turn at being held out.
 
 The Brier score is the mean square of the difference between a stated probability and what is true: 1 if the best match
@@ -31,14 +32,17 @@ from core.evaluation.data.datasets import find_dataset, open_dataset
 
 FOLDERS = {"corridor": "corridor", "lip6": "lip6_outdoor"}
 KEPT: Mapping[str, Sequence[str]] = {
+    "none": (),
     "doubtful": ("ambiguous", "unknown"),
     "all": ("recognized", "ambiguous", "unknown"),
 }
-ORDERS: Mapping[str, Mapping[str, str] | None] = {
-    "encoder's default": None,
-    "own frames": {"method": "map"},
+"""Which answers' frames are labelled."""
+
+UNLABELLED: Mapping[str, Mapping[str, str] | None] = {"the encoder": None, "own frames": {"method": "map"}}
+LABELLED: Mapping[str, Mapping[str, str] | None] = {
     "labels": {"method": "labels", "beside": "none"},
-    "labels and own frames": {"method": "labels", "beside": "map"},
+    "labels, own frames": {"method": "labels", "beside": "map"},
+    "labels, the encoder": {"method": "labels", "beside": "encoder"},
 }
 
 
@@ -59,13 +63,15 @@ class Walk:
     queries: Sequence[Frame]
 
 
-def walk(name: str, folder: Path) -> Walk:
-    """A data set from its folder."""
+def walk(name: str, folder: Path, most: int) -> Walk:
+    """A data set from its folder, with at most so many queries."""
     pair = open_dataset(find_dataset(name), folder / FOLDERS[name])
     queries = [
         Frame(path.read_bytes(), tuple(place_id(int(row)) for row in true))
         for path, true in zip(pair.queries, pair.truth, strict=True)
     ]
+    chosen = np.unique(np.linspace(0, len(queries) - 1, min(most, len(queries))).astype(int))
+    queries = [queries[index] for index in chosen]
     return Walk(name, [path.read_bytes() for path in pair.references], queries)
 
 
@@ -109,9 +115,9 @@ def _query(client: httpx.Client, map_id: str, data: bytes) -> dict[str, Any]:
     return answer
 
 
-def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str]) -> None:
-    """A map of a walk that keeps frames for review."""
-    review = {"verdicts": list(verdicts), "most_frames": 10_000}
+def make_map(client: httpx.Client, map_id: str, of: Walk) -> None:
+    """A map of a walk that keeps every frame for review."""
+    review = {"verdicts": list(KEPT["all"]), "most_frames": 10_000}
     client.post("/v1/maps", json={"id": map_id, "keep": "none", "review": review}).raise_for_status()
     for row, data in enumerate(of.references):
         kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
@@ -119,17 +125,16 @@ def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str
         client.put(path, content=data, headers={"Content-Type": kind}).raise_for_status()
 
 
-def label_all(client: httpx.Client, map_id: str, frames: Sequence[Frame]) -> int:
-    """Label every kept frame by the truth; returns how many there are."""
+def label_kept(client: httpx.Client, map_id: str, frames: Sequence[Frame], verdicts: Sequence[str]) -> int:
+    """Label the kept frames that were answered so by the truth; returns how many there are."""
     shown = {hashlib.sha256(frame.data).hexdigest(): frame.places for frame in frames}
-    time.sleep(2)  # the last frames are written a moment after their answers
-    items, cursor = [], None
-    while True:
-        given = {"limit": 1000} | ({"cursor": cursor} if cursor else {})
+    items: list[dict[str, Any]] = []
+    cursor: str | None = ""
+    while cursor is not None:
+        given: dict[str, str | int] = {"limit": 1000} | ({"cursor": cursor} if cursor else {})
         page = client.get(f"/v1/maps/{map_id}/review", params=given).raise_for_status().json()
-        items += page["items"]
-        if (cursor := page["next_cursor"]) is None:
-            break
+        items += [item for item in page["items"] if item["answer"]["verdict"] in verdicts]
+        cursor = page["next_cursor"]
     for item in items:
         places = shown[item["sha256"]]
         said: dict[str, object] = {"place": places[len(places) // 2]} if places else {"stranger": True}
@@ -138,18 +143,19 @@ def label_all(client: httpx.Client, map_id: str, frames: Sequence[Frame]) -> int
 
 
 def measure(client: httpx.Client, of: Walk, other: Walk) -> list[dict[str, Any]]:
-    """The figures of a data set by what was kept and how the map was calibrated, both halves together."""
+    """The figures of a data set by what was labelled, how the map was calibrated, and which half was held out."""
     found: list[dict[str, Any]] = []
     parts = halves(of, other)
-    for kept, verdicts in KEPT.items():
-        for turn, (asked, held_out) in enumerate((parts, parts[::-1])):
-            map_id = f"{of.name}-{kept}-{turn}"
-            make_map(client, map_id, of, verdicts)
-            for frame in asked:
-                _query(client, map_id, frame.data)
-            labels = label_all(client, map_id, asked)
-            client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
-            for order, body in ORDERS.items():
+    for turn, (asked, held_out) in enumerate((parts, parts[::-1])):
+        map_id = f"{of.name}-{turn}"
+        make_map(client, map_id, of)
+        for frame in asked:
+            _query(client, map_id, frame.data)
+        time.sleep(2)  # the last frames are written a moment after their answers
+        client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
+        for kept, verdicts in KEPT.items():
+            labels = label_kept(client, map_id, asked, verdicts)
+            for order, body in (LABELLED if labels else UNLABELLED).items():
                 client.patch(f"/v1/maps/{map_id}", json={"calibration": None}).raise_for_status()
                 done = {"map": of.name, "kept": kept, "labels": labels, "half": turn, "order": order}
                 if body is not None:
@@ -164,9 +170,10 @@ def measure(client: httpx.Client, of: Walk, other: Walk) -> list[dict[str, Any]]
 def main(
     folder: Annotated[Path, typer.Argument(help="The folder of the data sets.")],
     only: Annotated[str | None, typer.Option(help="Only this data set.")] = None,
+    most: Annotated[int, typer.Option(help="Most frames of each second walk, evenly taken.")] = 1000,
 ) -> None:
     """Measure, print a table and write JSON."""
-    walks = {name: walk(name, folder) for name in FOLDERS}
+    walks = {name: walk(name, folder, most) for name in FOLDERS}
     found: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as temporary:
         data_dir = Path(temporary) / "data"
@@ -175,21 +182,18 @@ def main(
                 if only in (None, name):
                     found += measure(process.client, walks[name], walks[other])
     rows: list[list[object]] = []
-    for name in FOLDERS:
-        for kept in KEPT:
-            for order in ORDERS:
-                some = [one for one in found if (one["map"], one["kept"], one["order"]) == (name, kept, order)]
-                held = [one for one in some if "brier" in one]
-                if not some:
-                    continue
-                total = sum(one["frames"] for one in held) or 1
-                figures = [
-                    sum(one[figure] * one["frames"] for one in held) / total if held else "refused"
-                    for figure in ("brier", "recall", "precision")
-                ]
-                brier = f"{figures[0]:.4f}" if held else "refused"
-                rows.append([name, kept, sum(one["labels"] for one in some), order, brier, *figures[1:], len(held)])
-    columns = ["map", "kept", "labels", "calibrated by", "Brier", "recall", "precision", "halves"]
+    for name, kept, order in dict.fromkeys((one["map"], one["kept"], one["order"]) for one in found):
+        some = [one for one in found if (one["map"], one["kept"], one["order"]) == (name, kept, order)]
+        held = [one for one in some if "brier" in one]
+        total = sum(one["frames"] for one in held)
+        figures = {
+            figure: sum(one[figure] * one["frames"] for one in held) / total if held else float("nan")
+            for figure in ("brier", "recall", "precision")
+        }
+        brier = f"{figures['brier']:.4f}" if len(held) == len(some) else f"refused for {len(some) - len(held)}"
+        labels = sum(one["labels"] for one in some)
+        rows.append([name, kept, labels, order, brier, figures["recall"], figures["precision"]])
+    columns = ["map", "labelled", "labels", "calibrated by", "Brier", "recall", "precision"]
     report("labels", "Held-out halves, with half as many strangers", columns, rows, {"found": found})
 
 

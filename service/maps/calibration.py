@@ -6,6 +6,8 @@ become the map's own calibration unless an operator has set another one meanwhil
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,12 +15,14 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from core import errors
 from core.errors import RevisionMismatch
+from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import (
     TOGETHER,
     LabelledQueries,
     ProgressCallback,
+    adjust_to_labels,
     calibration_warnings,
     queries_from_labels,
     queries_from_map,
@@ -51,8 +55,12 @@ from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.map_events import tell_map
 from service.maps.schemas import MOST_FRAMES, CalibrationOrder, CalibrationReport
+from service.queries.answers import StatisticsDep
+from service.queries.statistics import QueryStatistics, map_key
 from service.review.labels import KnownFrame, known_frames, parts, with_regions
 from service.worker_threads import in_thread
+
+log = logging.getLogger("placerec.calibration")
 
 KIND = "calibrate"
 """The kind of the job."""
@@ -106,7 +114,13 @@ BODY: dict[str, Any] = {
     responses={202: {"model": JobView, "description": "The job that calibrates the map, if `background` is true."}},
 )
 async def calibrate_map(
-    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, deadline: DeadlineDep, if_match: IfMatch = None
+    map_id: MapId,
+    request: Request,
+    engine: EngineDep,
+    jobs: JobsDep,
+    statistics: StatisticsDep,
+    deadline: DeadlineDep,
+    if_match: IfMatch = None,
 ) -> CalibrationReport | Response:
     """Measure when a map's answers can be believed, and store the result as the map's calibration.
 
@@ -142,7 +156,8 @@ async def calibrate_map(
             )
 
     replaces = map_.record.calibration
-    report = await in_thread(measure, map_, encoder, order, encodings, advance, known)
+    report, trials = await in_thread(measure, map_, encoder, order, encodings, advance, known)
+    await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
         tell_map(engine, map_, "calibrated")
@@ -230,12 +245,15 @@ def measure(
     encodings: Sequence[Encoding],
     advance: ProgressCallback,
     known: Sequence[KnownFrame] = (),
-) -> CalibrationReport:
+) -> tuple[CalibrationReport, Trials]:
     """Ask a map the frames of an order, and report the calibration that follows; nothing is stored.
 
     Args:
         encodings: the frames of the order's labels, or of ``known``, in their order; empty for the other methods.
         known: the labelled frames of the map's review, for the method ``labels``.
+
+    Returns:
+        The report, and the answers that it rests on.
 
     Raises:
         UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure, and whatever ``advance`` raises.
@@ -244,8 +262,12 @@ def measure(
     queries = _queries(map_, snapshot, order, encodings, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
-    return CalibrationReport(
+    adjusted = (order.method, order.beside) == ("labels", "encoder")
+    if adjusted:
+        found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
+    else:
+        found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
+    report = CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
         method=order.method,
@@ -254,8 +276,17 @@ def measure(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=calibration_warnings(found, order.method),
+        warnings=calibration_warnings(found, "adjusted" if adjusted else order.method),
     )
+    return report, found.trials
+
+
+def remember(statistics: QueryStatistics, map_: Map, report: CalibrationReport, trials: Trials) -> None:
+    """Keep what was measured, for those who ask what another threshold would change; a refusing disk is only logged."""
+    try:
+        statistics.keep_calibration(map_key(map_), report.model_dump_json(), json.dumps(trials.record()))
+    except errors.PlacerecError as error:
+        log.warning("what was measured in calibrating %s is not kept: %s", map_.record.id, error)
 
 
 def _queries(
@@ -315,7 +346,7 @@ def job_arguments(map_: Map, order: CalibrationOrder, expected: int | None) -> d
     }
 
 
-def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
+def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) -> Mapping[str, Any]:
     """Calibrate a map as a job; an attempt after a restart begins again unless the calibration was stored already.
 
     Raises:
@@ -343,7 +374,8 @@ def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     encodings: list[Encoding] = []
     if order.method == "labels":
         known, encodings = _encode_known_after_requests(engine, context, map_)
-    report = measure(map_, encoder, order, encodings, advance, known)
+    report, trials = measure(map_, encoder, order, encodings, advance, known)
+    remember(statistics, map_, report, trials)
     result = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=result)

@@ -14,6 +14,7 @@ from core.places import Timestamp
 from core.storage import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
+from service.queries.statistics import VerdictCounts
 
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",
@@ -51,6 +52,7 @@ MAP_EXAMPLE: dict[str, Any] = {
         "keypoints": {"places": 111, "bytes": 4348980},
     },
     "places": 111,
+    "last_day": {"recognized": 120, "ambiguous": 4, "unknown": 9},
     "revision": 1,
     "created_at": "2026-11-20T09:00:00Z",
     "updated_at": "2026-11-20T09:00:00Z",
@@ -83,6 +85,9 @@ class MapView(BaseModel):
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
     storage: StorageStatus = Field(description="What the map occupies on disk.")
     places: int
+    last_day: VerdictCounts | None = Field(
+        description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."
+    )
     revision: int = Field(description="Number of the last edit of the settings; the ETag contains it.")
     created_at: Timestamp
     updated_at: Timestamp
@@ -266,10 +271,11 @@ class CalibrationOrder(BaseModel):
         le=MOST_FRAMES,
         description="How many frames are asked at most; they are chosen evenly.",
     )
-    beside: Literal["map", "none"] = Field(
-        default="map",
-        description="With the method labels: whether the map's own frames are asked as well (`map`), since few frames "
-        "are labelled and these are the doubtful ones, or the labelled frames alone (`none`).",
+    beside: Literal["encoder", "map", "none"] = Field(
+        default="encoder",
+        description="With the method labels, what the labels join, since they are few and of the doubtful frames. "
+        "`encoder`: the encoder's calibration, whose curve is moved as far as the labels demand; the target is not "
+        "used then. `map`: the map's own frames, which are asked as well. `none`: nothing.",
     )
     labels: list[Label] | None = Field(
         default=None, min_length=1, max_length=MOST_FRAMES, description="One label for each frame of the form."

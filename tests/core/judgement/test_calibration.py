@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,9 +13,11 @@ from core.judgement.calibration import (
     BLOCKS,
     MOST_POINTS,
     Target,
+    adjust_calibration,
     blocks_of,
     cross_validated,
     curve_points,
+    effect_of,
     fit_encoder_calibration,
     fit_map_calibration,
 )
@@ -235,3 +239,60 @@ def test_the_curve_is_sure_of_second_looks_and_not_of_strangers() -> None:
     strangers = [judged(unknown[i], np.flatnonzero(np.abs(np.arange(N) - i) > 2), made).probability for i in range(N)]
     assert np.median(np.array(looks, float)) > 0.9
     assert np.median(np.array(strangers, float)) < 0.1
+
+
+def test_the_effect_of_a_calibration_is_what_its_verdicts_do() -> None:
+    trials = drawn(300)
+    trials.margin[::7] = 0.001  # a rival is close
+    for threshold in (-1.0, 0.05, 0.12, 9.0):
+        calibration = BASE.model_copy(update={"threshold": threshold, "margin": 0.002, "curve": LAW})
+        effect = effect_of(trials, calibration)
+        believed, apart = trials.decision >= threshold, trials.margin >= 0.002
+        recognized = believed & apart
+        assert effect.verdicts.recognized == recognized.sum() == effect.precision.of
+        assert effect.verdicts.ambiguous == (believed & ~apart).sum()
+        assert effect.verdicts.unknown == (~believed).sum()
+        assert effect.recall.count == (recognized & trials.right).sum() and effect.recall.of == 300
+        assert effect.false_accept_rate.count == (recognized & ~trials.known).sum()
+        assert effect.reliability is not None
+        assert effect.reliability.brier == pytest.approx(
+            np.square(trials.probabilities(calibration) - trials.right).mean()
+        )
+    assert effect_of(trials, BASE).reliability is None, "without a curve there are no probabilities"
+
+
+def test_trials_are_the_same_as_json() -> None:
+    trials = drawn(20)
+    trials.evidence[3] = 7.5
+    again = Trials.of_record(json.loads(json.dumps(trials.record(), allow_nan=False)))
+    for name in ("decision", "margin", "known", "right", "frame", "imagined", "evidence"):
+        before, after = getattr(trials, name), getattr(again, name)
+        assert before.dtype == after.dtype
+        np.testing.assert_array_equal(before, after)
+    for wrong in ({}, trials.record() | {"right": [True]}, trials.record() | {"frame": ["x"]}):
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            Trials.of_record(wrong)  # type: ignore[arg-type]
+
+
+def test_doubtful_labels_make_the_probabilities_of_all_answers_better() -> None:
+    base = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-3)})  # too sure, for this environment
+    asked, held_out = drawn(60), drawn(500, seed=1)
+    doubtful = asked.take(~asked.recognized(base))
+    found = adjust_calibration(doubtful, base, "labels")
+    errors = [float(np.mean((held_out.probabilities(one) - held_out.right) ** 2)) for one in (base, found.calibration)]
+    assert errors[1] < 0.8 * errors[0]
+    after = found.calibration
+    assert after.curve is not None and base.curve is not None
+    assert after.curve.probability(after.threshold) == pytest.approx(base.curve.probability(base.threshold))
+    assert (after.margin, after.source, after.frames) == (base.margin, "labels", len(np.unique(doubtful.frame)))
+    assert found.measurement.trials == len(doubtful)
+
+
+def test_a_calibration_is_not_adjusted_to_next_to_nothing() -> None:
+    few = drawn(60).take(np.arange(120) < 9)
+    with pytest.raises(CalibrationImpossible, match="at least 10 labelled frames; here are 9"):
+        adjust_calibration(few, BASE.model_copy(update={"curve": LAW}), "labels")
+    with pytest.raises(CalibrationImpossible, match="no curve"):
+        adjust_calibration(drawn(60), BASE, "labels")
+    wrong = drawn(60).take(~drawn(60).right)
+    assert adjust_calibration(wrong, BASE.model_copy(update={"curve": LAW}), "labels").measurement.right == 0
