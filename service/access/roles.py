@@ -145,6 +145,11 @@ OPERATIONS: dict[str, Rule] = {
     "list_answers": Rule("query", "path"),
     "list_place_matches": Rule("query", "path"),
     "see_explanation": Rule("query", "path"),
+    # Review: its frames are what robots saw, and labels change how the map is calibrated
+    "list_review": Rule("enrol", "path"),
+    "see_review_picture": Rule("enrol", "path"),
+    "export_labels": Rule("enrol", "path"),
+    "label_frame": Rule("enrol", "path", changes=True),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
     "list_sessions": Rule("query", "path"),
@@ -156,6 +161,7 @@ OPERATIONS: dict[str, Rule] = {
     # Upkeep: it changes the answers to all robots, or takes long
     "read_calibration": Rule("query", "path"),
     "calibrate_map": Rule("admin", "path", changes=True),
+    "compare_traverses": Rule("query", "path"),
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),

@@ -38,12 +38,14 @@ from service.places import routes as places
 from service.places.parameters import BatchItem
 from service.queries import answer_routes, loop_closure, multi_map_routes
 from service.queries import routes as queries
+from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
 from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
 from service.upkeep import routes as upkeep
+from service.upkeep import similarity
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -70,8 +72,15 @@ TAGS = [
         "description": "A calibration decides when a map's answers are believed; it is measured on the map itself.",
     },
     {"name": "sessions", "description": "A session is a robot's run: a belief over places that every frame updates."},
+    {
+        "name": "review",
+        "description": "Frames that a map has kept because its answers were doubtful, with labels.",
+    },
     {"name": "frames", "description": "The encoder applied to frames, without a map."},
-    {"name": "upkeep", "description": "Re-encoding, rebuilding, health reports, pruning and merging of maps."},
+    {
+        "name": "upkeep",
+        "description": "Re-encoding, rebuilding, health, similarity, pruning, merging of maps.",
+    },
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
@@ -96,9 +105,11 @@ ROUTERS = (
     sessions.router,
     stream_routes.router,
     queries.explanations,
+    review.router,
     answer_routes.router,
     frames.router,
     upkeep.router,
+    similarity.router,
     transfer_routes.router,
     jobs.router,
     key_routes.own,

@@ -122,6 +122,10 @@ class TooFewFrames(Fault):
     """The traverse is too short for sequence matching."""
 
 
+class TooManyPairs(Fault):
+    """The traverses have too many frames to be compared frame by frame."""
+
+
 class TooManyWatchers(Fault):
     """Too many clients follow jobs."""
 
@@ -180,6 +184,10 @@ class UnknownKey(InvalidRequest):
 
 class KeyExists(InvalidRequest):
     """Another key in force has the name."""
+
+
+class FirstKeyLocal(Fault):
+    """The service has no keys and other machines can reach it, so none of them may create the first one."""
 
 
 class KeyEnded(Fault):

@@ -526,6 +526,16 @@ class SendFrame(TypedDict, total=False):
     """Name or identity that the map's encoder must have (409 otherwise)."""
 
 
+class ListReview(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/review``."""
+
+    limit: int
+    """Most items on a page."""
+
+    labelled: bool | None
+    """Only frames with a label, or only those without one."""
+
+
 class ListAnswers(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/answers``."""
 
@@ -586,6 +596,10 @@ class CheckHealth(TypedDict, total=False):
 
     limit: int
     """How many places, gaps and stretches are listed at most, each."""
+
+
+class CompareTraverses(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/similarity``."""
 
 
 class ImportMap(TypedDict, total=False):
@@ -698,6 +712,9 @@ class NewMap(TypedDict, total=False):
     name of it), or by what suits its size (auto): compact from 256 places.
     """
 
+    review: ReviewSetting | None
+    """Which frames are kept to be reviewed by people; null: none."""
+
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
 
@@ -720,6 +737,9 @@ class MapChanges(TypedDict, total=False):
 
     index: Literal["auto", "exact", "compact", "inverted"] | None
     """auto, exact or compact (auto from 256 places on); inverted is compact."""
+
+    review: ReviewChanges | None
+    """null: no frames are kept from now on."""
 
     calibration: CalibrationChanges | None
 
@@ -858,6 +878,12 @@ class CalibrationOrder(TypedDict, total=False):
 
     most: int
     """How many frames are asked at most; they are chosen evenly."""
+
+    beside: Literal["encoder", "map", "none"]
+    """With the method labels, what the labels join, since they are few and of the doubtful frames. `encoder`: the
+    encoder's calibration, whose curve is moved as far as the labels demand; the target is not used then. `map`: the
+    map's own frames, which are asked as well. `none`: nothing.
+    """
 
     labels: Sequence[Label] | None
     """One label for each frame of the form."""
