@@ -1,0 +1,269 @@
+"""What a robot has beside the node: it plays bags, records what the node publishes, and calls its services.
+
+It runs in .venv-ros, takes one JSON object a line from standard input, and answers each with one on standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+KINDS = {kind.__name__: kind for kind in (CompressedImage, Image, CameraInfo, Odometry, String)}
+TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4, "shutdown unconfigured": 5, "shutdown inactive": 6, "shutdown active": 7}  # fmt: skip
+BAG_TYPES = {
+    "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "CameraInfo": "sensor_msgs/msg/CameraInfo",
+    "Odometry": "nav_msgs/msg/Odometry",
+}
+PATIENCE = 15.0
+
+
+class Peer:
+    """The process's node, and what it has heard."""
+
+    def __init__(self) -> None:
+        self.node = Node("peer")
+        self.heard: dict[str, list[dict[str, Any]]] = {}
+        self._lock = threading.Lock()
+        self._publishers: dict[str, Any] = {}
+        self._subscriptions: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+        self._playing: threading.Thread | None = None
+
+    def note(self, topic: str, entry: dict[str, Any]) -> None:
+        with self._lock:
+            self.heard.setdefault(topic, []).append({"at": time.time(), **entry})
+
+    # ---- commands
+
+    def listen(self, topic: str, durable: bool = False) -> dict[str, Any]:
+        """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
+        kind, show = {
+            "answer": (String, lambda message: json.loads(message.data)),
+            "pose": (PoseWithCovarianceStamped, pose_of),
+            "map_to_odom": (TransformStamped, transform_of),
+            "annotated/compressed": (CompressedImage, picture_of),
+            "/diagnostics": (DiagnosticArray, diagnostics_of),
+        }[topic]
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+        if durable:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        full = topic if topic.startswith("/") else f"/placerec/{topic}"
+        self._subscriptions[topic] = self.node.create_subscription(
+            kind, full, lambda message: self.note(topic, show(message)), qos
+        )
+        return {}
+
+    def deafen(self, topic: str) -> dict[str, Any]:
+        """End the recording of a topic."""
+        self.node.destroy_subscription(self._subscriptions.pop(topic))
+        return {}
+
+    def take(self, topic: str) -> dict[str, Any]:
+        """What was heard since the last time."""
+        with self._lock:
+            return {"heard": self.heard.pop(topic, [])}
+
+    def advertise(self, topic: str, kind: str, reliable: bool = False) -> dict[str, Any]:
+        """Make a publisher, and return when the node has subscribed, or after two seconds."""
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=10, reliability=reliability)
+        self.withdraw(topic)
+        self._publishers[topic] = made = self.node.create_publisher(KINDS[kind], topic, qos)
+        until = time.monotonic() + 2.5
+        while not made.get_subscription_count() and time.monotonic() < until:
+            time.sleep(0.01)
+        return {"subscribers": made.get_subscription_count()}
+
+    def withdraw(self, topic: str) -> dict[str, Any]:
+        """Take a publisher back."""
+        if topic in self._publishers:
+            self.node.destroy_publisher(self._publishers.pop(topic))
+        return {}
+
+    def subscribers(self, topic: str) -> dict[str, Any]:
+        """How many subscribe to a topic of this peer."""
+        return {"subscribers": self._publishers[topic].get_subscription_count()}
+
+    def publish(self, topic: str, kind: str, **fields: Any) -> dict[str, Any]:
+        """Publish one message; bytes are named by the path of a file."""
+        self._publishers[topic].publish(message_of(kind, fields))
+        return {"at": time.time()}
+
+    def write_bag(self, path: str, messages: list[dict[str, Any]]) -> dict[str, Any]:
+        """Write a bag; each message has a topic, a kind and a stamp in seconds."""
+        store = get_typestore(Stores.ROS2_KILTED)
+        connections: dict[str, Any] = {}
+        with Writer(Path(path), version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            for fields in messages:
+                topic, kind = fields.pop("topic"), fields.pop("kind")
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, BAG_TYPES[kind], typestore=store)
+                stamp = int(fields["stamp"] * 1e9)
+                from rclpy.serialization import serialize_message
+
+                writer.write(connections[topic], stamp, serialize_message(message_of(kind, fields)))
+        return {}
+
+    def play(self, path: str, rate: float = 1.0, wait: bool = False, settle: float = 0.0) -> dict[str, Any]:
+        """Publish a bag's messages at the pace of their times, so many times faster."""
+        with Reader(Path(path)) as reader:
+            for connection in reader.connections:
+                if connection.topic not in self._publishers:
+                    self.advertise(connection.topic, connection.msgtype.rpartition("/")[2])
+        self._playing = threading.Thread(target=self._play, args=(path, rate), daemon=True)
+        self._playing.start()
+        return self.played() if wait else {}
+
+    def _play(self, path: str, rate: float) -> None:
+        with Reader(Path(path)) as reader:
+            began, first = time.monotonic(), None
+            for connection, stamp, raw in reader.messages():
+                first = stamp if first is None else first
+                due = began + (stamp - first) / 1e9 / rate
+                time.sleep(max(0.0, due - time.monotonic()))
+                kind = KINDS[connection.msgtype.rpartition("/")[2]]
+                message = deserialize_message(bytes(raw), kind)
+                now = time.time()
+                self._publishers[connection.topic].publish(message)
+                if kind is CompressedImage:
+                    self.note("played", {"stamp": stamp_of(message), "published": now})
+
+    def played(self) -> dict[str, Any]:
+        """Wait until the bag has been played."""
+        assert self._playing is not None
+        self._playing.join()
+        return {}
+
+    def call(self, service: str, patience: float = PATIENCE) -> dict[str, Any]:
+        """Call one of the node's own services."""
+        done = self._call(Trigger, f"/placerec/{service}", Trigger.Request(), patience)
+        return {"success": done.success, "message": done.message}
+
+    def transition(self, name: str) -> dict[str, Any]:
+        """Ask the node for a transition; how long it took."""
+        request = ChangeState.Request()
+        request.transition.id = TRANSITIONS[name]
+        began = time.monotonic()
+        done = self._call(ChangeState, "/placerec/change_state", request)
+        return {"success": done.success, "seconds": time.monotonic() - began}
+
+    def state(self) -> dict[str, Any]:
+        """The state of the node, and how long it took to say so."""
+        began = time.monotonic()
+        done = self._call(GetState, "/placerec/get_state", GetState.Request())
+        return {"state": done.current_state.label, "seconds": time.monotonic() - began}
+
+    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE) -> Any:
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        if not client.wait_for_service(patience):
+            raise TimeoutError(f"no service {name}")
+        future, done = client.call_async(request), threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(patience):
+            raise TimeoutError(f"{name} did not answer in {patience} s")
+        return future.result()
+
+
+def message_of(kind: str, fields: dict[str, Any]) -> Any:
+    """A message of the fields that matter in the tests."""
+    message = KINDS[kind]()
+    if kind == "String":
+        message.data = fields.get("data", "")
+        return message
+    stamp = fields["stamp"]
+    message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(1e9 * (stamp - int(stamp)))
+    message.header.frame_id = fields.get("frame_id", "camera")
+    if kind == "CompressedImage":
+        message.format = fields.get("format", "jpeg")
+        message.data = Path(fields["file"]).read_bytes()
+    elif kind == "Image":
+        message.height, message.width, message.encoding = fields["height"], fields["width"], fields["encoding"]
+        message.data = Path(fields["file"]).read_bytes()
+        message.step = fields.get("step", len(message.data) // message.height)
+    elif kind == "CameraInfo":
+        message.width, message.height = fields["width"], fields["height"]
+        message.k = [fields["fx"], 0.0, fields["cx"], 0.0, fields["fy"], fields["cy"], 0.0, 0.0, 1.0]
+        message.distortion_model, message.d = fields.get("distortion_model", "plumb_bob"), fields.get("d", [0.0] * 5)
+    else:
+        message.header.frame_id, message.child_frame_id = fields.get("frame_id", "odom"), "base_link"
+        pose, yaw = message.pose.pose, math.radians(fields.get("heading", 0.0))
+        pose.position.x, pose.position.y = float(fields["x"]), float(fields["y"])
+        pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    return message
+
+
+def stamp_of(message: Any) -> float:
+    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
+
+
+def pose_of(message: Any) -> dict[str, Any]:
+    pose = message.pose.pose
+    return {
+        "stamp": stamp_of(message),
+        "frame": message.header.frame_id,
+        "x": pose.position.x,
+        "y": pose.position.y,
+        "heading": math.degrees(2 * math.atan2(pose.orientation.z, pose.orientation.w)) % 360,
+        "covariance": list(map(float, message.pose.covariance)),
+    }
+
+
+def transform_of(message: Any) -> dict[str, Any]:
+    moved, turned = message.transform.translation, message.transform.rotation
+    yaw = math.degrees(2 * math.atan2(turned.z, turned.w)) % 360
+    frames = {"frame": message.header.frame_id, "child": message.child_frame_id}
+    return {"stamp": stamp_of(message), "x": moved.x, "y": moved.y, "heading": yaw, **frames}
+
+
+def picture_of(message: Any) -> dict[str, Any]:
+    return {"stamp": stamp_of(message), "format": message.format, "start": bytes(message.data[:8]).hex()}
+
+
+def diagnostics_of(message: Any) -> dict[str, Any]:
+    (status,) = message.status
+    level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+    values = {one.key: one.value for one in status.values}
+    return {"level": level, "message": status.message, "name": status.name, "values": values}
+
+
+def main() -> None:
+    rclpy.init()
+    peer = Peer()
+    executor = SingleThreadedExecutor()
+    executor.add_node(peer.node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    for line in sys.stdin:
+        order = json.loads(line)
+        try:
+            answer = getattr(peer, order.pop("do"))(**order)
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), flush=True)
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
