@@ -20,6 +20,7 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
@@ -44,6 +45,7 @@ STOP_SECONDS = 1.0
 QUEUED = 5
 """Messages of a sensor that wait in the middleware."""
 
+RCLError = rclpy_implementation.RCLError
 Success, Failure = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -203,7 +205,10 @@ class PlacerecNode(LifecycleNode):
             fitting = [kind for _, kind in wanted.values()]
         if fitting and (self._image_subscription is None or self._image_subscription.msg_type not in fitting):
             self._drop_images()
-            self._image_subscription = self._subscribe(fitting[0], "image", self._on_image, sensor_qos(QUEUED))
+            try:
+                self._image_subscription = self._subscribe(fitting[0], "image", self._on_image, sensor_qos(QUEUED))
+            except RCLError as error:  # the middleware has not forgotten the type from before; the next tick tries again
+                self.get_logger().debug(f"No subscription yet: {error}")
 
     def _on_image(self, message: Any) -> None:
         self._frames += 1

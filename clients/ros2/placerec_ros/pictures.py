@@ -100,7 +100,7 @@ def _paired(rows: Pixels, places: tuple[int, int, int, int]) -> Pixels:
     first, second, blue, red = places
     height, width = rows.shape[0], rows.shape[1] // 2
     quads = rows.reshape(height, width // 2, 4)
-    luminance = 1.164 * (quads[:, :, [first, second]].reshape(height, width).astype(np.float32) - 16)
+    luminance = 1.164 * np.maximum(quads[:, :, [first, second]].reshape(height, width).astype(np.float32) - 16, 0)
     u = np.repeat(quads[:, :, blue].astype(np.float32) - 128, 2, axis=1)
     v = np.repeat(quads[:, :, red].astype(np.float32) - 128, 2, axis=1)
     picture = np.stack([luminance + 2.018 * u, luminance - 0.391 * u - 0.813 * v, luminance + 1.596 * v], axis=2)

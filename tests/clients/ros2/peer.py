@@ -18,10 +18,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -56,7 +59,12 @@ class Peer:
 
     # ---- commands
 
-    def listen(self, topic: str, durable: bool = False) -> dict[str, Any]:
+    def sleep(self, seconds: float) -> dict[str, Any]:
+        """Wait."""
+        time.sleep(seconds)
+        return {}
+
+    def listen(self, topic: str, durable: bool = False, node: str = "placerec") -> dict[str, Any]:
         """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
         kind, show = {
             "answer": (String, lambda message: json.loads(message.data)),
@@ -68,7 +76,9 @@ class Peer:
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         if durable:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        full = topic if topic.startswith("/") else f"/placerec/{topic}"
+        full = topic if topic.startswith("/") else f"/{node}/{topic}"
+        if topic in self._subscriptions:
+            self.deafen(topic)
         self._subscriptions[topic] = self.node.create_subscription(
             kind, full, lambda message: self.note(topic, show(message)), qos
         )
@@ -85,15 +95,19 @@ class Peer:
             return {"heard": self.heard.pop(topic, [])}
 
     def advertise(self, topic: str, kind: str, reliable: bool = False) -> dict[str, Any]:
-        """Make a publisher, and return when the node has subscribed, or after two seconds."""
+        """Make a publisher."""
         reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         qos = QoSProfile(depth=10, reliability=reliability)
         self.withdraw(topic)
-        self._publishers[topic] = made = self.node.create_publisher(KINDS[kind], topic, qos)
-        until = time.monotonic() + 2.5
-        while not made.get_subscription_count() and time.monotonic() < until:
-            time.sleep(0.01)
-        return {"subscribers": made.get_subscription_count()}
+        until = time.monotonic() + PATIENCE
+        while topic not in self._publishers:  # the middleware takes a moment to forget another type
+            try:
+                self._publishers[topic] = self.node.create_publisher(KINDS[kind], topic, qos)
+            except rclpy_implementation.RCLError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.1)
+        return {}
 
     def withdraw(self, topic: str) -> dict[str, Any]:
         """Take a publisher back."""
@@ -120,8 +134,6 @@ class Peer:
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, BAG_TYPES[kind], typestore=store)
                 stamp = int(fields["stamp"] * 1e9)
-                from rclpy.serialization import serialize_message
-
                 writer.write(connections[topic], stamp, serialize_message(message_of(kind, fields)))
         return {}
 
@@ -160,18 +172,30 @@ class Peer:
         done = self._call(Trigger, f"/placerec/{service}", Trigger.Request(), patience)
         return {"success": done.success, "message": done.message}
 
-    def transition(self, name: str) -> dict[str, Any]:
-        """Ask the node for a transition; how long it took."""
+    def transition(self, name: str, node: str = "placerec") -> dict[str, Any]:
+        """Ask a node for a transition; how long it took."""
         request = ChangeState.Request()
         request.transition.id = TRANSITIONS[name]
         began = time.monotonic()
-        done = self._call(ChangeState, "/placerec/change_state", request)
+        done = self._call(ChangeState, f"/{node}/change_state", request)
         return {"success": done.success, "seconds": time.monotonic() - began}
 
-    def state(self) -> dict[str, Any]:
-        """The state of the node, and how long it took to say so."""
+    def set(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Set parameters of the node; why each was refused, if so."""
+        request = SetParameters.Request()
+        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        done = self._call(SetParameters, "/placerec/set_parameters", request)
+        return {"refused": [result.reason for result in done.results if not result.successful]}
+
+    def describe(self, names: list[str]) -> dict[str, Any]:
+        """What the node says of its parameters."""
+        done = self._call(DescribeParameters, "/placerec/describe_parameters", DescribeParameters.Request(names=names))
+        return {"descriptions": {one.name: one.description for one in done.descriptors}}
+
+    def state(self, node: str = "placerec") -> dict[str, Any]:
+        """The state of a node, and how long it took to say so."""
         began = time.monotonic()
-        done = self._call(GetState, "/placerec/get_state", GetState.Request())
+        done = self._call(GetState, f"/{node}/get_state", GetState.Request())
         return {"state": done.current_state.label, "seconds": time.monotonic() - began}
 
     def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE) -> Any:
@@ -254,7 +278,8 @@ def main() -> None:
     peer = Peer()
     executor = SingleThreadedExecutor()
     executor.add_node(peer.node)
-    threading.Thread(target=executor.spin, daemon=True).start()
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
     for line in sys.stdin:
         order = json.loads(line)
         try:
@@ -262,7 +287,9 @@ def main() -> None:
         except Exception as error:
             answer = {"error": f"{type(error).__name__}: {error}"}
         print(json.dumps(answer), flush=True)
+    executor.shutdown()
     rclpy.try_shutdown()
+    spinning.join()
 
 
 if __name__ == "__main__":

@@ -8,13 +8,14 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from core.frames.preprocessing import Pixels
+from placerec_ros.parameters import PARAMETERS
 from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import ROOT, Server
 
@@ -38,15 +39,6 @@ def walked_again(frames: list[Pixels]) -> list[bytes]:
     return [encoded(seen_again(frame, number)) for number, frame in enumerate(frames)]
 
 
-def enrol_walk(server: Server, map_id: str, frames: list[Pixels], **camera: str) -> None:
-    """Make a map of a walk: a metre from frame to frame along +x."""
-    server.create_map(map_id, same_place_radius=1.5)
-    for number, frame in enumerate(frames):
-        data = encoded(frame)
-        done = server.enrol(map_id, f"p{number:02d}", data, x=number, y=0, heading=0, sequence="walk", **camera)
-        assert done.status_code == 201, done.text
-
-
 def ros_environment(**more: str) -> dict[str, str]:
     """The environment of processes of .venv-ros: ROS keeps to this machine, and logs as it goes."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PLACEREC_", "ROS_", "RMW_"))}
@@ -60,14 +52,17 @@ class Node:
     Args:
         folder: for its log.
         parameters: its parameters.
+        name: of the node.
         environment: variables, such as PLACEREC_KEY.
     """
 
-    def __init__(self, folder: Path, parameters: Mapping[str, object], **environment: str) -> None:
+    def __init__(
+        self, folder: Path, parameters: Mapping[str, object], name: str = "placerec", **environment: str
+    ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.log_file = folder / "node.log"
         words = [word for name, value in parameters.items() for word in ("-p", f"{name}:={_yaml(value)}")]
-        command = [str(PYTHON), "-m", "placerec_ros.node", "--ros-args", *words]
+        command = [str(PYTHON), "-m", "placerec_ros.node", "--ros-args", "-r", f"__node:={name}", *words]
         with self.log_file.open("ab") as log:
             variables = ros_environment(ROS_LOG_DIR=str(folder / "ros"), **environment)
             self.process = subprocess.Popen(command, env=variables, stdout=log, stderr=log, cwd=folder)
@@ -141,6 +136,159 @@ def until(done: Callable[[], Any], patience: float = PATIENCE) -> Any:
     return found
 
 
-def raw_rgb(pixels: Pixels) -> bytes:
-    """The bytes of an Image in rgb8."""
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB).tobytes()
+
+@dataclass
+class Site:
+    """A service with keys, a peer, a node, and the frames of a walk: as enrolled, and as the robot sees them."""
+
+    folder: Path
+    server: Server
+    keys: dict[str, str]
+    frames: list[Pixels]
+    again: list[bytes]
+    peer: Peer = field(init=False)
+    node: Node = field(init=False)
+
+    def start_peers(self) -> None:
+        """Start the processes of ROS."""
+        self.peer = Peer(self.folder / "peer")
+        self.node = Node(self.folder / "node", {})
+
+    def stop(self) -> None:
+        """End all processes."""
+        try:
+            assert self.node.stop() == 0, self.node.log()[-3000:]
+            for key in self.keys.values():
+                assert key not in self.node.log()
+        finally:
+            self.peer.stop()
+            self.server.stop()
+
+    @property
+    def url(self) -> str:
+        """The address of the service."""
+        return f"http://127.0.0.1:{self.server.port}"
+
+    def enrol(self, map_id: str, count: int = 99) -> None:
+        """Make a map of the walk: a metre from frame to frame along +x."""
+        self.server.create_map(map_id, same_place_radius=1.5)
+        for number, frame in enumerate(self.frames[:count]):
+            pose = {"x": number, "y": 0, "heading": 0}
+            done = self.server.enrol(map_id, f"p{number:02d}", encoded(frame), sequence="walk", **pose)
+            assert done.status_code == 201, done.text
+
+    def file(self, name: str, data: bytes) -> str:
+        """The path of a new file."""
+        path = self.folder / name
+        path.write_bytes(data)
+        return str(path)
+
+
+class Robot:
+    """The node as a test uses it."""
+
+    BASE = 1_763_800_000.0
+    """The stamp of the first frame, in seconds."""
+
+    def __init__(self, site: Site) -> None:
+        self.site, self.peer = site, site.peer
+        self.frame = 0
+        self._log_start = len(site.node.log())
+        for topic in ("answer", "pose", "map_to_odom", "/diagnostics"):
+            self.peer.do("listen", topic=topic)
+            self.peer.take(topic)
+
+    def begin(self, active: bool = True, role: str = "enrol", **parameters: object) -> None:
+        """Configure and activate the node, with all parameters that are not given at their defaults."""
+        defaults = {one.name: one.default for one in PARAMETERS}
+        quiet = {"use_camera_info": False, "deadline": 20.0, "queue_length": 100, "image_type": "compressed"}
+        key = str(self.site.folder / f"{role}.key") if role else ""
+        own = {"url": self.site.url, "map": "walk", "key_file": key}
+        assert self.peer.do("set", values={**defaults, **quiet, **own, **parameters})["refused"] == []
+        assert self.transition("configure")
+        if active:
+            assert self.transition("activate")
+
+    def transition(self, name: str) -> bool:
+        """Ask the node for a transition, which takes no longer than a moment."""
+        done = self.peer.do("transition", name=name)
+        assert done["seconds"] < 5, "the node waited for something"
+        return bool(done["success"])
+
+    @property
+    def state(self) -> str:
+        """The node's state."""
+        return str(self.peer.do("state")["state"])
+
+    def end(self) -> None:
+        """Take the node back to where it is not configured, whatever the test left."""
+        if self.state == "active":
+            assert self.transition("deactivate")
+        if self.state == "inactive":
+            assert self.transition("cleanup")
+        for topic in ("answer", "pose", "map_to_odom", "/diagnostics"):
+            self.peer.do("deafen", topic=topic)
+        for topic in ("/image", "/camera_info", "/odom"):
+            self.peer.do("withdraw", topic=topic)
+
+    def look(self, data: bytes | None = None, number: int | None = None, **fields: object) -> float:
+        """Publish one frame of the walk, or a picture; its stamp."""
+        index = self.frame if number is None else number
+        path = self.site.folder / f"again-{index:02d}.jpg"
+        file = str(path) if data is None else self.site.file(f"picture-{self.frame}", data)
+        stamp = self.BASE + 0.1 * self.frame
+        self.frame += 1
+        self.peer.do("publish", topic="/image", kind="CompressedImage", stamp=stamp, file=file, **fields)
+        return stamp
+
+    def answers(self, count: int = 1) -> list[dict[str, Any]]:
+        """The next so many answers."""
+        heard: list[dict[str, Any]] = []
+
+        def enough() -> bool:
+            heard.extend(self.peer.take("answer"))
+            return len(heard) >= count
+
+        until(enough)
+        assert len(heard) == count
+        return heard
+
+    def answers_to(self, pictures: list[bytes]) -> list[dict[str, Any]]:
+        """Show pictures one after the other; the answers."""
+        answers = []
+        for data in pictures:
+            self.look(data)
+            answers += self.answers()
+        return answers
+
+    def answers_settled(self) -> None:
+        """Wait until all frames that were published have been answered."""
+        quiet = 0
+        while quiet < 3:
+            self.peer.do("sleep", seconds=0.15)
+            quiet = 0 if self.peer.take("answer") else quiet + 1
+
+    def asked(self, number: int, **fields: object) -> dict[str, Any]:
+        """Publish a frame of the walk, and wait for its answer."""
+        self.look(number=number, **fields)
+        return self.answers()[0]
+
+    def drive(self, start: int, stop: int) -> dict[str, Any]:
+        """Let the robot see frames of the walk, one after the other; the last answer."""
+        answer: dict[str, Any] = {}
+        for number in range(start, stop):
+            answer = self.asked(number)
+        return answer
+
+    def says(self, text: str) -> dict[str, Any]:
+        """Wait until the diagnostics say something; the status."""
+
+        def heard() -> dict[str, Any] | None:
+            return next((one for one in self.peer.take("/diagnostics") if text in one["message"]), None)
+
+        found: dict[str, Any] = until(heard)
+        return found
+
+    def log(self) -> str:
+        """What the node has logged since the test began."""
+        return self.site.node.log()[self._log_start :]
