@@ -3,8 +3,6 @@
 Written from openapi.json by scripts/client.  Do not edit.
 """
 
-from __future__ import annotations
-
 from datetime import date, datetime
 from typing import Any, Literal
 
@@ -36,6 +34,14 @@ class AliasView(Model):
     own: float | None = None
 
 
+class HubView(Model):
+    """A place that is a match unusually often."""
+
+    place: str
+    count: int
+    expected: float
+
+
 class AliasingView(Model):
     """Places that look like other places."""
 
@@ -49,6 +55,30 @@ class AliasingView(Model):
     unsure: list[HubView]
 
 
+class TrendView(Model):
+    """A straight line fitted to the weeks."""
+
+    per_week: float
+    error: float
+    weeks: int
+    significant: bool
+
+
+class WeekView(Model):
+    """The answers of one week."""
+
+    monday: date
+    queries: int
+    recognized: int
+    ambiguous: int
+    unknown: int
+    blank: int
+    unknown_rate: float | None = None
+    mean_score: float | None = None
+    mean_decision: float | None = None
+    scores: list[int]
+
+
 class AnswersView(Model):
     """The map's answers since the counting began."""
 
@@ -60,6 +90,179 @@ class AnswersView(Model):
     weeks: list[WeekView]
     score_trend: TrendView | None = None
     unknown_trend: TrendView | None = None
+
+
+class Problem(Model, extra="allow"):
+    """What went wrong, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str | None = None
+    request_id: str | None = None
+
+
+class EstimatedPose(Model, extra="allow"):
+    """The schema EstimatedPose of the interface."""
+
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    heading: float | None = None
+    spread: float | None = None
+    heading_spread: float | None = None
+    heading_offset: float | None = None
+    offset_spread: float | None = None
+    places: int | None = None
+    source: str | None = None
+    note: str | None = None
+    covariance: list[float] | None = None
+
+
+class Pose(Model):
+    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``heading`` is in
+    degrees: counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is kept
+    within [0, 360).
+    """
+
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    heading: float | None = None
+
+
+class PlaceView(Model):
+    """One enrolled reference frame."""
+
+    id: str
+    pose: Pose | None = None
+    pose_of: str | None = None
+    timestamp: datetime | None = None
+    sequence: str | None = None
+    camera: str | None = None
+    metadata: dict[str, Any]
+    regions: int
+    picture: Known[Literal["none", "thumbnail", "image"]]
+    created_at: datetime
+    updated_at: datetime
+
+
+class ScoreParts(Model):
+    """What a match's place in the ranking is made of: the score is the sum of `similarity` and `agreement`."""
+
+    similarity: float
+    agreement: float
+    inliers: int | None = None
+    keypoints: int | None = None
+    evidence: float | None = None
+
+
+class Match(Model):
+    """One of the best places."""
+
+    rank: int
+    score: float
+    parts: ScoreParts | None = None
+    weight: float | None = None
+    place: PlaceView
+
+
+class CellPair(Model):
+    """Two cells that are each other's best match: row and column of each in `grid`."""
+
+    query: tuple[int, int]
+    match: tuple[int, int]
+    gain: float
+
+
+class RelativeBox(Model):
+    """A box in shares of the upright frame's width and height."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+class ExplainedRegion(Model):
+    """A region of interest and its share in the score."""
+
+    layer: str
+    word: int
+    box: RelativeBox
+    loss: float
+
+
+class KeypointPair(Model):
+    """Two keypoints that match and fit one rigid scene: (x, y) of each in shares of its frame's width and height."""
+
+    query: tuple[float, float]
+    match: tuple[float, float]
+
+
+class RegionPair(Model):
+    """Two regions of one word that are each other's nearest neighbours: their positions in the two lists."""
+
+    query: int
+    match: int
+
+
+class MatchExplanation(Model):
+    """Why a query's best match scores as it does."""
+
+    score: float
+    words: list[float]
+    query_regions: list[ExplainedRegion]
+    match_regions: list[ExplainedRegion] | None = None
+    regions: list[RegionPair]
+    cells: list[CellPair]
+    grid: tuple[int, int]
+    place: str
+    inliers: list[KeypointPair] = Field(default_factory=list)
+    match_picture: str
+    picture: str | None = None
+
+
+class RivalGroup(Model):
+    """Places that keep an answer from being recognized, as one."""
+
+    places: list[str]
+    score: float
+    same_place: bool
+
+
+class VerificationView(Model):
+    """Whether the geometry of the best candidates was verified."""
+
+    state: Known[Literal["verified", "not-needed", "no-keypoints", "never"]]
+    candidates: int
+    keypoints: int | None = None
+
+
+class QueryAnswer(Model):
+    """Where a frame was taken, or that this is not known."""
+
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    place: PlaceView | None = None
+    probability: float | None = None
+    pose: EstimatedPose | None = None
+    score: float | None = None
+    margin: float | None = None
+    decision: float | None = None
+    threshold: float
+    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
+    matches: list[Match]
+    rivals: list[RivalGroup] = Field(default_factory=list)
+    verification: VerificationView | None = None
+    revision: int | None = None
+    explanation: MatchExplanation | None = None
+    encoder: str
+    milliseconds: dict[str, float]
 
 
 class BatchAnswer(Model):
@@ -96,6 +299,14 @@ class BatchResults(Model):
     encoder: str
 
 
+class BelievedPlace(Model):
+    """One place where the robot may be."""
+
+    rank: int
+    probability: float
+    place: PlaceView
+
+
 class BeliefView(Model):
     """The belief about where a robot is."""
 
@@ -107,12 +318,16 @@ class BeliefView(Model):
     candidates: list[BelievedPlace]
 
 
-class BelievedPlace(Model):
-    """One place where the robot may be."""
+class Share(Model):
+    """A share that was counted, with Wilson's interval: how far it may lie from the one that would be found in the
+    long run.
+    """
 
-    rank: int
-    probability: float
-    place: PlaceView
+    value: float | None = None
+    low: float
+    high: float
+    count: int
+    of: int
 
 
 class Bin(Model):
@@ -131,6 +346,35 @@ class Box(Model):
     top: float
     right: float
     bottom: float
+
+
+class Curve(Model):
+    """P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), d a decision value."""
+
+    slope: float
+    intercept: float
+    imagined_slope: float = 0.0
+    imagined_intercept: float = 0.0
+
+
+class Environment(Model):
+    """The prior of the scores of other places of one environment, in units of the score (see the module). ``mean``
+    and ``deviation`` are μ₀ and σ₀; ``mean_weight`` and ``deviation_weight`` are κ₀ and ν₀, the number of scores
+    that the prior counts as.
+    """
+
+    mean: float
+    deviation: float
+    mean_weight: float
+    deviation_weight: float
+
+
+class GeometryTerms(Model):
+    """How evidence joins the log odds of the first two stages (see the module)."""
+
+    support: float
+    slope: float
+    intercept: float
 
 
 class Calibration(Model):
@@ -156,6 +400,61 @@ class Calibration(Model):
     geometry: GeometryTerms | None = None
 
 
+class Reliability(Model):
+    """What stated probabilities are worth, over n answers whose truth is known."""
+
+    answers: int
+    right: int
+    ece: float
+    brier: float
+    brier_of_base_rate: float
+    bins: list[Bin]
+
+
+class Held(Model):
+    """What the verdicts did with frames that had no part in the threshold by which they were judged."""
+
+    precision: Share
+    recall: Share
+    false_accept_rate: Share
+    reliability: Reliability
+
+
+class Point(Model):
+    """What one threshold on the decision value does, on all frames; the margin is not applied."""
+
+    threshold: float
+    precision: float
+    recall: float
+    false_accept_rate: float | None = None
+
+
+class Measurement(Model):
+    """What was measured in making a calibration."""
+
+    frames: int
+    trials: int
+    known: int
+    unknown: int
+    right: int
+    auc_pr: float
+    auc_roc: float | None = None
+    auc_roc_right: float
+    cross_validated: Held
+    points: list[Point]
+
+
+class Target(Model):
+    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
+    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
+    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
+    has no value.
+    """
+
+    rule: Known[Literal["precision", "false_accept_rate", "mean_of_negatives"]]
+    value: float | None = None
+
+
 class CalibrationReport(Model):
     """A calibration, and the measurement that it rests on."""
 
@@ -170,11 +469,26 @@ class CalibrationReport(Model):
     warnings: list[str]
 
 
-class CameraList(Model):
-    """All cameras of a map in the order of their names, on one page."""
+class Intrinsics(Model):
+    """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
 
-    items: list[CameraView]
-    next_cursor: None = None
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion_model: Known[Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]] = "none"
+    distortion: list[float] = Field(default_factory=list)
+
+
+class Mask(Model):
+    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
+    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
+    covered.
+    """
+
+    polygons: list[list[tuple[float, float]]]
 
 
 class CameraView(Model):
@@ -186,12 +500,11 @@ class CameraView(Model):
     updated_at: datetime
 
 
-class CellPair(Model):
-    """Two cells that are each other's best match: row and column of each in `grid`."""
+class CameraList(Model):
+    """All cameras of a map in the order of their names, on one page."""
 
-    query: tuple[int, int]
-    match: tuple[int, int]
-    gain: float
+    items: list[CameraView]
+    next_cursor: None = None
 
 
 class ClosureAnswer(Model):
@@ -215,15 +528,6 @@ class ClosureAnswer(Model):
     milliseconds: dict[str, float]
     change: Known[Literal["created", "unchanged"]] | None = None
     enrolled: PlaceView | None = None
-
-
-class Curve(Model):
-    """P(right | d) = 1 / (1 + exp(-(slope · d + intercept))), d a decision value."""
-
-    slope: float
-    intercept: float
-    imagined_slope: float = 0.0
-    imagined_intercept: float = 0.0
 
 
 class Descriptor(Model):
@@ -261,13 +565,6 @@ class EncoderDefinition(Model):
     agreement: AgreementDefinition | None = None
 
 
-class EncoderPage(Model):
-    """All installed encoders."""
-
-    items: list[EncoderSummary]
-    next_cursor: str | None = None
-
-
 class EncoderSummary(Model):
     """One installed encoder as a user sees it; ``damaged`` says why it cannot be used."""
 
@@ -282,6 +579,13 @@ class EncoderSummary(Model):
     calibration: Calibration | None = None
     training: dict[str, Any]
     damaged: str | None = None
+
+
+class EncoderPage(Model):
+    """All installed encoders."""
+
+    items: list[EncoderSummary]
+    next_cursor: str | None = None
 
 
 class EnrolledPlace(Model):
@@ -301,46 +605,6 @@ class EnrolledPlace(Model):
     change: Known[Literal["created", "unchanged", "updated", "replaced"]]
     encoder: str
     milliseconds: dict[str, float]
-
-
-class Environment(Model):
-    """The prior of the scores of other places of one environment, in units of the score (see the module). ``mean``
-    and ``deviation`` are μ₀ and σ₀; ``mean_weight`` and ``deviation_weight`` are κ₀ and ν₀, the number of scores
-    that the prior counts as.
-    """
-
-    mean: float
-    deviation: float
-    mean_weight: float
-    deviation_weight: float
-
-
-class EstimatedPose(Model, extra="allow"):
-    """The schema EstimatedPose of the interface."""
-
-    x: float | None = None
-    y: float | None = None
-    z: float | None = None
-    latitude: float | None = None
-    longitude: float | None = None
-    heading: float | None = None
-    spread: float | None = None
-    heading_spread: float | None = None
-    heading_offset: float | None = None
-    offset_spread: float | None = None
-    places: int | None = None
-    source: str | None = None
-    note: str | None = None
-    covariance: list[float] | None = None
-
-
-class ExplainedRegion(Model):
-    """A region of interest and its share in the score."""
-
-    layer: str
-    word: int
-    box: RelativeBox
-    loss: float
 
 
 class ExplanationView(Model):
@@ -384,35 +648,19 @@ class GapView(Model):
     severity: float
 
 
-class GeometryTerms(Model):
-    """How evidence joins the log odds of the first two stages (see the module)."""
-
-    support: float
-    slope: float
-    intercept: float
-
-
 class Health(Model):
     """The process is alive."""
 
     status: str = "ok"
 
 
-class Held(Model):
-    """What the verdicts did with frames that had no part in the threshold by which they were judged."""
+class Recall(Model):
+    """How often the place that an exact search finds first is found first by way of the codes."""
 
-    precision: Share
-    recall: Share
-    false_accept_rate: Share
-    reliability: Reliability
-
-
-class HubView(Model):
-    """A place that is a match unusually often."""
-
-    place: str
-    count: int
-    expected: float
+    at_1: float
+    queries: int
+    shortlist: int
+    places: int
 
 
 class IndexStatus(Model):
@@ -429,24 +677,12 @@ class IndexStatus(Model):
     problem: str | None = None
 
 
-class Intrinsics(Model):
-    """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
+class Progress(Model):
+    """How far a job is."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion_model: Known[Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]] = "none"
-    distortion: list[float] = Field(default_factory=list)
-
-
-class JobPage(Model):
-    """Jobs, the newest first."""
-
-    items: list[JobView]
-    next_cursor: str | None = None
+    done: int
+    total: int | None = None
+    message: str
 
 
 class JobView(Model):
@@ -468,11 +704,11 @@ class JobView(Model):
     ended_at: datetime | None = None
 
 
-class KeypointPair(Model):
-    """Two keypoints that match and fit one rigid scene: (x, y) of each in shares of its frame's width and height."""
+class JobPage(Model):
+    """Jobs, the newest first."""
 
-    query: tuple[float, float]
-    match: tuple[float, float]
+    items: list[JobView]
+    next_cursor: str | None = None
 
 
 class KeypointsStatus(Model):
@@ -508,6 +744,24 @@ class MapAnswer(Model):
     problem: Problem | None = None
 
 
+class SilentPlaces(Model):
+    """Places that were never the best match."""
+
+    count: int
+    by_chance: float
+    places: list[str]
+
+
+class StretchView(Model):
+    """A stretch of a sequence that should be recorded again."""
+
+    sequence: str
+    first: str
+    last: str
+    reasons: list[Known[Literal["never-matched", "distance-gap", "time-gap", "similarity-gap", "aliased", "hub"]]]
+    weight: float
+
+
 class MapHealth(Model):
     """The health of a map, judged by its own frames and by its answers."""
 
@@ -533,12 +787,15 @@ class MapMatch(Model):
     place: PlaceView
 
 
-class MapPage(Model):
-    """A page of maps in the order of their ids."""
+class StorageStatus(Model):
+    """What a map takes on disk."""
 
-    items: list[MapView]
-    next_cursor: str | None = None
-    quarantined: list[QuarantinedMap]
+    precision: str
+    bytes_per_place: int
+    descriptors: int
+    index: int
+    database: int
+    keypoints: KeypointsStatus | None = None
 
 
 class MapView(Model):
@@ -561,39 +818,19 @@ class MapView(Model):
     updated_at: datetime
 
 
-class Mask(Model):
-    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
-    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
-    covered.
-    """
+class QuarantinedMap(Model):
+    """A damaged map, which is out of service."""
 
-    polygons: list[list[tuple[float, float]]]
+    id: str
+    reason: str
 
 
-class Match(Model):
-    """One of the best places."""
+class MapPage(Model):
+    """A page of maps in the order of their ids."""
 
-    rank: int
-    score: float
-    parts: ScoreParts | None = None
-    weight: float | None = None
-    place: PlaceView
-
-
-class MatchExplanation(Model):
-    """Why a query's best match scores as it does."""
-
-    score: float
-    words: list[float]
-    query_regions: list[ExplainedRegion]
-    match_regions: list[ExplainedRegion] | None = None
-    regions: list[RegionPair]
-    cells: list[CellPair]
-    grid: tuple[int, int]
-    place: str
-    inliers: list[KeypointPair] = Field(default_factory=list)
-    match_picture: str
-    picture: str | None = None
+    items: list[MapView]
+    next_cursor: str | None = None
+    quarantined: list[QuarantinedMap]
 
 
 class MatchScore(Model):
@@ -606,112 +843,11 @@ class MatchScore(Model):
     milliseconds: dict[str, float]
 
 
-class Measurement(Model):
-    """What was measured in making a calibration."""
-
-    frames: int
-    trials: int
-    known: int
-    unknown: int
-    right: int
-    auc_pr: float
-    auc_roc: float | None = None
-    auc_roc_right: float
-    cross_validated: Held
-    points: list[Point]
-
-
 class PlacePage(Model):
     """Places in the order of their ids."""
 
     items: list[PlaceView]
     next_cursor: str | None = None
-
-
-class PlaceView(Model):
-    """One enrolled reference frame."""
-
-    id: str
-    pose: Pose | None = None
-    pose_of: str | None = None
-    timestamp: datetime | None = None
-    sequence: str | None = None
-    camera: str | None = None
-    metadata: dict[str, Any]
-    regions: int
-    picture: Known[Literal["none", "thumbnail", "image"]]
-    created_at: datetime
-    updated_at: datetime
-
-
-class Point(Model):
-    """What one threshold on the decision value does, on all frames; the margin is not applied."""
-
-    threshold: float
-    precision: float
-    recall: float
-    false_accept_rate: float | None = None
-
-
-class Pose(Model):
-    """Where a frame was taken: metres in the map's frame, or degrees on the Earth (WGS 84). ``heading`` is in
-    degrees: counter-clockwise from +x beside x and y, clockwise from north beside latitude and longitude. It is kept
-    within [0, 360).
-    """
-
-    x: float | None = None
-    y: float | None = None
-    z: float | None = None
-    latitude: float | None = None
-    longitude: float | None = None
-    heading: float | None = None
-
-
-class Problem(Model, extra="allow"):
-    """What went wrong, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    instance: str | None = None
-    request_id: str | None = None
-
-
-class Progress(Model):
-    """How far a job is."""
-
-    done: int
-    total: int | None = None
-    message: str
-
-
-class QuarantinedMap(Model):
-    """A damaged map, which is out of service."""
-
-    id: str
-    reason: str
-
-
-class QueryAnswer(Model):
-    """Where a frame was taken, or that this is not known."""
-
-    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
-    place: PlaceView | None = None
-    probability: float | None = None
-    pose: EstimatedPose | None = None
-    score: float | None = None
-    margin: float | None = None
-    decision: float | None = None
-    threshold: float
-    reason: Known[Literal["no-regions", "empty-map", "no-place-allowed"]] | None = None
-    matches: list[Match]
-    rivals: list[RivalGroup] = Field(default_factory=list)
-    verification: VerificationView | None = None
-    revision: int | None = None
-    explanation: MatchExplanation | None = None
-    encoder: str
-    milliseconds: dict[str, float]
 
 
 class Readiness(Model):
@@ -723,15 +859,6 @@ class Readiness(Model):
     quarantined: list[QuarantinedMap]
 
 
-class Recall(Model):
-    """How often the place that an exact search finds first is found first by way of the codes."""
-
-    at_1: float
-    queries: int
-    shortlist: int
-    places: int
-
-
 class Region(Model):
     """One region of interest."""
 
@@ -740,13 +867,6 @@ class Region(Model):
     energy: float
     cells: tuple[int, int, int, int]
     box: Box
-
-
-class RegionPair(Model):
-    """Two regions of one word that are each other's nearest neighbours: their positions in the two lists."""
-
-    query: int
-    match: int
 
 
 class RegionsView(Model):
@@ -761,51 +881,6 @@ class RegionsView(Model):
     milliseconds: dict[str, float]
 
 
-class RelativeBox(Model):
-    """A box in shares of the upright frame's width and height."""
-
-    left: float
-    top: float
-    right: float
-    bottom: float
-
-
-class Reliability(Model):
-    """What stated probabilities are worth, over n answers whose truth is known."""
-
-    answers: int
-    right: int
-    ece: float
-    brier: float
-    brier_of_base_rate: float
-    bins: list[Bin]
-
-
-class RivalGroup(Model):
-    """Places that keep an answer from being recognized, as one."""
-
-    places: list[str]
-    score: float
-    same_place: bool
-
-
-class ScoreParts(Model):
-    """What a match's place in the ranking is made of: the score is the sum of `similarity` and `agreement`."""
-
-    similarity: float
-    agreement: float
-    inliers: int | None = None
-    keypoints: int | None = None
-    evidence: float | None = None
-
-
-class SequencePage(Model):
-    """Traverses in the order of their names."""
-
-    items: list[SequenceSummary]
-    next_cursor: str | None = None
-
-
 class SequenceSummary(Model):
     """One traverse of a map; the times are those of its first and last frames that have one."""
 
@@ -813,6 +888,13 @@ class SequenceSummary(Model):
     places: int
     first_at: datetime | None = None
     last_at: datetime | None = None
+
+
+class SequencePage(Model):
+    """Traverses in the order of their names."""
+
+    items: list[SequenceSummary]
+    next_cursor: str | None = None
 
 
 class SessionAnswer(Model):
@@ -836,6 +918,29 @@ class SessionAnswer(Model):
     saved: bool
     single: QueryAnswer
     milliseconds: dict[str, float]
+
+
+class SessionView(Model):
+    """A session as it is listed."""
+
+    filter: Known[Literal["bayes", "path"]] = "bayes"
+    advance: float = 1.0
+    backwards: bool = False
+    speed_limit: float | None = None
+    sequences: list[str] | None = None
+    lag: int = 0
+    path_frames: int = 10
+    camera: str | None = None
+    verify: Known[Literal["auto", "always", "never"]] = "auto"
+    expires_after: float | None = None
+    id: str
+    map: str
+    created_at: datetime
+    expires_at: datetime
+    frames: int
+    last_frame: int | None = None
+    restored: bool
+    frames_lost: int | None = None
 
 
 class SessionPage(Model):
@@ -869,29 +974,6 @@ class SessionReport(Model):
     belief: BeliefView
 
 
-class SessionView(Model):
-    """A session as it is listed."""
-
-    filter: Known[Literal["bayes", "path"]] = "bayes"
-    advance: float = 1.0
-    backwards: bool = False
-    speed_limit: float | None = None
-    sequences: list[str] | None = None
-    lag: int = 0
-    path_frames: int = 10
-    camera: str | None = None
-    verify: Known[Literal["auto", "always", "never"]] = "auto"
-    expires_after: float | None = None
-    id: str
-    map: str
-    created_at: datetime
-    expires_at: datetime
-    frames: int
-    last_frame: int | None = None
-    restored: bool
-    frames_lost: int | None = None
-
-
 class SeveralAnswer(Model):
     """Where the frames were taken, and in which map, or that this is not known."""
 
@@ -904,75 +986,6 @@ class SeveralAnswer(Model):
     maps: list[MapAnswer]
     frames: list[FrameReport]
     milliseconds: dict[str, float]
-
-
-class Share(Model):
-    """A share that was counted, with Wilson's interval: how far it may lie from the one that would be found in the
-    long run.
-    """
-
-    value: float | None = None
-    low: float
-    high: float
-    count: int
-    of: int
-
-
-class SilentPlaces(Model):
-    """Places that were never the best match."""
-
-    count: int
-    by_chance: float
-    places: list[str]
-
-
-class StorageStatus(Model):
-    """What a map takes on disk."""
-
-    precision: str
-    bytes_per_place: int
-    descriptors: int
-    index: int
-    database: int
-    keypoints: KeypointsStatus | None = None
-
-
-class StretchView(Model):
-    """A stretch of a sequence that should be recorded again."""
-
-    sequence: str
-    first: str
-    last: str
-    reasons: list[Known[Literal["never-matched", "distance-gap", "time-gap", "similarity-gap", "aliased", "hub"]]]
-    weight: float
-
-
-class Target(Model):
-    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
-    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
-    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
-    has no value.
-    """
-
-    rule: Known[Literal["precision", "false_accept_rate", "mean_of_negatives"]]
-    value: float | None = None
-
-
-class TrendView(Model):
-    """A straight line fitted to the weeks."""
-
-    per_week: float
-    error: float
-    weeks: int
-    significant: bool
-
-
-class VerificationView(Model):
-    """Whether the geometry of the best candidates was verified."""
-
-    state: Known[Literal["verified", "not-needed", "no-keypoints", "never"]]
-    candidates: int
-    keypoints: int | None = None
 
 
 class VerifyReport(Model):
@@ -996,18 +1009,3 @@ class Version(Model):
     python: str
     torch: str
     faiss: str
-
-
-class WeekView(Model):
-    """The answers of one week."""
-
-    monday: date
-    queries: int
-    recognized: int
-    ambiguous: int
-    unknown: int
-    blank: int
-    unknown_rate: float | None = None
-    mean_score: float | None = None
-    mean_decision: float | None = None
-    scores: list[int]

@@ -18,6 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[3]
 PACKAGE = ROOT / "clients" / "python" / "placerec_client"
 DOCUMENT = json.loads((ROOT / "openapi.json").read_text())
+SCHEMAS = DOCUMENT["components"]["schemas"]
 METHODS = ("get", "post", "put", "patch", "delete")
 
 SENT = (
@@ -102,7 +103,9 @@ def text(described: str, indent: str = "    ") -> str:
 def models() -> str:
     """The module of the models of all answers."""
     lines = [
-        REMARK.format("What the service answers with: a model for each schema of its interface, under the same name."),
+        REMARK.format(
+            "What the service answers with: a model for each schema of its interface, under the same name."
+        ).replace("from __future__ import annotations\n", ""),  # pydantic would evaluate each, which takes time
         "from datetime import date, datetime",
         "from typing import Any, Literal",
         "",
@@ -111,10 +114,8 @@ def models() -> str:
         "from placerec_client.model import Known, Model",
         "",
     ]
-    wanted = answered()
-    for name, schema in DOCUMENT["components"]["schemas"].items():
-        if name not in wanted:
-            continue
+    for name in ordered(answered()):
+        schema = SCHEMAS[name]
         bases = 'Model, extra="allow"' if schema.get("additionalProperties") is True else "Model"
         lines += ["", f"class {name}({bases}):"]
         lines.append(text(schema.get("description") or f"The schema {name} of the interface."))
@@ -133,7 +134,22 @@ def answered() -> set[str]:
     while waiting:
         for name in set(re.findall(r"#/components/schemas/(\w+)", json.dumps(waiting.pop()))) - found:
             found.add(name)
-            waiting.append(DOCUMENT["components"]["schemas"][name])
+            waiting.append(SCHEMAS[name])
+    return found
+
+
+def ordered(names: set[str]) -> list[str]:
+    """The schemas by their names, but none before those that it consists of."""
+    found: list[str] = []
+
+    def add(name: str) -> None:
+        for part in sorted(set(re.findall(r"#/components/schemas/(\w+)", json.dumps(SCHEMAS[name])))):
+            add(part)
+        if name not in found:
+            found.append(name)
+
+    for name in sorted(names):
+        add(name)
     return found
 
 
@@ -178,7 +194,7 @@ def parameters() -> str:
                 if one["name"] not in BY_CALL and not one.get("required"):
                     lines += [f"    {one['name']}: {parameter_type(one)}", text(one.get("description", "")), ""]
     for name in SENT:
-        lines += body(name, DOCUMENT["components"]["schemas"][name])
+        lines += body(name, SCHEMAS[name])
     return "\n".join(lines)
 
 

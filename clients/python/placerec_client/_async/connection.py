@@ -5,6 +5,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from placerec_client._async.concurrency import sleep
@@ -75,6 +76,11 @@ class AsyncConnection:
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, retry=retry)
         return other
+
+    def lasting(self, patience: float) -> AsyncConnection:
+        """The same connection with this patience at least, if it has any."""
+        retry = self.retry
+        return self.patient(replace(retry, patience=max(patience, retry.patience))) if retry.patience else self
 
     async def close(self) -> None:
         """Close all connections."""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Self, Unpack
 
 from placerec_client import models, parameters, problems
 from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.numbering import AsyncNumbering
+from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import quoted
 
@@ -59,7 +61,7 @@ class AsyncSession:
         self, connection: AsyncConnection, path: str, options: parameters.NewSession, session_id: str = ""
     ) -> None:
         self._connection, self._sessions, self._options, self.id = connection, path, options, session_id
-        self._next: int | None = None if session_id else 0
+        self._numbering = AsyncNumbering(connection, self.path, None) if session_id else None
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.id!r})"
@@ -78,6 +80,7 @@ class AsyncSession:
         """Begin the session. If the answer to an attempt is lost, the session of that attempt ends by itself."""
         view = await self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
         self.id = view.id
+        self._numbering = AsyncNumbering(self._connection, self.path, 0)
         return view
 
     async def end(self) -> None:
@@ -113,7 +116,7 @@ class AsyncSession:
             models.SessionAnswer,
             "POST",
             self.path + "/frames",
-            params=await self.numbered(options),
+            params=await self._numbers().number(options),
             content=data,
             media_type=media_type(data),
             deadline=deadline,
@@ -132,18 +135,12 @@ class AsyncSession:
         """
         from placerec_client._async.streams import AsyncStream
 
-        return AsyncStream(self._connection, self)
+        return AsyncStream(self._connection, self.path + "/stream", self._numbers())
 
-    async def numbered(self, options: parameters.SendFrame) -> parameters.SendFrame:
-        """Return the options of a frame with its number."""
-        given = options.get("frame")
-        if given is None:
-            if self._next is None:  # a session that was begun elsewhere
-                last = (await self.read()).last_frame
-                self._next = 0 if last is None else last + 1
-            given = self._next
-        self._next = given + 1
-        return {**options, "frame": given}
+    def _numbers(self) -> AsyncNumbering:
+        if self._numbering is None:
+            raise PlacerecError("The session has not begun: enter it, or call begin().")
+        return self._numbering
 
     @property
     def path(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import uuid
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import Any, Self, Unpack
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, WebSocketException
@@ -13,14 +13,12 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from placerec_client import models, parameters, problems
 from placerec_client._async.concurrency import received, sleep
 from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.numbering import AsyncNumbering
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
-
-if TYPE_CHECKING:
-    from placerec_client._async.sessions import AsyncSession
 
 CONNECT_SECONDS = 5.0
 MOST_BYTES = 64 << 20
@@ -34,8 +32,8 @@ class AsyncStream:
     the same number, so that it counts once.
     """
 
-    def __init__(self, connection: AsyncConnection, session: AsyncSession) -> None:
-        self._connection, self._session = connection, session
+    def __init__(self, connection: AsyncConnection, path: str, numbering: AsyncNumbering) -> None:
+        self._connection, self._path, self._numbering = connection, path, numbering
         self._socket: ClientConnection | None = None
 
     async def __aenter__(self) -> Self:
@@ -67,7 +65,7 @@ class AsyncStream:
                 ``UnknownSession``.
         """
         data = frame_bytes(image)
-        numbered = await self._session.numbered(options)
+        numbered = await self._numbering.number(options)
         head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
         retry = self._connection.retry
         clock = Clock(deadline, retry)
@@ -111,7 +109,7 @@ class AsyncStream:
     async def _connected(self, limit: float) -> ClientConnection:
         headers = [(name.decode(), value.decode()) for name, value in self._connection.headers if name != b"Host"]
         headers.append(("X-Request-Id", uuid.uuid4().hex))
-        address = "ws" + self._connection.url.removeprefix("http") + self._session.path + "/stream"
+        address = "ws" + self._connection.url.removeprefix("http") + self._path
         try:
             return await connect(
                 address,

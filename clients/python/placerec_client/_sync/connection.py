@@ -6,6 +6,7 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from placerec_client._http import httpx
@@ -76,6 +77,11 @@ class Connection:
         other = object.__new__(type(self))
         other.__dict__.update(self.__dict__, retry=retry)
         return other
+
+    def lasting(self, patience: float) -> Connection:
+        """The same connection with this patience at least, if it has any."""
+        retry = self.retry
+        return self.patient(replace(retry, patience=max(patience, retry.patience))) if retry.patience else self
 
     def close(self) -> None:
         """Close all connections."""

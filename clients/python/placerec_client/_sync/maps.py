@@ -4,17 +4,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Unpack, overload
 
 from placerec_client import models, parameters, problems
+from placerec_client._sync.batches import Queries
 from placerec_client._sync.connection import Connection
+from placerec_client._sync.enrolment import Enrolment, enrol_by_job
 from placerec_client._sync.jobs import Job
 from placerec_client._sync.places import Places
 from placerec_client._sync.sessions import Sessions
+from placerec_client._sync.transfers import Progress, export, upload
 from placerec_client.answers import parsed
+from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import Part, dumps, fields, form, path_of, quoted
+
+TRANSFER_PATIENCE = 3600.0
+"""Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
+a map, which for 100 000 places takes minutes; if the client has any patience."""
 
 
 class Maps:
@@ -66,7 +74,7 @@ class Maps:
         *,
         id: str | None = None,
         encoder: str | None = None,
-        progress: Any = None,
+        progress: Progress | None = None,
     ) -> Job:
         """Upload the file of an exported map, and return the job that makes a map of it.
 
@@ -76,9 +84,7 @@ class Maps:
             encoder: name or identity that the map must have.
             progress: is called with the bytes sent and their number, and may be called again from the beginning.
         """
-        from placerec_client._sync.transfers import upload
-
-        return upload(self._connection, path, id, encoder, progress)
+        return upload(self._connection.lasting(TRANSFER_PATIENCE), path, id, encoder, progress)
 
 
 class Map:
@@ -182,6 +188,65 @@ class Map:
             request_id=request_id,
         )
         return parsed(models.QueryAnswer, response.content)
+
+    def query_batch(self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]) -> Iterator[Located]:
+        """Ask where many frames were taken; yield the answers in their order.
+
+        The frames are read a batch ahead, and batches are as large as the service is fast. Those that were answered
+        are not sent again when a connection is lost. A frame that cannot be used has an ``error``.
+
+        Args:
+            frames: read in a thread when their turn comes.
+            options: as of ``query``; they hold for every frame.
+        """
+        queries = Queries(self.connection.lasting(PATIENCE), self.path + "/query:batch", frames, options)
+        for located in queries.run():
+            yield located
+
+    def enrol(
+        self,
+        places: Iterable[NewPlace],
+        *,
+        known: Container[str] | None = None,
+        encoder: str | None = None,
+    ) -> Iterator[Enrolled]:
+        """Enrol many frames in their order, and yield what became of each.
+
+        It can be broken off and called again with the same frames: those that the map holds already are neither sent
+        nor encoded a second time; their fields are updated. A frame that cannot be used has an ``error``, and the
+        others are enrolled. Within a batch, frames that the map holds come first.
+
+        ::
+
+            frames = (NewPlace(path.stem, path, {"sequence": "monday"}) for path in sorted(folder.glob("*.jpg")))
+            for one in lab.enrol(frames):
+                print(one.place.id, one.change or one.error)
+
+        Args:
+            places: read in a thread when their turn comes.
+            known: ids that the map has; found out if left out.
+            encoder: name or identity that the map must have.
+        """
+        if known is None:
+            known = {place.id for place in self.places.list()}
+        options = {"encoder": encoder}
+        lasting = self.connection.lasting(PATIENCE)
+        for outcome in Enrolment(lasting, self.path + "/places", places, known, options).run():
+            yield outcome
+
+    def enrol_by_job(self, places: Sequence[NewPlace], *, align: bool = False, encoder: str | None = None) -> Job:
+        """Send many frames in one request, and return the job that enrols them.
+
+        Args:
+            places: all are read twice; none of them is kept in memory.
+            align: whether the job then finds which frames show places that the map had already.
+            encoder: name or identity that the map must have.
+
+        Raises:
+            InvalidFrame: a frame cannot be read; nothing is enrolled.
+        """
+        options = {"align": align or None, "encoder": encoder}
+        return enrol_by_job(self.connection.lasting(PATIENCE), self.path + "/places", places, options)
 
     def query_or_enrol(
         self,
@@ -302,7 +367,7 @@ class Map:
         *,
         overwrite: bool = False,
         known: str | None = None,
-        progress: Any = None,
+        progress: Progress | None = None,
     ) -> str | None:
         """Download the map as a file; a download that was broken off goes on where it was.
 
@@ -318,9 +383,7 @@ class Map:
         Raises:
             TransferFailed: the file exists, cannot be written, or is damaged.
         """
-        from placerec_client._sync.transfers import export
-
-        return export(self.connection, self.path, path, overwrite, known, progress)
+        return export(self.connection.lasting(TRANSFER_PATIENCE), self.path, path, overwrite, known, progress)
 
     def _job(self, path: str, **options: Any) -> Job:
         return Job.submit(self.connection, path, **options)

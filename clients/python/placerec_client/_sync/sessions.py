@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Self, Unpack
 
 from placerec_client import models, parameters, problems
 from placerec_client._sync.connection import Connection
+from placerec_client._sync.numbering import Numbering
+from placerec_client.errors import PlacerecError
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import quoted
 
@@ -58,7 +60,7 @@ class Session:
 
     def __init__(self, connection: Connection, path: str, options: parameters.NewSession, session_id: str = "") -> None:
         self._connection, self._sessions, self._options, self.id = connection, path, options, session_id
-        self._next: int | None = None if session_id else 0
+        self._numbering = Numbering(connection, self.path, None) if session_id else None
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.id!r})"
@@ -77,6 +79,7 @@ class Session:
         """Begin the session. If the answer to an attempt is lost, the session of that attempt ends by itself."""
         view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
         self.id = view.id
+        self._numbering = Numbering(self._connection, self.path, 0)
         return view
 
     def end(self) -> None:
@@ -112,7 +115,7 @@ class Session:
             models.SessionAnswer,
             "POST",
             self.path + "/frames",
-            params=self.numbered(options),
+            params=self._numbers().number(options),
             content=data,
             media_type=media_type(data),
             deadline=deadline,
@@ -131,18 +134,12 @@ class Session:
         """
         from placerec_client._sync.streams import Stream
 
-        return Stream(self._connection, self)
+        return Stream(self._connection, self.path + "/stream", self._numbers())
 
-    def numbered(self, options: parameters.SendFrame) -> parameters.SendFrame:
-        """Return the options of a frame with its number."""
-        given = options.get("frame")
-        if given is None:
-            if self._next is None:  # a session that was begun elsewhere
-                last = (self.read()).last_frame
-                self._next = 0 if last is None else last + 1
-            given = self._next
-        self._next = given + 1
-        return {**options, "frame": given}
+    def _numbers(self) -> Numbering:
+        if self._numbering is None:
+            raise PlacerecError("The session has not begun: enter it, or call begin().")
+        return self._numbering
 
     @property
     def path(self) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import uuid
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import Any, Self, Unpack
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
@@ -14,14 +14,12 @@ from websockets.sync.client import ClientConnection, connect
 from placerec_client import models, parameters, problems
 from placerec_client._sync.concurrency import received, sleep
 from placerec_client._sync.connection import Connection
+from placerec_client._sync.numbering import Numbering
 from placerec_client.answers import OVERLOADED, parsed, problem_of
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem, UnexpectedAnswer
 from placerec_client.frames import Frame, frame_bytes
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
-
-if TYPE_CHECKING:
-    from placerec_client._sync.sessions import Session
 
 CONNECT_SECONDS = 5.0
 MOST_BYTES = 64 << 20
@@ -35,8 +33,8 @@ class Stream:
     the same number, so that it counts once.
     """
 
-    def __init__(self, connection: Connection, session: Session) -> None:
-        self._connection, self._session = connection, session
+    def __init__(self, connection: Connection, path: str, numbering: Numbering) -> None:
+        self._connection, self._path, self._numbering = connection, path, numbering
         self._socket: ClientConnection | None = None
 
     def __enter__(self) -> Self:
@@ -68,7 +66,7 @@ class Stream:
                 ``UnknownSession``.
         """
         data = frame_bytes(image)
-        numbered = self._session.numbered(options)
+        numbered = self._numbering.number(options)
         head = dumps({name: _field(name, value) for name, value in numbered.items() if value is not None})
         retry = self._connection.retry
         clock = Clock(deadline, retry)
@@ -112,7 +110,7 @@ class Stream:
     def _connected(self, limit: float) -> ClientConnection:
         headers = [(name.decode(), value.decode()) for name, value in self._connection.headers if name != b"Host"]
         headers.append(("X-Request-Id", uuid.uuid4().hex))
-        address = "ws" + self._connection.url.removeprefix("http") + self._session.path + "/stream"
+        address = "ws" + self._connection.url.removeprefix("http") + self._path
         try:
             return connect(
                 address,
