@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
-from placerec_client import Client, ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
+from placerec_client import Client, DeadlineExceeded, PlacerecError, Problem
 
 from placerec_ros.frame_queue import Frame, FrameQueue
 from placerec_ros.health import ERROR, OK, Health
@@ -208,17 +208,15 @@ class Localizer:
             step()
         except UnfitPicture as error:
             self._health.frame(f"{_sentence(str(error))}")
-        except Problem as problem:
-            self._heard = time.monotonic()
-            self._health.over("service")
-            self._told(problem)
         except PlacerecError as error:
             self._heard = time.monotonic()  # the next check of an idle node comes later
-            late = isinstance(error, DeadlineExceeded)
-            reason = "did not answer in time" if late else "cannot be reached"
-            self._health.fact("service", f"{self._settings.url}: {reason}")
-            self._health.begins("service", f"The service at {self._settings.url} {reason}: {error}", ERROR)
-            if not late:
+            reason = reason_of(error)
+            if isinstance(reason, Problem):
+                self._health.over("service")
+                self._told(reason)
+            else:
+                self._health.fact("service", str(reason))
+                self._health.begins("service", str(reason), ERROR)
                 self._rest_longer()
         except Exception as error:  # the thread has to live on
             self._run = None
@@ -352,7 +350,7 @@ class Localizer:
         try:
             png = run.picture(picture)
         except PlacerecError as error:
-            self._health.begins("picture", f"There is no annotated picture: {error}")
+            self._health.begins("picture", f"There is no annotated picture: {reason_of(error)}")
             return
         self._health.over("picture")
         if png is not None and generation == self._generation:
@@ -372,13 +370,12 @@ class Localizer:
             return command()
         except UnfitPicture as error:
             return Done(False, _sentence(str(error)))
-        except Problem as problem:
-            hint = " Send the node a key that may." if problem.slug in NOT_ALLOWED else ""
-            return Done(False, f"The service refuses: {problem}{hint} ({problem.slug})")
-        except ConnectionFailed as error:
-            return Done(False, f"The service at {self._settings.url} cannot be reached: {error}")
         except PlacerecError as error:
-            return Done(False, str(error))
+            reason = reason_of(error)
+            if not isinstance(reason, Problem):
+                return Done(False, str(reason))
+            hint = " Give the node a key that may." if reason.slug in NOT_ALLOWED else ""
+            return Done(False, f"The service refuses: {reason}{hint} ({reason.slug})")
         except Exception as error:  # the thread has to live on
             return Done(False, f"The node failed with {type(error).__name__}: {error}")
 
@@ -429,6 +426,12 @@ class Localizer:
     def _present(self) -> Frame | None:
         frame = self._latest
         return frame if frame is not None and time.monotonic() - frame.arrived <= FRESH else None
+
+
+def reason_of(error: PlacerecError) -> PlacerecError:
+    """Why the last attempt failed, which a request with a deadline has behind the deadline."""
+    cause = error.__cause__
+    return cause if isinstance(error, DeadlineExceeded) and isinstance(cause, PlacerecError) else error
 
 
 def _sentence(text: str) -> str:

@@ -35,12 +35,13 @@ def until_answered(robot: Robot, number: int) -> None:
     until(lambda: (robot.look(number=number), robot.peer.do("sleep", seconds=0.1), robot.peer.take("answer"))[-1])
 
 
-def test_a_service_that_was_killed_is_found_again(driving: Robot) -> None:
+def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, site = driving, driving.site
     robot.begin(deadline=5.0)
     connected(robot)
     robot.drive(0, 3)
-    headers, settings = dict(site.server.client.headers), {"port": site.server.port}
+    monkeypatch.setattr("tests.service.server.free_port", lambda: port)
+    port = site.server.port
     site.server.kill()
     robot.look(number=3)
     status = robot.says("cannot be reached")
@@ -52,14 +53,12 @@ def test_a_service_that_was_killed_is_found_again(driving: Robot) -> None:
     robot.peer.take("pose")
     robot.says("cannot be reached")
     assert robot.peer.take("pose") == [], "no old pose is repeated"
-    site.server = Server(site.folder / "service", settings)
-    site.server.client.headers.update(headers)
-    site.server.wait()
+    site.server = Server(site.folder / "service", key=site.keys["admin"]).wait()
     until_answered(robot, 3)
     robot.says("The verdict is")
     robot.answers_settled()
     assert robot.asked(4)["verdict"] == "recognized"
-    assert robot.log().count("cannot be reached") == 2, "when it began, and when it was over"
+    assert robot.log().count(f"{site.url} cannot be reached") == 2, "when it began, and when it was over"
 
 
 def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
