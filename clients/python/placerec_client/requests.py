@@ -31,6 +31,8 @@ def text_of(name: str, value: Any) -> str:
     """One parameter as text: numbers in full, times in ISO 8601, lists with commas, objects as JSON."""
     if isinstance(value, str):
         return value
+    if getattr(value, "ndim", None) == 0:  # a number of NumPy, whose text is not the number's
+        value = value.item()
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, date):  # or a datetime

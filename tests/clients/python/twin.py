@@ -20,6 +20,7 @@ NAMES = {
     "_async": "_sync",
     "aread": "read",
     "aclose": "close",
+    "aclosing": "closing",
     "aiter_bytes": "iter_bytes",
     "aiter_lines": "iter_lines",
     "asyncio": "sync",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from placerec_client import models
@@ -51,7 +51,7 @@ class AsyncBatches(ABC, Generic[Item, Outcome]):
     def begin(self, batch: AsyncBatch[Item, Outcome], before: AsyncSent[Outcome] | None) -> AsyncSent[Outcome]:
         """Begin to send a batch, after the one that is under way."""
 
-    async def run(self) -> AsyncIterator[Outcome]:
+    async def run(self) -> AsyncGenerator[Outcome]:
         """Yield the outcomes.
 
         Raises:

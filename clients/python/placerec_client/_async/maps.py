@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Container, Iterable, Mapping, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Container, Iterable, Mapping, Sequence
+from contextlib import aclosing
 from typing import Any, Literal, Unpack, overload
 
 from placerec_client import models, parameters, problems
@@ -190,7 +191,7 @@ class AsyncMap:
 
     async def query_batch(
         self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]
-    ) -> AsyncIterator[Located]:
+    ) -> AsyncGenerator[Located]:
         """Ask where many frames were taken; yield the answers in their order.
 
         The frames are read a batch ahead, and batches are as large as the service is fast. Those that were answered
@@ -201,8 +202,9 @@ class AsyncMap:
             options: as of ``query``; they hold for every frame.
         """
         queries = AsyncQueries(self.connection.lasting(PATIENCE), self.path + "/query:batch", frames, options)
-        async for located in queries.run():
-            yield located
+        async with aclosing(queries.run()) as answers:
+            async for located in answers:
+                yield located
 
     async def enrol(
         self,
@@ -210,7 +212,7 @@ class AsyncMap:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
-    ) -> AsyncIterator[Enrolled]:
+    ) -> AsyncGenerator[Enrolled]:
         """Enrol many frames in their order, and yield what became of each.
 
         It can be broken off and called again with the same frames: those that the map holds already are neither sent
@@ -232,8 +234,10 @@ class AsyncMap:
             known = {place.id async for place in self.places.list()}
         options = {"encoder": encoder}
         lasting = self.connection.lasting(PATIENCE)
-        async for outcome in AsyncEnrolment(lasting, self.path + "/places", places, known, options).run():
-            yield outcome
+        enrolment = AsyncEnrolment(lasting, self.path + "/places", places, known, options)
+        async with aclosing(enrolment.run()) as outcomes:
+            async for outcome in outcomes:
+                yield outcome
 
     async def enrol_by_job(
         self, places: Sequence[NewPlace], *, align: bool = False, encoder: str | None = None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from placerec_client import models
@@ -52,7 +52,7 @@ class Batches(ABC, Generic[Item, Outcome]):
     def begin(self, batch: Batch[Item, Outcome], before: Sent[Outcome] | None) -> Sent[Outcome]:
         """Begin to send a batch, after the one that is under way."""
 
-    def run(self) -> Iterator[Outcome]:
+    def run(self) -> Generator[Outcome]:
         """Yield the outcomes.
 
         Raises:

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from typing import Any, Literal, Unpack, overload
 
 from placerec_client import models, parameters, problems
@@ -189,7 +190,7 @@ class Map:
         )
         return parsed(models.QueryAnswer, response.content)
 
-    def query_batch(self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]) -> Iterator[Located]:
+    def query_batch(self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]) -> Generator[Located]:
         """Ask where many frames were taken; yield the answers in their order.
 
         The frames are read a batch ahead, and batches are as large as the service is fast. Those that were answered
@@ -200,8 +201,9 @@ class Map:
             options: as of ``query``; they hold for every frame.
         """
         queries = Queries(self.connection.lasting(PATIENCE), self.path + "/query:batch", frames, options)
-        for located in queries.run():
-            yield located
+        with closing(queries.run()) as answers:
+            for located in answers:
+                yield located
 
     def enrol(
         self,
@@ -209,7 +211,7 @@ class Map:
         *,
         known: Container[str] | None = None,
         encoder: str | None = None,
-    ) -> Iterator[Enrolled]:
+    ) -> Generator[Enrolled]:
         """Enrol many frames in their order, and yield what became of each.
 
         It can be broken off and called again with the same frames: those that the map holds already are neither sent
@@ -231,8 +233,10 @@ class Map:
             known = {place.id for place in self.places.list()}
         options = {"encoder": encoder}
         lasting = self.connection.lasting(PATIENCE)
-        for outcome in Enrolment(lasting, self.path + "/places", places, known, options).run():
-            yield outcome
+        enrolment = Enrolment(lasting, self.path + "/places", places, known, options)
+        with closing(enrolment.run()) as outcomes:
+            for outcome in outcomes:
+                yield outcome
 
     def enrol_by_job(self, places: Sequence[NewPlace], *, align: bool = False, encoder: str | None = None) -> Job:
         """Send many frames in one request, and return the job that enrols them.
