@@ -1,16 +1,17 @@
 """Start the node and bring it to the state active.
 
-    ros2 launch placerec_ros placerec.launch.py map:=lab image:=/camera/image_raw/compressed
+ros2 launch placerec_ros placerec.launch.py map:=lab image:=/camera/image_raw/compressed
 """
 
 from pathlib import Path
 
 from ament_index_python.packages import get_package_share_directory
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import LifecycleNode
 from launch_ros.parameter_descriptions import ParameterValue
+
+from launch import LaunchDescription
 
 PARAMETERS = Path(get_package_share_directory("placerec_ros")) / "config" / "placerec.yaml"
 

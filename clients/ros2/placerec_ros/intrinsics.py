@@ -27,8 +27,8 @@ def intrinsics_of(message: Any, rectified: bool = False) -> dict[str, Any]:
     if not message.width or not message.height:
         raise UnfitCamera("CameraInfo has no width and height: the camera is not calibrated")
     matrix = message.p if rectified else message.k
-    fx, fy, cx, cy = (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (
-        matrix[0], matrix[4], matrix[2], matrix[5]
+    fx, fy, cx, cy = (
+        (matrix[0], matrix[5], matrix[2], matrix[6]) if rectified else (matrix[0], matrix[4], matrix[2], matrix[5])
     )
     if not fx > 0 or not fy > 0:
         raise UnfitCamera(f"CameraInfo has a focal length of {fx:g} by {fy:g}: the camera is not calibrated")

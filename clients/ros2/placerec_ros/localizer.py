@@ -19,7 +19,6 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from placerec_client import Client, DeadlineExceeded, PlacerecError, Problem
-
 from placerec_ros.frame_queue import Frame, FrameQueue
 from placerec_ros.health import ERROR, OK, Health
 from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Increment, Odometer, increment
@@ -292,13 +291,12 @@ class Localizer:
 
     def _running(self) -> Run:
         """The present run; it begins if there is none, and anew when intrinsics come or change."""
-        if self._run is not None and self._settings.use_camera_info and self._intrinsics is not None:
-            if self._run.intrinsics != self._intrinsics:
-                self._end_run()
+        known = self._intrinsics if self._settings.use_camera_info else None
+        if self._run is not None and known is not None and self._run.intrinsics != known:
+            self._end_run()
         if self._run is None:
             self._run_generation = self._generation
-            wanted = self._intrinsics if self._settings.use_camera_info else None
-            self._run = Run(self._open(), self._settings, self._health, wanted)
+            self._run = Run(self._open(), self._settings, self._health, known)
         return self._run
 
     def _moved(self, frame: Frame) -> Increment | None:
@@ -380,7 +378,7 @@ class Localizer:
             return Done(False, f"The node failed with {type(error).__name__}: {error}")
 
     def _create_map(self) -> Done:
-        fields = {"encoder": self._settings.encoder} if self._settings.encoder else {}
+        fields: Any = {"encoder": self._settings.encoder} if self._settings.encoder else {}
         made = self._open().maps.create(self._settings.map, **fields).view
         assert made is not None
         self._paused_until = 0.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from array import array
 from collections.abc import Mapping
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -54,7 +53,9 @@ def picture_message(frame: Frame, png: bytes) -> CompressedImage:
     return message
 
 
-def diagnostics_message(level: int, text: str, values: Mapping[str, str], name: str, url: str, now: Time) -> DiagnosticArray:
+def diagnostics_message(
+    level: int, text: str, values: Mapping[str, str], name: str, url: str, now: Time
+) -> DiagnosticArray:
     """The node's state as ``/diagnostics`` has it."""
     status = DiagnosticStatus(level=bytes([level]), name=name, message=text, hardware_id=url)
     status.values = [KeyValue(key=key, value=value) for key, value in values.items()]

@@ -36,7 +36,10 @@ from placerec_ros.localizer import Answered, Done, Localizer
 from placerec_ros.odometry import stamp_of
 from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, settings
 
-IMAGE_TYPES = {"compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage), "raw": ("sensor_msgs/msg/Image", Image)}
+IMAGE_TYPES = {
+    "compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage),
+    "raw": ("sensor_msgs/msg/Image", Image),
+}
 TICK_SECONDS = 1.0
 SILENCE_SECONDS = 5.0
 """Seconds without an image after which the node says so."""
@@ -207,7 +210,9 @@ class PlacerecNode(LifecycleNode):
             self._drop_images()
             try:
                 self._image_subscription = self._subscribe(fitting[0], "image", self._on_image, sensor_qos(QUEUED))
-            except RCLError as error:  # the middleware has not forgotten the type from before; the next tick tries again
+            except (
+                RCLError
+            ) as error:  # the middleware has not forgotten the type from before; the next tick tries again
                 self.get_logger().debug(f"No subscription yet: {error}")
 
     def _on_image(self, message: Any) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
-from typing import Any
+from typing import Any, Literal, cast
 
 from placerec_client import Client, Problem
 from placerec_client.retry import Retry
-
 from placerec_ros.health import Health
 from placerec_ros.intrinsics import camera_name
 from placerec_ros.odometry import Increment
@@ -37,7 +36,9 @@ class Run:
         intrinsics: of the robot's camera, as the service takes them; None if they are not known.
     """
 
-    def __init__(self, client: Client, settings: Settings, health: Health, intrinsics: Mapping[str, Any] | None) -> None:
+    def __init__(
+        self, client: Client, settings: Settings, health: Health, intrinsics: Mapping[str, Any] | None
+    ) -> None:
         self._client, self._settings, self._health = client, settings, health
         self._map = client.maps[settings.map]
         self._read_map()
@@ -48,7 +49,7 @@ class Run:
             backwards=settings.backwards,
             speed_limit=settings.speed_limit or None,
             camera=self.camera,
-            verify=settings.verify,
+            verify=cast(Literal["auto", "always", "never"], settings.verify),
         )
         self.id = self._session.begin().id
         health.fact("session", self.id)
@@ -74,8 +75,9 @@ class Run:
                 self._health.over("camera")
                 return name
         mask = None if there is None or there.mask is None else there.mask.model_dump(mode="json")
+        definition: Any = {"mask": mask, "intrinsics": dict(intrinsics)}
         try:
-            self._map.cameras.put(name, mask=mask, intrinsics=dict(intrinsics))
+            self._map.cameras.put(name, **definition)
         except Problem as problem:
             if problem.slug not in NOT_ALLOWED and problem.status != 422:
                 raise
@@ -87,7 +89,9 @@ class Run:
 
     def send(self, frame: Any, number: int, stamp: int, moved: Increment | None) -> dict[str, Any]:
         """Send a frame; the service's ``SessionAnswer`` as JSON."""
-        motion = {} if moved is None else {"forward": moved.forward, "left": moved.left, "turn": moved.turn}
+        motion: dict[str, Any] = {}
+        if moved is not None:
+            motion = {"forward": moved.forward, "left": moved.left, "turn": moved.turn}
         answer = self._session.send(
             frame,
             frame=number,

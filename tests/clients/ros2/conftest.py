@@ -8,7 +8,8 @@ import pytest
 
 from service.access.keys import KeyStore
 from tests.clients.ros2.network import NoNetwork, own_network
-from tests.clients.ros2.robot import VENV, Robot, Site, encoded, walk, walked_again
+from tests.clients.ros2.robot import VENV, Robot, Site, walk, walked_again
+from tests.service.scenes import encoded
 from tests.service.server import Server
 
 

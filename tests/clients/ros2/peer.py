@@ -32,7 +32,15 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 KINDS = {kind.__name__: kind for kind in (CompressedImage, Image, CameraInfo, Odometry, String)}
-TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4, "shutdown unconfigured": 5, "shutdown inactive": 6, "shutdown active": 7}  # fmt: skip
+TRANSITIONS = {
+    "configure": 1,
+    "cleanup": 2,
+    "activate": 3,
+    "deactivate": 4,
+    "shutdown unconfigured": 5,
+    "shutdown inactive": 6,
+    "shutdown active": 7,
+}
 BAG_TYPES = {
     "CompressedImage": "sensor_msgs/msg/CompressedImage",
     "CameraInfo": "sensor_msgs/msg/CameraInfo",
@@ -45,7 +53,7 @@ class Peer:
     """The process's node, and what it has heard."""
 
     def __init__(self) -> None:
-        self.node = Node("peer")
+        self.node: Any = Node("peer")
         self.heard: dict[str, list[dict[str, Any]]] = {}
         self._lock = threading.Lock()
         self._publishers: dict[str, Any] = {}
@@ -119,10 +127,30 @@ class Peer:
         """How many subscribe to a topic of this peer."""
         return {"subscribers": self._publishers[topic].get_subscription_count()}
 
+    def publishers(self) -> dict[str, Any]:
+        """To how many publishers of the node each of this peer's recordings is connected."""
+        counts = {topic: made.get_publisher_count() for topic, made in self._subscriptions.items()}
+        return {"publishers": {topic: count for topic, count in counts.items() if not topic.startswith("/")}}
+
     def publish(self, topic: str, kind: str, **fields: Any) -> dict[str, Any]:
         """Publish one message; bytes are named by the path of a file."""
         self._publishers[topic].publish(message_of(kind, fields))
         return {"at": time.time()}
+
+    def ask(self, topic: str, kind: str, **fields: Any) -> dict[str, Any]:
+        """Publish one message, and wait for the node's answer to it; the seconds from the one to the other."""
+        message = message_of(kind, fields)
+        with self._lock:
+            self.heard.pop("answer", None)
+        began = time.time()
+        self._publishers[topic].publish(message)
+        while time.time() < began + PATIENCE:
+            with self._lock:
+                heard = self.heard.get("answer", [])
+                if heard and abs(heard[-1]["stamp"] - fields["stamp"]) < 1e-3:
+                    return {"seconds": heard[-1]["at"] - began, "answer": heard[-1]}
+            time.sleep(0.002)
+        raise TimeoutError("the node did not answer")
 
     def write_bag(self, path: str, messages: list[dict[str, Any]]) -> dict[str, Any]:
         """Write a bag; each message has a topic, a kind and a stamp in seconds."""

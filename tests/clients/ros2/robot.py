@@ -31,7 +31,9 @@ STEPS, SHIFT, WIDTH = 6, 24, 320
 def walk(first: int = 700, pictures: int = 3) -> list[Pixels]:
     """The frames of a walk along drawn walls: the camera moves sideways past each."""
     walls = [scene(first + number, WIDTH + SHIFT * STEPS, 240) for number in range(pictures)]
-    return [np.ascontiguousarray(wall[:, SHIFT * step : SHIFT * step + WIDTH]) for wall in walls for step in range(STEPS)]
+    return [
+        np.ascontiguousarray(wall[:, SHIFT * step : SHIFT * step + WIDTH]) for wall in walls for step in range(STEPS)
+    ]
 
 
 def walked_again(frames: list[Pixels]) -> list[bytes]:
@@ -42,7 +44,11 @@ def walked_again(frames: list[Pixels]) -> list[bytes]:
 def ros_environment(**more: str) -> dict[str, str]:
     """The environment of processes of .venv-ros: ROS keeps to this machine, and logs as it goes."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("PLACEREC_", "ROS_", "RMW_"))}
-    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "RCUTILS_LOGGING_BUFFERED_STREAM": "0", "PYTHONUNBUFFERED": "1"}
+    own = {
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+        "PYTHONUNBUFFERED": "1",
+    }
     return {**kept, **own, **more}
 
 
@@ -111,6 +117,15 @@ class Peer:
         assert "error" not in answer, answer["error"]
         return answer
 
+    def hears(self, count: int) -> None:
+        """Wait until all that it records of the node has so many publishers; what came before would be lost."""
+        until(lambda: set(self.do("publishers")["publishers"].values()) <= {count})
+
+    def connected(self, topic: str) -> None:
+        """Wait until the node subscribes; then a moment more, for it learns of this publisher at about that time."""
+        until(lambda: self.do("subscribers", topic=topic)["subscribers"])
+        time.sleep(0.2)
+
     def take(self, topic: str) -> list[dict[str, Any]]:
         """What it heard on a topic since the last time."""
         heard: list[dict[str, Any]] = self.do("take", topic=topic)["heard"]
@@ -134,7 +149,6 @@ def until(done: Callable[[], Any], patience: float = PATIENCE) -> Any:
         assert time.monotonic() < end, f"not in {patience} s"
         time.sleep(0.05)
     return found
-
 
 
 @dataclass
@@ -205,9 +219,15 @@ class Robot:
         key = str(self.site.folder / f"{role}.key") if role else ""
         own = {"url": self.site.url, "map": "walk", "key_file": key}
         assert self.peer.do("set", values={**defaults, **quiet, **own, **parameters})["refused"] == []
+        self.peer.hears(0)
         assert self.transition("configure")
+        self.peer.hears(1)
         if active:
             assert self.transition("activate")
+
+    def connected(self, topic: str = "/image") -> None:
+        """Wait until the node subscribes to a topic of the peer."""
+        self.peer.connected(topic)
 
     def transition(self, name: str) -> bool:
         """Ask the node for a transition, which takes no longer than a moment."""
@@ -268,9 +288,9 @@ class Robot:
             self.peer.do("sleep", seconds=0.15)
             quiet = 0 if self.peer.take("answer") else quiet + 1
 
-    def asked(self, number: int, **fields: object) -> dict[str, Any]:
+    def asked(self, number: int) -> dict[str, Any]:
         """Publish a frame of the walk, and wait for its answer."""
-        self.look(number=number, **fields)
+        self.look(number=number)
         return self.answers()[0]
 
     def drive(self, start: int, stop: int) -> dict[str, Any]:

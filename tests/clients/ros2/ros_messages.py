@@ -23,9 +23,7 @@ def odometry(stamp: float, x: float, y: float, yaw: float = 0.0, frame_id: str =
         position=SimpleNamespace(x=x, y=y, z=0.0),
         orientation=SimpleNamespace(x=turned[0], y=turned[1], z=turned[2], w=turned[3]),
     )
-    return SimpleNamespace(
-        header=header(stamp, frame_id), child_frame_id="base_link", pose=SimpleNamespace(pose=pose)
-    )
+    return SimpleNamespace(header=header(stamp, frame_id), child_frame_id="base_link", pose=SimpleNamespace(pose=pose))
 
 
 def image(encoding: str, width: int, height: int, data: bytes, step: int = 0, big: int = 0) -> Any:

@@ -26,10 +26,6 @@ def door(driving: Robot) -> Iterator[Door]:
     made.close()
 
 
-def connected(robot: Robot) -> None:
-    until(lambda: robot.peer.do("subscribers", topic="/image")["subscribers"])
-
-
 def until_answered(robot: Robot, number: int) -> None:
     """Show the frame again and again until an answer comes."""
     until(lambda: (robot.look(number=number), robot.peer.do("sleep", seconds=0.1), robot.peer.take("answer"))[-1])
@@ -38,10 +34,10 @@ def until_answered(robot: Robot, number: int) -> None:
 def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, site = driving, driving.site
     robot.begin(deadline=5.0)
-    connected(robot)
+    robot.connected()
     robot.drive(0, 3)
-    monkeypatch.setattr("tests.service.server.free_port", lambda: port)
     port = site.server.port
+    monkeypatch.setattr("tests.service.server.free_port", lambda: port)
     site.server.kill()
     robot.look(number=3)
     status = robot.says("cannot be reached")
@@ -64,7 +60,7 @@ def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: p
 def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", deadline=3.0)
-    connected(robot)
+    robot.connected()
     robot.drive(0, 2)
     door.shut()
     robot.look(number=2)
@@ -73,7 +69,7 @@ def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
     assert robot.transition("deactivate"), "and the node does not"
     assert robot.transition("cleanup")
     robot.begin(url=f"http://127.0.0.1:{door.port}", deadline=3.0)
-    connected(robot)
+    robot.connected()
     robot.look(number=3)
     robot.says("did not answer in time")
     assert robot.peer.take("answer") == []
@@ -85,7 +81,7 @@ def test_a_network_that_was_cut_is_mended(driving: Robot, door: Door) -> None:
 def test_a_service_that_is_cut_off_lets_the_node_end(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", deadline=60.0)
-    connected(robot)
+    robot.connected()
     robot.drive(0, 1)
     door.shut()
     robot.look(number=1)
@@ -102,7 +98,7 @@ def test_a_service_that_is_cut_off_lets_the_node_end(driving: Robot, door: Door)
 def test_what_a_slow_service_cannot_take_is_dropped_oldest_first(driving: Robot, door: Door) -> None:
     robot = driving
     robot.begin(url=f"http://127.0.0.1:{door.port}", queue_length=2)
-    connected(robot)
+    robot.connected()
     robot.drive(0, 1)
     door.shut()
     stamps = [robot.look(number=number) for number in range(1, 10)]
@@ -118,7 +114,7 @@ def test_what_a_slow_service_cannot_take_is_dropped_oldest_first(driving: Robot,
 def test_a_clock_that_is_set_back_begins_a_new_run(driving: Robot) -> None:
     robot = driving
     robot.begin()
-    connected(robot)
+    robot.connected()
     robot.frame = 100
     first = robot.drive(0, 2)
     robot.frame = 99
@@ -135,7 +131,7 @@ def test_a_clock_that_is_set_back_begins_a_new_run(driving: Robot) -> None:
 def test_a_session_that_was_ended_elsewhere_is_begun_anew(driving: Robot) -> None:
     robot, site = driving, driving.site
     robot.begin()
-    connected(robot)
+    robot.connected()
     session = robot.drive(0, 2)["answer"]["session"]
     headers = {"Authorization": f"Bearer {site.keys['admin']}"}
     assert httpx.delete(f"{site.url}/v1/maps/walk/sessions/{session}", headers=headers).status_code == 204

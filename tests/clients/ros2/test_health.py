@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from placerec_ros import health
@@ -31,8 +33,8 @@ def test_troubles_of_frames_are_logged_once_and_shown_for_a_while(monkeypatch: p
     assert logged == ["The encoding is wrong.", "It is torn."]
     level, text, values = state.report()
     assert (level, text, values["frames refused"]) == (WARN, "It is torn.", "51")
-    later = health.time.monotonic() + health.FRAME_TROUBLE_SECONDS
-    monkeypatch.setattr(health.time, "monotonic", lambda: later)
+    later = time.monotonic() + health.FRAME_TROUBLE_SECONDS
+    monkeypatch.setattr(time, "monotonic", lambda: later)
     assert state.report()[0] == OK
 
 

@@ -41,7 +41,7 @@ def test_a_region_of_interest_keeps_every_direction() -> None:
     part = Intrinsics(**intrinsics_of(camera_info(d=[], roi=roi)))
     assert (part.width, part.height) == (500, 400)
     point = np.array([[100.0, 60.0]])
-    np.testing.assert_allclose(part.bearings(point), whole.bearings(point + [40, 20]))
+    np.testing.assert_allclose(part.bearings(point), whole.bearings(point + np.array([40.0, 20.0])))
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import httpx
 import pytest
 
 from placerec_ros.parameters import PARAMETERS
-from tests.clients.ros2.robot import Node, Peer, Robot, Site, encoded, until
-from tests.service.scenes import blank, scene, stranger
+from tests.clients.ros2.robot import Node, Peer, Robot, Site, until
+from tests.service.scenes import blank, encoded, stranger
 
 
 @pytest.fixture
@@ -20,15 +20,9 @@ def image(robot: Robot) -> Robot:
     return robot
 
 
-def connected(robot: Robot, topic: str = "/image") -> None:
-    """Wait until the node subscribes."""
-    until(lambda: robot.peer.do("subscribers", topic=topic)["subscribers"])
-
-
 def over_http(site: Site, frames: list[tuple[int, float, bytes]], **options: Any) -> list[dict[str, Any]]:
     """The answers of a session over HTTP to numbered, stamped frames."""
     from placerec_client import Client
-
     from placerec_ros.run import moment_of
 
     with (
@@ -49,18 +43,26 @@ def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
         "write_bag",
         path=str(bag),
         messages=[
-            {"topic": "/image", "kind": "CompressedImage", "stamp": stamp, "file": str(site.folder / f"again-{at:02d}.jpg")}
+            {
+                "topic": "/image",
+                "kind": "CompressedImage",
+                "stamp": stamp,
+                "file": str(site.folder / f"again-{at:02d}.jpg"),
+            }
             for at, stamp in enumerate(stamps)
         ],
     )
     robot.begin()
-    connected(robot)
+    robot.connected()
     robot.peer.do("play", path=str(bag), wait=True)
     answers = robot.answers(len(stamps))
     by_stamp = {round(stamp, 3): data for stamp, data in zip(stamps, site.again, strict=True)}
     sent = [(one["number"], one["stamp"], by_stamp[round(one["stamp"], 3)]) for one in answers]
     for found, expected in zip(answers, over_http(site, sent), strict=True):
-        assert (found["verdict"], found["place"]) == (expected["verdict"], expected["place"] and expected["place"]["id"])
+        assert (found["verdict"], found["place"]) == (
+            expected["verdict"],
+            expected["place"] and expected["place"]["id"],
+        )
         assert found["probability"] == pytest.approx(expected["probability"], abs=1e-6)
         assert found["answer"]["unknown"] == pytest.approx(expected["unknown"], abs=1e-6)
     assert sum(one["verdict"] == "recognized" for one in answers) >= len(answers) - 3
@@ -81,7 +83,7 @@ def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
 def test_nothing_is_published_while_not_localized(image: Robot) -> None:
     robot = image
     robot.begin()
-    connected(robot)
+    robot.connected()
     assert robot.drive(0, 3)["verdict"] == "recognized"
     until(lambda: robot.peer.take("pose"))
     last = robot.answers_to([encoded(stranger(40 + number)) for number in range(4)])[-1]
@@ -98,7 +100,7 @@ def test_nothing_is_published_while_not_localized(image: Robot) -> None:
 def test_a_late_subscriber_hears_no_old_pose(image: Robot) -> None:
     robot = image
     robot.begin()
-    connected(robot)
+    robot.connected()
     robot.drive(0, 3)
     until(lambda: robot.peer.take("pose"))
     robot.peer.do("deafen", topic="pose")
@@ -122,14 +124,14 @@ def test_every_transition_is_clean(image: Robot) -> None:
         robot.begin(active=False)
         robot.look(number=0)
         assert robot.transition("activate")
-        connected(robot)
+        robot.connected()
         assert robot.asked(1)["place"] == "p01"
         assert robot.transition("deactivate")
         assert robot.peer.do("subscribers", topic="/image")["subscribers"] == 0
         robot.look(number=2)
         assert not robot.peer.do("call", service="relocalize")["success"]
         assert robot.transition("activate")
-        connected(robot)
+        robot.connected()
         assert robot.asked(3)["answer"]["frames"] == 1, "a new run"
         assert robot.transition("deactivate")
         assert robot.transition("cleanup")
@@ -163,7 +165,7 @@ def test_a_node_that_starts_by_itself(image: Robot) -> None:
     words = {"PLACEREC_KEY": robot.site.keys["query"]}
     node = Node(robot.site.folder / "own", parameters, name="other", **words)
     try:
-        connected(robot)
+        robot.connected()
         robot.peer.do("listen", topic="answer", node="other")
         robot.look(number=0)
         assert until(lambda: robot.peer.take("answer"))[0]["place"] == "p00"
@@ -193,13 +195,13 @@ def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) ->
     finally:
         other.stop()
     robot.peer.do("advertise", topic="/image", kind="Image")
-    connected(robot)
+    robot.connected()
     rgb = robot.site.file("raw", cv2.cvtColor(robot.site.frames[4], cv2.COLOR_BGR2RGB).tobytes())
     shape: dict[str, object] = {"width": 320, "height": 240, "stamp": robot.BASE}
     robot.peer.do("publish", topic="/image", kind="Image", encoding="rgb8", file=rgb, **shape)
     assert robot.answers()[0]["place"] == "p04"
     robot.peer.do("advertise", topic="/image", kind="CompressedImage")
-    connected(robot)
+    robot.connected()
     assert robot.asked(5)["place"] == "p05"
     assert robot.log().count("has the type std_msgs") == 2, "when it began, and when it was over"
 
@@ -207,7 +209,7 @@ def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) ->
 def test_pictures_that_cannot_be_used_are_said_once(image: Robot) -> None:
     robot = image
     robot.begin()
-    connected(robot)
+    robot.connected()
     robot.drive(0, 2)
     whole = robot.site.again[2]
     for _ in range(3):
@@ -224,7 +226,7 @@ def test_pictures_that_cannot_be_used_are_said_once(image: Robot) -> None:
 def test_raw_pictures_of_a_wrong_encoding_are_said_once(robot: Robot) -> None:
     robot.peer.do("advertise", topic="/image", kind="Image")
     robot.begin(image_type="raw")
-    connected(robot)
+    robot.connected()
     depth, grey = robot.site.file("depth", b"\1" * 2 * 320 * 240), robot.site.file("grey", b"\1" * 320 * 240)
     for number in range(3):
         fields: dict[str, object] = {"width": 320, "height": 240, "stamp": robot.BASE + number}
@@ -245,8 +247,8 @@ def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
     server.client.put("/v1/maps/walk/cameras/front", json={"mask": mask}).raise_for_status()
     robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
     robot.begin(use_camera_info=True, camera="front")
-    connected(robot)
-    connected(robot, "/camera_info")
+    robot.connected()
+    robot.connected("/camera_info")
     camera_info(robot)
     until(lambda: "frames answered" in (robot.look(number=0), robot.says("")["values"])[1])
     made = server.client.get("/v1/maps/walk/cameras/front").json()
@@ -255,15 +257,17 @@ def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
     robot.peer.take("answer")
     assert robot.asked(1)["answer"]["single"]["pose"].get("note") is None
     camera_info(robot, fx=310.0)
-    until(lambda: robot.asked(2) and server.client.get("/v1/maps/walk/cameras/front").json()["intrinsics"]["fx"] == 310.0)
+    until(
+        lambda: robot.asked(2) and server.client.get("/v1/maps/walk/cameras/front").json()["intrinsics"]["fx"] == 310.0
+    )
 
 
 def test_without_camera_info_it_goes_on_and_says_so(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
     robot.begin(use_camera_info=True)
-    connected(robot)
-    connected(robot, "/camera_info")
+    robot.connected()
+    robot.connected("/camera_info")
     until(lambda: (robot.look(number=0), robot.peer.take("answer"))[1])
     assert "No CameraInfo has come on /camera_info" in robot.says("CameraInfo")["message"]
     camera_info(robot, fx=0.0)
@@ -282,8 +286,8 @@ def test_a_key_that_may_not_define_cameras_is_said(image: Robot) -> None:
     robot = image
     robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
     robot.begin(use_camera_info=True, role="query")
-    connected(robot)
-    connected(robot, "/camera_info")
+    robot.connected()
+    robot.connected("/camera_info")
     camera_info(robot, fx=333.0)
     until(lambda: (robot.look(number=0), robot.peer.take("answer"))[1])
     said = robot.says("could not be sent to the map")
@@ -303,8 +307,8 @@ def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None
     robot = image
     robot.peer.do("advertise", topic="/odom", kind="Odometry")
     robot.begin()
-    connected(robot)
-    connected(robot, "/odom")
+    robot.connected()
+    robot.connected("/odom")
     answer: dict[str, Any] = {}
     for number in range(6):
         odometry(robot, -2.0, 5.0 - number, -90.0)
@@ -323,8 +327,8 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.peer.do("advertise", topic="/odom", kind="Odometry")
     robot.begin(map="made", role="admin", sequence="patrol")
-    connected(robot)
-    connected(robot, "/odom")
+    robot.connected()
+    robot.connected("/odom")
     robot.look(number=0)
     assert "unknown-map" in robot.says("The service refuses")["message"]
     assert robot.peer.do("call", service="create_map")["success"]
@@ -349,8 +353,8 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
     assert {one["sequence"] for one in places} == {"patrol"}
     assert robot.transition("deactivate") and robot.transition("cleanup")
     robot.begin(map="made", role="enrol")
-    connected(robot)
-    connected(robot, "/odom")
+    robot.connected()
+    robot.connected("/odom")
     odometry(robot, 50.0, 50.0, 0.0)
     robot.look(encoded(stranger(77)))
     robot.answers_settled()
@@ -361,7 +365,7 @@ def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
 def test_relocalize_forgets_the_belief(image: Robot) -> None:
     robot = image
     robot.begin()
-    connected(robot)
+    robot.connected()
     before = robot.drive(0, 3)
     done = robot.peer.do("call", service="relocalize")
     assert done["success"], done["message"]
@@ -373,7 +377,7 @@ def test_relocalize_forgets_the_belief(image: Robot) -> None:
 def test_annotated_pictures_are_made_for_those_who_look(image: Robot) -> None:
     robot, server = image, image.site.server
     robot.begin(picture_period=0.1)
-    connected(robot)
+    robot.connected()
     robot.drive(0, 2)
 
     def queries() -> int:
@@ -403,11 +407,11 @@ def test_annotated_pictures_are_made_for_those_who_look(image: Robot) -> None:
     ],
 )
 def test_what_the_service_refuses_is_said_and_tried_again(
-    image: Robot, role: str, parameters: dict[str, object], said: str
+    image: Robot, role: str, parameters: dict[str, Any], said: str
 ) -> None:
     robot = image
     robot.begin(role=role, **parameters)
-    connected(robot)
+    robot.connected()
     robot.look(number=0)
     status = robot.says(said)
     assert status["level"] == 2

@@ -73,7 +73,9 @@ def table() -> str:
         reach = ", ".join(f"`{choice}`" for choice in one.choices)
         if one.least is not None and one.most is not None:
             reach = f"{one.least:g} to {one.most:g}"
-        default = "" if one.default == "" else f"`{one.default if isinstance(one.default, str) else json.dumps(one.default)}`"
+        default = (
+            "" if one.default == "" else f"`{one.default if isinstance(one.default, str) else json.dumps(one.default)}`"
+        )
         rows.append(f"| `{one.name}` | {default} | {reach} | {one.description} |")
     return "\n".join(rows)
 

@@ -53,8 +53,13 @@ def test_rows_may_have_padding() -> None:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "code"), [("uyvy", cv2.COLOR_YUV2BGR_UYVY), ("yuv422", cv2.COLOR_YUV2BGR_UYVY), ("yuyv", cv2.COLOR_YUV2BGR_YUY2)]
-)  # fmt: skip
+    ("encoding", "code"),
+    [
+        ("uyvy", cv2.COLOR_YUV2BGR_UYVY),
+        ("yuv422", cv2.COLOR_YUV2BGR_UYVY),
+        ("yuyv", cv2.COLOR_YUV2BGR_YUY2),
+    ],
+)
 def test_paired_colours_are_those_of_opencv(encoding: str, code: int) -> None:
     data = np.random.default_rng(3).integers(0, 256, (48, 64, 2)).astype(np.uint8)
     found = pixels_of(image(encoding, 64, 48, data.tobytes())).astype(int)
