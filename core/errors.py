@@ -112,6 +112,10 @@ class UnknownPlace(PlacerecError):
     """The map has no place with this id."""
 
 
+class TooManyToForget(PlacerecError):
+    """More places fulfil the conditions than may be forgotten at once; none was."""
+
+
 class UnknownSequence(PlacerecError):
     """The map has no place in this sequence."""
 
@@ -168,6 +172,21 @@ class InvalidArchive(PlacerecError):
 
 class ArchiveTooNew(PlacerecError):
     """An export was written by a later version of placerec."""
+
+
+# Recordings
+
+
+class InvalidRecording(PlacerecError):
+    """A bag, a video or a folder cannot be read, or holds no frame."""
+
+
+class UnknownTopic(PlacerecError):
+    """A bag has no such topic, the topic has another type, or several topics could be meant."""
+
+
+class InvalidTrajectory(PlacerecError):
+    """A trajectory file cannot be read, a line of it is malformed, or it does not fit the frames."""
 
 
 # Evaluation

@@ -103,7 +103,16 @@ OPERATIONS: dict[str, Rule] = {
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
+    "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
     "read_metrics": Rule("query", "all"),  # its series name all maps
+    # Keys and the audit trail: they tell of all maps, and of everybody
+    "read_own_key": Rule("query", "none"),
+    "list_keys": Rule("admin", "all"),
+    "create_key": Rule("admin", "all", changes=True),
+    "read_key": Rule("admin", "all"),
+    "narrow_key": Rule("admin", "all", changes=True),
+    "revoke_key": Rule("admin", "all", changes=True),
+    "read_audit": Rule("admin", "all"),
     # Maps
     "list_maps": Rule("query", "shown"),
     "read_map": Rule("query", "path"),
@@ -117,9 +126,11 @@ OPERATIONS: dict[str, Rule] = {
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
     "forget_place": Rule("enrol", "path", changes=True),
+    "forget_places": Rule("enrol", "path", changes=True),
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path"),
+    "read_plan": Rule("query", "path"),
     "list_sequences": Rule("query", "path"),
     "delete_sequence": Rule("enrol", "path", changes=True),
     "list_cameras": Rule("query", "path"),
@@ -131,6 +142,8 @@ OPERATIONS: dict[str, Rule] = {
     "query_batch": Rule("query", "path"),
     "query_maps": Rule("query", "named"),  # without names it asks the key's maps
     "query_or_enrol": Rule("enrol", "path", changes=True),
+    "list_answers": Rule("query", "path"),
+    "list_place_matches": Rule("query", "path"),
     "see_explanation": Rule("query", "path"),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
@@ -141,6 +154,7 @@ OPERATIONS: dict[str, Rule] = {
     "stream_frames": Rule("query", "path"),
     "align_map": Rule("enrol", "path", changes=True),  # it changes of places what an edit of each could change
     # Upkeep: it changes the answers to all robots, or takes long
+    "read_calibration": Rule("query", "path"),
     "calibrate_map": Rule("admin", "path", changes=True),
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too

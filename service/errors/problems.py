@@ -96,8 +96,10 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownMap: Kind(404, "unknown-map", "The map does not exist"),
     errors.MapExists: Kind(409, "map-exists", "A map of this id already exists"),
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
+    errors.TooManyToForget: Kind(422, "too-many-to-forget", "Too many places would be forgotten at once"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
+    faults.PlanTooLarge: Kind(422, "plan-too-large", "The plan would list too many places"),
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
     errors.NoThumbnail: Kind(404, "no-thumbnail", "The map keeps no picture of the place"),
     errors.CalibrationImpossible: Kind(422, "calibration-impossible", "The map cannot be calibrated with these frames"),
@@ -132,6 +134,9 @@ KINDS: dict[type[Exception], Kind] = {
     faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
     faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
     # Traverses on disk, which only the command line reads
+    errors.InvalidRecording: Kind(422, "invalid-recording", "The recording cannot be used"),
+    errors.UnknownTopic: Kind(404, "unknown-topic", "The bag has no such topic"),
+    errors.InvalidTrajectory: Kind(422, "invalid-trajectory", "The trajectory cannot be used"),
     errors.MissingExtra: Kind(503, "missing-extra", "A package is not installed"),
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is not a traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
@@ -171,6 +176,12 @@ KINDS: dict[type[Exception], Kind] = {
     faults.MapForbidden: Kind(403, "map-forbidden", "The key is limited to other maps"),
     faults.ForeignPage: Kind(403, "foreign-page", "Requests from other web sites are refused"),
     faults.RateExceeded: Kind(429, "rate-exceeded", "Too many requests a second"),
+    faults.UnknownKey: Kind(404, "unknown-key", "The key does not exist"),
+    faults.KeyExists: Kind(409, "key-exists", "Another key has this name"),
+    faults.KeyEnded: Kind(409, "key-ended", "The key is revoked or has expired"),
+    faults.KeyWidened: Kind(409, "key-widened", "A key can only be narrowed"),
+    faults.LastAdminKey: Kind(409, "last-admin-key", "No key could manage the service any more"),
+    faults.TooManyKeys: Kind(409, "too-many-keys", "No more keys can be created"),
     faults.KeysUnreadable: Kind(503, "keys-unreadable", "The keys cannot be read"),
 }
 

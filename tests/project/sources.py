@@ -8,7 +8,16 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 CLIENT = ROOT / "clients" / "python"
-FOLDERS = ("core", "service", "training", "benchmarks", "clients/python/placerec_client", "examples", "scripts", "tests")
+FOLDERS = (
+    "core",
+    "service",
+    "training",
+    "benchmarks",
+    "clients/python/placerec_client",
+    "examples",
+    "scripts",
+    "tests",
+)
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 

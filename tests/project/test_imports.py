@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tests.project.sources import CLIENT, FILES, FOLDERS, ROOT, forbidden_imports, imports_of, module_of
+from tests.project.sources import CLIENT, FILES, FOLDERS, OF_CLIENT, ROOT, forbidden_imports, imports_of, module_of
 from tests.project.test_lock import locked
 
 MOST_MODULES = 16
@@ -76,7 +76,7 @@ def test_examples_know_nothing_of_the_project() -> None:
 def test_the_client_knows_nothing_of_the_project() -> None:
     """It is installed where nothing else of the project is."""
     forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
-    assert forbidden_imports("clients/python/placerec_client", forbidden) == []
+    assert forbidden_imports(OF_CLIENT, forbidden) == []
 
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -103,7 +103,11 @@ def allowed(path: Path) -> set[str]:
 
 
 def test_what_is_imported_is_declared() -> None:
-    known = set(sys.stdlib_module_names) | {Path(folder).name for folder in FOLDERS} | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    known = (
+        set(sys.stdlib_module_names)
+        | {Path(folder).name for folder in FOLDERS}
+        | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    )
     distributions = packages_distributions()
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"

@@ -67,7 +67,7 @@ def test_the_client_is_that_of_the_checkout() -> None:
     from placerec_client.version import VERSION
 
     wanted = declared(PROJECT["project"]["dependencies"])["placerec-client"]
-    assert wanted.specifier.contains(VERSION) and VERSION == PROJECT["project"]["version"]
+    assert wanted.specifier.contains(VERSION) and PROJECT["project"]["version"] == VERSION
     assert all("placerec-client" not in locked(name) for name in ("service", "development"))
 
 

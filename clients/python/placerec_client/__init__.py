@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         TransferFailed,
         UnexpectedAnswer,
     )
+    from placerec_client.events import MapEvent
     from placerec_client.frames import Frame, Picture
     from placerec_client.retry import Retry
 
@@ -59,6 +60,7 @@ __all__ = [
     "JobCancelled",
     "Located",
     "Map",
+    "MapEvent",
     "NewPlace",
     "Picture",
     "PlacerecError",
@@ -87,6 +89,7 @@ _MODULES = {
         *("ConnectionFailed", "DeadlineExceeded", "InvalidFrame", "JobCancelled", "PlacerecError", "Problem"),
         *("TransferFailed", "UnexpectedAnswer"),
     ),
+    "events": ("MapEvent",),
     "frames": ("Frame", "Picture"),
     "retry": ("Retry",),
 }

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
+
+from placerec_client.errors import UnexpectedAnswer
 
 MOST_BYTES = 16 << 20
 """Bytes of one event, beyond which the stream is not believed."""
@@ -17,6 +21,36 @@ class Event:
     data: str
     id: str | None
 
+    def json(self) -> dict[str, Any]:
+        """The data as an object.
+
+        Raises:
+            UnexpectedAnswer: it is none.
+        """
+        try:
+            found = json.loads(self.data)
+        except ValueError as error:
+            raise UnexpectedAnswer(f"An event is not JSON: {error}") from error
+        if not isinstance(found, dict):
+            raise UnexpectedAnswer("An event is not a JSON object.")
+        return found
+
+
+@dataclass(frozen=True)
+class MapEvent:
+    """What happened in a map.
+
+    Attributes:
+        kind: ``query``, ``enrolment``, ``session``, ``job`` or ``map``; of the stream itself, ``listening`` or
+            ``missed``.
+        id: by which the stream is taken up again.
+        data: the fields that docs/reference/events.md lists.
+    """
+
+    kind: str
+    id: str | None
+    data: dict[str, Any]
+
 
 class Reader:
     """Takes the events from the chunks of a stream."""
@@ -28,12 +62,12 @@ class Reader:
         """Yield the events that a chunk completes.
 
         Raises:
-            ValueError: an event is longer than any service sends.
+            UnexpectedAnswer: an event is longer than any service sends.
         """
-        self._waiting += chunk.replace(b"\r\n", b"\n")
+        self._waiting = (self._waiting + chunk).replace(b"\r\n", b"\n")
         *whole, self._waiting = self._waiting.split(b"\n\n")
         if len(self._waiting) > MOST_BYTES:
-            raise ValueError("An event is too long.")
+            raise UnexpectedAnswer("An event is too long.")
         for block in whole:
             event = _event(block.decode("utf-8", "replace"))
             if event.data:

@@ -92,6 +92,29 @@ class AnswersView(Model):
     unknown_trend: TrendView | None = None
 
 
+class AuditEntry(Model, extra="allow"):
+    """One line of the audit trail, with whatever else it says, such as `place`, `change` or `problem`."""
+
+    time: str
+    event: str
+    operation: str | None = None
+    status: int | None = None
+    principal: str | None = None
+    key: str | None = None
+    client: str | None = None
+    request_id: str | None = None
+    map: str | None = None
+    job: str | None = None
+
+
+class AuditPage(Model):
+    """A part of the audit trail, the latest line first."""
+
+    items: list[AuditEntry]
+    next_cursor: str | None = None
+    source: Known[Literal["file", "memory"]]
+
+
 class Problem(Model, extra="allow"):
     """What went wrong, for a program (``type``, ``status``) and for a person (``title``, ``detail``)."""
 
@@ -469,6 +492,47 @@ class CalibrationReport(Model):
     warnings: list[str]
 
 
+class Mix(Model):
+    """How many queries had each verdict."""
+
+    recognized: int
+    ambiguous: int
+    unknown: int
+
+
+class Effect(Model):
+    """What a calibration does with queries whose truth is known. The calibration may have been fitted to the same
+    queries, so these figures are a little too good; those of :class:`Measurement` are cross-validated. A best match
+    that does not stand out counts as unknown, also where rivals explain it.
+    """
+
+    threshold: float
+    margin: float
+    verdicts: Mix
+    precision: Share
+    recall: Share
+    false_accept_rate: Share
+    reliability: Reliability | None = None
+
+
+class LatestMeasurement(Model):
+    """The latest calibrate of a map, a dry run or not."""
+
+    at: datetime
+    report: CalibrationReport
+
+
+class CalibrationState(Model):
+    """A map's calibration, and what it does with the frames that the map was last asked to be calibrated."""
+
+    map: str
+    revision: int
+    calibration: Calibration | None = None
+    measured: LatestMeasurement | None = None
+    now: Effect | None = None
+    then: Effect | None = None
+
+
 class Intrinsics(Model):
     """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
 
@@ -530,6 +594,22 @@ class ClosureAnswer(Model):
     enrolled: PlaceView | None = None
 
 
+class CreatedKey(Model):
+    """A new key with its secret."""
+
+    id: str
+    name: str
+    role: Known[Literal["query", "enrol", "admin"]]
+    maps: list[str] | None = None
+    state: Known[Literal["in force", "revoked", "expired"]]
+    created_at: datetime
+    expires_at: datetime | None = None
+    revoked_at: datetime | None = None
+    last_used_at: datetime | None = None
+    own: bool
+    key: str
+
+
 class Descriptor(Model):
     """A frame's descriptor."""
 
@@ -540,6 +620,13 @@ class Descriptor(Model):
     descriptor: str
     regions: int
     milliseconds: dict[str, float]
+
+
+class DiskState(Model):
+    """The disk of the data directory in bytes."""
+
+    free: int
+    total: int
 
 
 class EarlierBelief(Model):
@@ -619,6 +706,15 @@ class ExplanationView(Model):
     grid: tuple[int, int]
 
 
+class ForgottenPlaces(Model):
+    """Places that were forgotten or, in a dry run, would be."""
+
+    dry_run: bool
+    places: int
+    ids: list[str]
+    missing: list[str]
+
+
 class ForgottenSequence(Model):
     """A deleted traverse."""
 
@@ -652,6 +748,15 @@ class Health(Model):
     """The process is alive."""
 
     status: str = "ok"
+
+
+class HourCount(Model):
+    """How many answers had each verdict within an hour."""
+
+    recognized: int = 0
+    ambiguous: int = 0
+    unknown: int = 0
+    hour: datetime
 
 
 class Recall(Model):
@@ -708,6 +813,36 @@ class JobPage(Model):
     """Jobs, the newest first."""
 
     items: list[JobView]
+    next_cursor: str | None = None
+
+
+class JobsState(Model):
+    """The jobs that have not ended."""
+
+    queued: int
+    running: int
+    watchers: int
+
+
+class KeyView(Model):
+    """A key without its secret."""
+
+    id: str
+    name: str
+    role: Known[Literal["query", "enrol", "admin"]]
+    maps: list[str] | None = None
+    state: Known[Literal["in force", "revoked", "expired"]]
+    created_at: datetime
+    expires_at: datetime | None = None
+    revoked_at: datetime | None = None
+    last_used_at: datetime | None = None
+    own: bool
+
+
+class KeyPage(Model):
+    """A page of keys, the oldest first, revoked ones included."""
+
+    items: list[KeyView]
     next_cursor: str | None = None
 
 
@@ -798,6 +933,14 @@ class StorageStatus(Model):
     keypoints: KeypointsStatus | None = None
 
 
+class VerdictCounts(Model):
+    """How many answers had each verdict."""
+
+    recognized: int = 0
+    ambiguous: int = 0
+    unknown: int = 0
+
+
 class MapView(Model):
     """One environment, bound for life to one encoder."""
 
@@ -813,6 +956,7 @@ class MapView(Model):
     index: IndexStatus
     storage: StorageStatus
     places: int
+    last_day: VerdictCounts | None = None
     revision: int
     created_at: datetime
     updated_at: datetime
@@ -843,11 +987,112 @@ class MatchScore(Model):
     milliseconds: dict[str, float]
 
 
+class MemoryState(Model):
+    """Memory in bytes."""
+
+    resident: int | None = None
+    uploads: int
+    upload_limit: int
+
+
+class OperationState(Model):
+    """The requests of one operation in the last minutes; durations in milliseconds."""
+
+    method: str
+    path: str
+    count: int
+    errors: int
+    p50: float
+    p90: float
+    p99: float
+    max: float
+
+
+class OwnKey(Model):
+    """Who asks, and what the asker may do."""
+
+    id: str | None = None
+    name: str
+    role: Known[Literal["open", "query", "enrol", "admin"]]
+    maps: list[str] | None = None
+    expires_at: datetime | None = None
+    keys_needed: bool
+
+
+class RecentMatch(Model):
+    """A place that resembled a query."""
+
+    place: str
+    score: float
+
+
+class PlaceMatchView(Model):
+    """An answer that lists a certain place."""
+
+    at: datetime
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    probability: float | None = None
+    place: str | None = None
+    pose: EstimatedPose | None = None
+    score: float | None = None
+    margin: float | None = None
+    decision: float | None = None
+    threshold: float
+    reason: str | None = None
+    matches: list[RecentMatch]
+    operation: str | None = None
+    milliseconds: float | None = None
+    request_id: str | None = None
+    principal: str | None = None
+    key: str | None = None
+    client: str | None = None
+    rank: int
+
+
+class PlaceMatchList(Model):
+    """The latest answers that list a place, the latest first, on one page."""
+
+    items: list[PlaceMatchView]
+    next_cursor: None = None
+    best: int
+    recognized: int
+    last_at: datetime | None = None
+
+
 class PlacePage(Model):
     """Places in the order of their ids."""
 
     items: list[PlaceView]
     next_cursor: str | None = None
+
+
+class PlanView(Model):
+    """Where the places of a map are: columns of equal length, in the order of enrolment. A column in which no place
+    has a value is null.
+    """
+
+    map: str
+    revision: str
+    places: int
+    step: int
+    sequences: list[str]
+    ids: list[str]
+    sequence: list[int]
+    x: list[float | None] | None = None
+    y: list[float | None] | None = None
+    z: list[float | None] | None = None
+    latitude: list[float | None] | None = None
+    longitude: list[float | None] | None = None
+    heading: list[float | None] | None = None
+    timestamp: list[int | None] | None = None
+    flags: list[int]
+
+
+class QueueState(Model):
+    """The queue in front of the encoder."""
+
+    waiting: int
+    limit: int
 
 
 class Readiness(Model):
@@ -857,6 +1102,37 @@ class Readiness(Model):
     checks: dict[str, str]
     encoder: str
     quarantined: list[QuarantinedMap]
+
+
+class RecentAnswerView(Model):
+    """The answer to a query of the last time, without the frame."""
+
+    at: datetime
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    probability: float | None = None
+    place: str | None = None
+    pose: EstimatedPose | None = None
+    score: float | None = None
+    margin: float | None = None
+    decision: float | None = None
+    threshold: float
+    reason: str | None = None
+    matches: list[RecentMatch]
+    operation: str | None = None
+    milliseconds: float | None = None
+    request_id: str | None = None
+    principal: str | None = None
+    key: str | None = None
+    client: str | None = None
+
+
+class RecentAnswerList(Model):
+    """The latest answers of a map, the latest first, on one page."""
+
+    items: list[RecentAnswerView]
+    next_cursor: None = None
+    kept: int
+    hours: list[HourCount]
 
 
 class Region(Model):
@@ -881,6 +1157,16 @@ class RegionsView(Model):
     milliseconds: dict[str, float]
 
 
+class RequestsState(Model):
+    """The requests of the last minutes."""
+
+    seconds: int
+    under_way: int
+    count: int
+    errors: int
+    operations: list[OperationState]
+
+
 class SequenceSummary(Model):
     """One traverse of a map; the times are those of its first and last frames that have one."""
 
@@ -895,6 +1181,36 @@ class SequencePage(Model):
 
     items: list[SequenceSummary]
     next_cursor: str | None = None
+
+
+class ThreadsState(Model):
+    """The threads that search, read and write maps."""
+
+    busy: int
+    waiting: int
+    threads: int
+
+
+class ServiceState(Model):
+    """The state of the service."""
+
+    version: str
+    encoder: str
+    started_at: datetime
+    uptime_seconds: float
+    ready: bool
+    checks: dict[str, str]
+    queue: QueueState
+    storage: ThreadsState
+    requests: RequestsState
+    jobs: JobsState
+    sessions: int
+    listeners: int
+    maps: int
+    limits: dict[str, int | float]
+    memory: MemoryState | None = None
+    disk: DiskState | None = None
+    settings: dict[str, Any] | None = None
 
 
 class SessionAnswer(Model):

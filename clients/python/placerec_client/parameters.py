@@ -239,6 +239,18 @@ class ListPlaces(TypedDict, total=False):
     sequence: str | None
     """Only the places of this traverse."""
 
+    camera: str | None
+    """Only places that this camera took."""
+
+    after: datetime | str | None
+    """Only places with this timestamp or a later one."""
+
+    before: datetime | str | None
+    """Only places with this timestamp or an earlier one."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: only places whose metadata has these values under these keys, at its top level."""
+
 
 class EnrolPlaces(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/places``."""
@@ -266,6 +278,40 @@ class ListSequences(TypedDict, total=False):
 
     limit: int
     """Most items on a page."""
+
+
+class ReadPlan(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/plan``."""
+
+    step: int
+    """List about every so manieth place."""
+
+
+class FollowMap(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/events``."""
+
+    kinds: str | Sequence[str] | None
+    """The kinds of events, separated by commas: query, enrolment, session, job, map; all if left out."""
+
+    verdicts: str | Sequence[str] | None
+    """Only queries with these verdicts, separated by commas: recognized, ambiguous, unknown; all if left out. Events
+    of other kinds are not affected.
+    """
+
+    pictures: bool
+    """Tell queries with a small picture of the frame, if the map keeps pictures of its places. This needs a key of
+    the role `enrol`.
+    """
+
+
+class ReadCalibration(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/calibration``."""
+
+    threshold: float | None
+    """Another threshold on the decision value."""
+
+    margin: float | None
+    """Another margin."""
 
 
 class QueryOrEnrol(TypedDict, total=False):
@@ -480,6 +526,23 @@ class SendFrame(TypedDict, total=False):
     """Name or identity that the map's encoder must have (409 otherwise)."""
 
 
+class ListAnswers(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/answers``."""
+
+    limit: int
+    """Most answers, the latest ones."""
+
+    verdict: Literal["recognized", "ambiguous", "unknown"] | None
+    """Only answers with this verdict."""
+
+
+class ListPlaceMatches(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places/{place}/matches``."""
+
+    limit: int
+    """Most answers, the latest ones."""
+
+
 class Encode(TypedDict, total=False):
     """Parameters of ``/v1/encode``."""
 
@@ -553,6 +616,62 @@ class ListJobs(TypedDict, total=False):
 
 class ReadJob(TypedDict, total=False):
     """Parameters of ``/v1/jobs/{job}``."""
+
+
+class ListKeys(TypedDict, total=False):
+    """Parameters of ``/v1/keys``."""
+
+    limit: int
+    """Most items on a page."""
+
+
+class CreateKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class NarrowKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys/{key}``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class RevokeKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys/{key}``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class ReadAudit(TypedDict, total=False):
+    """Parameters of ``/v1/audit``."""
+
+    limit: int
+    """Most items on a page."""
+
+    map: str | None
+    """Only lines about this map."""
+
+    key: str | None
+    """Only what the key of this id or name asked for."""
+
+    operation: str | None
+    """Only this operation."""
+
+    after: datetime | str | None
+    """Only lines of this time or later."""
+
+    before: datetime | str | None
+    """Only lines of this time or earlier."""
 
 
 class NewMap(TypedDict, total=False):

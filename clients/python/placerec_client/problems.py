@@ -9,6 +9,10 @@ from placerec_client import errors
 from placerec_client.errors import Problem
 
 
+class BadRequest(Problem):
+    """400 ``bad-request``: The request cannot be understood."""
+
+
 class MalformedBody(Problem):
     """400 ``malformed-body``: The body cannot be parsed."""
 
@@ -53,8 +57,16 @@ class UnknownJob(Problem):
     """404 ``unknown-job``: The job does not exist."""
 
 
+class UnknownKey(Problem):
+    """404 ``unknown-key``: The key does not exist."""
+
+
 class UnknownMap(Problem):
     """404 ``unknown-map``: The map does not exist."""
+
+
+class UnknownPath(Problem):
+    """404 ``unknown-path``: There is no such resource."""
 
 
 class UnknownPlace(Problem):
@@ -67,6 +79,14 @@ class UnknownSequence(Problem):
 
 class UnknownSession(Problem):
     """404 ``unknown-session``: The session does not exist."""
+
+
+class UnknownTopic(Problem):
+    """404 ``unknown-topic``: The bag has no such topic."""
+
+
+class MethodNotAllowed(Problem):
+    """405 ``method-not-allowed``: The resource does not support this method."""
 
 
 class HeadTooSlow(Problem):
@@ -93,6 +113,22 @@ class JobEnded(Problem):
     """409 ``job-ended``: The job has already ended."""
 
 
+class KeyEnded(Problem):
+    """409 ``key-ended``: The key is revoked or has expired."""
+
+
+class KeyExists(Problem):
+    """409 ``key-exists``: Another key has this name."""
+
+
+class KeyWidened(Problem):
+    """409 ``key-widened``: A key can only be narrowed."""
+
+
+class LastAdminKey(Problem):
+    """409 ``last-admin-key``: No key could manage the service any more."""
+
+
 class MapExists(Problem):
     """409 ``map-exists``: A map of this id already exists."""
 
@@ -107,6 +143,10 @@ class PlaceTaken(Problem):
 
 class StreamTaken(Problem):
     """409 ``stream-taken``: Another connection streams into the session."""
+
+
+class TooManyKeys(Problem):
+    """409 ``too-many-keys``: No more keys can be created."""
 
 
 class TooManyMaps(Problem):
@@ -205,12 +245,20 @@ class InvalidImage(Problem):
     """422 ``invalid-image``: The frame cannot be used."""
 
 
+class InvalidRecording(Problem):
+    """422 ``invalid-recording``: The recording cannot be used."""
+
+
 class InvalidRequest(Problem):
     """422 ``invalid-request``: The request is not valid."""
 
 
 class InvalidResults(Problem):
     """422 ``invalid-results``: The results cannot be used."""
+
+
+class InvalidTrajectory(Problem):
+    """422 ``invalid-trajectory``: The trajectory cannot be used."""
 
 
 class InvalidTraverse(Problem):
@@ -229,8 +277,16 @@ class NothingToMeasure(Problem):
     """422 ``nothing-to-measure``: The map has no frames to measure the recall with."""
 
 
+class PlanTooLarge(Problem):
+    """422 ``plan-too-large``: The plan would list too many places."""
+
+
 class TooFewFrames(Problem):
     """422 ``too-few-frames``: The sequence is too short to be aligned."""
+
+
+class TooManyToForget(Problem):
+    """422 ``too-many-to-forget``: Too many places would be forgotten at once."""
 
 
 class TruncatedImage(Problem):
@@ -259,6 +315,10 @@ class HeadTooLarge(Problem):
 
 class ClientGone(Problem):
     """499 ``client-gone``: The client closed the connection."""
+
+
+class InternalError(Problem):
+    """500 ``internal-error``: The service failed."""
 
 
 class InvalidKeypoints(Problem):
@@ -353,6 +413,10 @@ class TooManyImports(Problem):
     """503 ``too-many-imports``: Too many maps are being imported."""
 
 
+class TooManyListeners(Problem):
+    """503 ``too-many-listeners``: Too many clients listen to events."""
+
+
 class TooManyWatchers(Problem):
     """503 ``too-many-watchers``: Too many clients follow jobs."""
 
@@ -366,6 +430,7 @@ class StorageFull(Problem):
 
 
 BY_SLUG: dict[str, type[Problem]] = {
+    "bad-request": BadRequest,
     "malformed-body": MalformedBody,
     "malformed-head": MalformedHead,
     "key-needed": KeyNeeded,
@@ -377,20 +442,29 @@ BY_SLUG: dict[str, type[Problem]] = {
     "unknown-camera": UnknownCamera,
     "unknown-explanation": UnknownExplanation,
     "unknown-job": UnknownJob,
+    "unknown-key": UnknownKey,
     "unknown-map": UnknownMap,
+    "unknown-path": UnknownPath,
     "unknown-place": UnknownPlace,
     "unknown-sequence": UnknownSequence,
     "unknown-session": UnknownSession,
+    "unknown-topic": UnknownTopic,
+    "method-not-allowed": MethodNotAllowed,
     "head-too-slow": HeadTooSlow,
     "batch-out-of-order": BatchOutOfOrder,
     "frame-needed": FrameNeeded,
     "frame-out-of-order": FrameOutOfOrder,
     "images-missing": ImagesMissing,
     "job-ended": JobEnded,
+    "key-ended": KeyEnded,
+    "key-exists": KeyExists,
+    "key-widened": KeyWidened,
+    "last-admin-key": LastAdminKey,
     "map-exists": MapExists,
     "merge-conflict": MergeConflict,
     "place-taken": PlaceTaken,
     "stream-taken": StreamTaken,
+    "too-many-keys": TooManyKeys,
     "too-many-maps": TooManyMaps,
     "too-many-places": TooManyPlaces,
     "wrong-encoder": WrongEncoder,
@@ -415,13 +489,17 @@ BY_SLUG: dict[str, type[Problem]] = {
     "invalid-ground-truth": InvalidGroundTruth,
     "invalid-identifier": InvalidIdentifier,
     "invalid-image": InvalidImage,
+    "invalid-recording": InvalidRecording,
     "invalid-request": InvalidRequest,
     "invalid-results": InvalidResults,
+    "invalid-trajectory": InvalidTrajectory,
     "invalid-traverse": InvalidTraverse,
     "no-regions": NoRegions,
     "not-an-image": NotAnImage,
     "nothing-to-measure": NothingToMeasure,
+    "plan-too-large": PlanTooLarge,
     "too-few-frames": TooFewFrames,
+    "too-many-to-forget": TooManyToForget,
     "truncated-image": TruncatedImage,
     "unfit-intrinsics": UnfitIntrinsics,
     "unknown-encoder": UnknownEncoder,
@@ -429,6 +507,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "too-many-sessions": TooManySessions,
     "head-too-large": HeadTooLarge,
     "client-gone": ClientGone,
+    "internal-error": InternalError,
     "invalid-keypoints": InvalidKeypoints,
     "storage-failure": StorageFailure,
     "data-directory-locked": DataDirectoryLocked,
@@ -452,6 +531,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "too-many-connections": TooManyConnections,
     "too-many-exports": TooManyExports,
     "too-many-imports": TooManyImports,
+    "too-many-listeners": TooManyListeners,
     "too-many-watchers": TooManyWatchers,
     "wrong-vocabulary": WrongVocabulary,
     "storage-full": StorageFull,

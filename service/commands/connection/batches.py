@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
+from functools import partial
 
 from placerec_client import Enrolled, NewPlace
+from placerec_client.errors import InvalidFrame
 
+from core.errors import PlacerecError
 from service.commands.connection.client import Service, failures
 from service.commands.traverse import Frame
 
@@ -47,11 +50,21 @@ async def enrol_frames(
     """
     by_id = {frame.id: frame for frame in frames}
     lab = service.patient(PATIENCE).maps[map_id]
-    places = (NewPlace(frame.id, frame.path, frame.parameters) for frame in frames)
+    places = (NewPlace(frame.id, partial(_load, frame), frame.parameters) for frame in frames)
     with failures():
         async with aclosing(lab.enrol(places, known=known, encoder=encoder)) as outcomes:
             async for outcome in outcomes:
                 tell(_outcome(by_id[outcome.place.id], outcome))
+
+
+def _load(frame: Frame) -> bytes:
+    """The bytes of a frame, when its turn has come; one that cannot be used is refused alone."""
+    try:
+        return frame.taken.load()
+    except OSError as error:
+        raise InvalidFrame(f"the file cannot be read: {error.strerror}.") from error
+    except PlacerecError as error:
+        raise InvalidFrame(str(error)) from error
 
 
 def _outcome(frame: Frame, found: Enrolled) -> Outcome:

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import httpx
 import typer
+
+from core.errors import DataDirectoryLocked
 from placerec_client import AsyncClient, PlacerecError, Problem, Retry, UnexpectedAnswer
 from placerec_client.frames import media_type
 from placerec_client.requests import Part, form, path_of
-
-from core.errors import DataDirectoryLocked
 from service.commands.connection.credentials import VARIABLE, given_key, is_unencrypted
 from service.commands.console import Failure, remark
 

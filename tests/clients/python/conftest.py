@@ -37,3 +37,9 @@ def client(server: Server, url: str) -> Iterator[Client]:
 def lab(client: Client) -> Map:
     """A new, empty map."""
     return client.maps.create(f"lab-{next(_numbers)}")
+
+
+@pytest.fixture
+def map_id(lab: Map) -> str:
+    """The id of a new, empty map."""
+    return lab.id

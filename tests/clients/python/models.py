@@ -31,7 +31,7 @@ SENT = (
 NESTED = ("CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics", "Label")
 """Those of them that stand within a body; a caller writes them as dictionaries."""
 
-LISTS = {"sequences": "str", "soft": "str", "maps": "str", "bbox": "float"}
+LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str", "bbox": "float"}
 OBJECTS = {"where", "metadata", "cameras"}
 """Parameters of the query string that hold lists and JSON objects; the client takes them as such, too."""
 
@@ -231,14 +231,13 @@ def problems() -> str:
         "from placerec_client.errors import Problem",
         "",
     ]
-    kinds = [one["value"] for one in DOCUMENT["components"]["examples"].values() if "type" in one.get("value", {})]
+    page = (ROOT / "docs" / "reference" / "http-operations.md").read_text()  # it has those of the framework, too
     table = []
-    for kind in sorted(kinds, key=lambda kind: (kind["status"], kind["type"])):
-        slug = kind["type"].rpartition(":")[2]
+    for slug, status, title in re.findall(r"^\| `([a-z-]+)` \| ([0-9]{3}) \| (.*) \|$", page, re.MULTILINE):
         name, base = camel(slug), "Problem"
         if slug == "deadline-exceeded":
             name, base = "DeadlineExceededByService", "Problem, errors.DeadlineExceeded"
-        lines += ["", f"class {name}({base}):", text(f"{kind['status']} ``{slug}``: {kind['title']}."), ""]
+        lines += ["", f"class {name}({base}):", text(f"{status} ``{slug}``: {title}."), ""]
         table.append(f'    "{slug}": {name},')
     lines += ["", "BY_SLUG: dict[str, type[Problem]] = {", *table, "}", '"""The exception of each kind."""', ""]
     return "\n".join(lines)

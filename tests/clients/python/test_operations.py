@@ -113,6 +113,10 @@ def tour(client: Client, folder: Path) -> None:
     assert lab.explanation(answer.explanation.picture).startswith(b"\x89PNG")
     found = list(lab.query_batch([jpeg(2), jpeg(4)], sequences=["monday"]))
     assert [one.answer and one.answer.place and one.answer.place.id for one in found] == ["p2", "p4"]
+    events = iter(lab.events(kinds=["query"], verdicts="recognized"))
+    assert next(events).kind == "listening"
+    lab.query(jpeg(4))
+    assert next(events).data["best"] == "p4"
     closure = lab.query_or_enrol("loop", jpeg(60), sequence="tuesday")
     assert closure.change == "created" and closure.enrolled and closure.enrolled.id == "loop"
     assert client.query({"left": jpeg(1), "right": scene(1)}, maps=["tour"]).map == "tour"

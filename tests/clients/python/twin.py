@@ -18,6 +18,7 @@ from tests.clients.python.models import PACKAGE, ROOT, formatted
 BY_HAND = ("concurrency.py", "__init__.py")
 NAMES = {
     "_async": "_sync",
+    "enter_async_context": "enter_context",
     "aread": "read",
     "aclose": "close",
     "aclosing": "closing",

@@ -25,6 +25,9 @@ CONNECT_SECONDS = 5.0
 IDLE_SECONDS = 30.0
 """How long a connection is kept without a request; the service keeps it for longer."""
 
+SILENCE_SECONDS = 30.0
+"""After how long a stream without a byte is taken for lost; the service sends a comment every ten seconds."""
+
 LEAST_SECONDS, MOST_SECONDS = 0.001, 3600.0
 """Bounds of X-Request-Timeout."""
 
@@ -220,7 +223,8 @@ class AsyncConnection:
             Problem, ConnectionFailed, UnexpectedAnswer: it is no success, or none came.
         """
         sent = [*self.headers, *((name.encode(), value.encode()) for name, value in headers.items())]
-        times = {"connect": CONNECT_SECONDS, "read": self.timeout, "write": self.timeout, "pool": self.timeout}
+        limit = min(self.timeout, SILENCE_SECONDS)
+        times = {"connect": CONNECT_SECONDS, "read": limit, "write": limit, "pool": limit}
         request = httpx.Request("GET", self.url_of(path), headers=sent, extensions={"timeout": times})
         try:
             response = await self._http.send(request, stream=True)

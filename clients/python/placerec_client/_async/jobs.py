@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, AsyncIterator, Callable
+from contextlib import aclosing, suppress
 from datetime import timedelta
 from typing import Any, Unpack
 
 from placerec_client import models, parameters, problems
-from placerec_client._async.concurrency import sleep
 from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.following import follow
 from placerec_client.answers import parsed, problem_of
-from placerec_client.errors import ConnectionFailed, DeadlineExceeded, JobCancelled
-from placerec_client.events import Reader
+from placerec_client.errors import DeadlineExceeded, JobCancelled
 from placerec_client.requests import path_of
 
 OPEN = ("queued", "running")
@@ -20,7 +20,6 @@ WAIT_SECONDS = 20.0
 """How long one request waits for the end of a job; with a progress function, PROGRESS_SECONDS."""
 
 PROGRESS_SECONDS = 1.0
-NO_EVENTS = 204
 
 Progress = Callable[[models.JobView], object]
 
@@ -70,7 +69,8 @@ class AsyncJob:
             async for other in AsyncJobs(connection).list(kind=view.kind):
                 same = (other.map, other.arguments) == (view.map, view.arguments) and other.id != view.id
                 if same and view.created_at - window <= other.created_at <= view.created_at:
-                    await cls(connection, view.id).cancel()
+                    with suppress(problems.JobEnded):
+                        await cls(connection, view.id).cancel()
                     view = other
         return cls(connection, view.id, view)
 
@@ -117,30 +117,14 @@ class AsyncJob:
         assert self.view is not None
         return self.view
 
-    async def events(self) -> AsyncIterator[models.JobView]:
+    async def events(self) -> AsyncGenerator[models.JobView]:
         """Yield the job whenever it has changed, until it has ended; a lost connection is taken up again."""
-        last: str | None = None
-        failures = 0
-        while True:
-            reader = Reader()
-            headers = {"Accept": "text/event-stream"} | ({} if last is None else {"Last-Event-ID": last})
-            try:
-                async with self._connection.stream(self._path + "/events", headers) as response:
-                    if response.status_code == NO_EVENTS:
-                        return
-                    async for chunk in response.aiter_bytes():
-                        for event in reader.take(chunk):
-                            failures, last = 0, event.id or last
-                            self.view = job = parsed(models.JobView, event.data)
-                            yield job
-                            if job.state not in OPEN:
-                                return
-            except (ConnectionFailed, problems.TooManyWatchers, problems.Stopping, problems.NotReady):
-                failures += 1
-                pause = self._connection.retry.pause(failures)
-                if failures * pause > self._connection.retry.patience:
-                    raise
-                await sleep(pause)
+        async with aclosing(follow(self._connection, self._path + "/events", {})) as events:
+            async for event in events:
+                self.view = job = parsed(models.JobView, event.data)
+                yield job
+                if job.state not in OPEN:
+                    return
 
 
 def ended(job: models.JobView) -> models.JobView:

@@ -11,12 +11,14 @@ from placerec_client import models, parameters, problems
 from placerec_client._async.batches import AsyncQueries
 from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.enrolment import AsyncEnrolment, enrol_by_job
+from placerec_client._async.following import follow
 from placerec_client._async.jobs import AsyncJob
 from placerec_client._async.places import AsyncPlaces
 from placerec_client._async.sessions import AsyncSessions
 from placerec_client._async.transfers import Progress, export, upload
 from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
+from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import Part, dumps, fields, form, path_of, quoted
 
@@ -281,6 +283,26 @@ class AsyncMap:
             deadline=deadline,
             request_id=request_id,
         )
+
+    async def events(self, **options: Unpack[parameters.FollowMap]) -> AsyncGenerator[MapEvent]:
+        """Yield what happens in the map: queries, enrolments, sessions, jobs, and changes of the map.
+
+        A connection that is lost is taken up again; the event ``missed`` says how many were lost all the same.
+
+        ::
+
+            async for event in lab.events(kinds=["query"], verdicts=["unknown"]):
+                print(event.data["at"], event.data["best"])
+
+        Args:
+            options: such as ``kinds``, ``verdicts`` and ``pictures``.
+        """
+        async with aclosing(follow(self.connection, self.path + "/events", options)) as events:
+            async for event in events:
+                made = MapEvent(event.name, event.id, event.json())
+                yield made
+                if made.kind == "map" and made.data.get("change") == "deleted":
+                    return
 
     async def explanation(self, explanation: str) -> bytes:
         """Return the picture of an explanation, a PNG file, by its id or the address in an answer."""

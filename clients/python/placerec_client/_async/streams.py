@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import uuid
+from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Any, Self, Unpack
 
@@ -20,7 +21,7 @@ from placerec_client.frames import Frame, frame_bytes
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
-CONNECT_SECONDS = 5.0
+CONNECT_SECONDS, CLOSE_SECONDS = 5.0, 1.0
 MOST_BYTES = 64 << 20
 """Bytes of an answer."""
 
@@ -35,6 +36,7 @@ class AsyncStream:
     def __init__(self, connection: AsyncConnection, path: str, numbering: AsyncNumbering) -> None:
         self._connection, self._path, self._numbering = connection, path, numbering
         self._socket: ClientConnection | None = None
+        self._opened = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         return self
@@ -46,9 +48,8 @@ class AsyncStream:
 
     async def close(self) -> None:
         """Close the connection; the session goes on."""
-        socket, self._socket = self._socket, None
-        if socket is not None:
-            await socket.close()
+        self._socket = None
+        await self._opened.aclose()
 
     async def send(
         self, image: Frame, *, deadline: float | None = None, **options: Unpack[parameters.SendFrame]
@@ -111,15 +112,17 @@ class AsyncStream:
         headers.append(("X-Request-Id", uuid.uuid4().hex))
         address = "ws" + self._connection.url.removeprefix("http") + self._path
         try:
-            return await connect(
+            opening = connect(
                 address,
                 compression=None,
                 additional_headers=headers,
                 user_agent_header=None,
                 open_timeout=limit,
+                close_timeout=CLOSE_SECONDS,
                 max_size=MOST_BYTES,
                 proxy=None,
             )
+            return await self._opened.enter_async_context(opening)
         except InvalidStatus as error:
             raise _denied(error) from error
         except (WebSocketException, InvalidHandshake) as error:

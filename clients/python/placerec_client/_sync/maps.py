@@ -12,12 +12,14 @@ from placerec_client import models, parameters, problems
 from placerec_client._sync.batches import Queries
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.enrolment import Enrolment, enrol_by_job
+from placerec_client._sync.following import follow
 from placerec_client._sync.jobs import Job
 from placerec_client._sync.places import Places
 from placerec_client._sync.sessions import Sessions
 from placerec_client._sync.transfers import Progress, export, upload
 from placerec_client.answers import parsed
 from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
+from placerec_client.events import MapEvent
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import Part, dumps, fields, form, path_of, quoted
 
@@ -278,6 +280,26 @@ class Map:
             deadline=deadline,
             request_id=request_id,
         )
+
+    def events(self, **options: Unpack[parameters.FollowMap]) -> Generator[MapEvent]:
+        """Yield what happens in the map: queries, enrolments, sessions, jobs, and changes of the map.
+
+        A connection that is lost is taken up again; the event ``missed`` says how many were lost all the same.
+
+        ::
+
+            for event in lab.events(kinds=["query"], verdicts=["unknown"]):
+                print(event.data["at"], event.data["best"])
+
+        Args:
+            options: such as ``kinds``, ``verdicts`` and ``pictures``.
+        """
+        with closing(follow(self.connection, self.path + "/events", options)) as events:
+            for event in events:
+                made = MapEvent(event.name, event.id, event.json())
+                yield made
+                if made.kind == "map" and made.data.get("change") == "deleted":
+                    return
 
     def explanation(self, explanation: str) -> bytes:
         """Return the picture of an explanation, a PNG file, by its id or the address in an answer."""

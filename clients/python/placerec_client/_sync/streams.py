@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import uuid
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self, Unpack
 
@@ -21,7 +22,7 @@ from placerec_client.frames import Frame, frame_bytes
 from placerec_client.requests import dumps, text_of
 from placerec_client.retry import Clock
 
-CONNECT_SECONDS = 5.0
+CONNECT_SECONDS, CLOSE_SECONDS = 5.0, 1.0
 MOST_BYTES = 64 << 20
 """Bytes of an answer."""
 
@@ -36,6 +37,7 @@ class Stream:
     def __init__(self, connection: Connection, path: str, numbering: Numbering) -> None:
         self._connection, self._path, self._numbering = connection, path, numbering
         self._socket: ClientConnection | None = None
+        self._opened = ExitStack()
 
     def __enter__(self) -> Self:
         return self
@@ -47,9 +49,8 @@ class Stream:
 
     def close(self) -> None:
         """Close the connection; the session goes on."""
-        socket, self._socket = self._socket, None
-        if socket is not None:
-            socket.close()
+        self._socket = None
+        self._opened.close()
 
     def send(
         self, image: Frame, *, deadline: float | None = None, **options: Unpack[parameters.SendFrame]
@@ -112,15 +113,17 @@ class Stream:
         headers.append(("X-Request-Id", uuid.uuid4().hex))
         address = "ws" + self._connection.url.removeprefix("http") + self._path
         try:
-            return connect(
+            opening = connect(
                 address,
                 compression=None,
                 additional_headers=headers,
                 user_agent_header=None,
                 open_timeout=limit,
+                close_timeout=CLOSE_SECONDS,
                 max_size=MOST_BYTES,
                 proxy=None,
             )
+            return self._opened.enter_context(opening)
         except InvalidStatus as error:
             raise _denied(error) from error
         except (WebSocketException, InvalidHandshake) as error:
