@@ -23,6 +23,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
@@ -175,7 +176,8 @@ class PlacerecNode(LifecycleNode):
     # ---- what comes in
 
     def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> Any:
-        made = self.create_subscription(kind, topic, callback, qos)
+        overridden = QoSOverridingOptions.with_default_policies()
+        made = self.create_subscription(kind, topic, callback, qos, qos_overriding_options=overridden)
         self._subscriptions_made.append(made)
         return made
 

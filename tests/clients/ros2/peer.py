@@ -10,6 +10,7 @@ import math
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,13 +75,14 @@ class Peer:
 
     def listen(self, topic: str, durable: bool = False, node: str = "placerec") -> dict[str, Any]:
         """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
-        kind, show = {
+        known: dict[str, tuple[Any, Callable[[Any], dict[str, Any]]]] = {
             "answer": (String, lambda message: json.loads(message.data)),
             "pose": (PoseWithCovarianceStamped, pose_of),
             "map_to_odom": (TransformStamped, transform_of),
             "annotated/compressed": (CompressedImage, picture_of),
             "/diagnostics": (DiagnosticArray, diagnostics_of),
-        }[topic]
+        }
+        kind, show = known[topic]
         qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
         if durable:
             qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
