@@ -8,16 +8,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 CLIENT = ROOT / "clients" / "python"
-FOLDERS = (
-    "core",
-    "service",
-    "training",
-    "benchmarks",
-    "clients/python/placerec_client",
-    "examples",
-    "scripts",
-    "tests",
-)
+OF_CLIENT = "clients/python/placerec_client"
+FOLDERS = ("core", "service", "training", "benchmarks", OF_CLIENT, "examples", "scripts", "tests")
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 

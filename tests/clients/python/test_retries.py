@@ -168,6 +168,13 @@ def test_no_answer_before_the_deadline() -> None:
     assert time.monotonic() - began < 5
 
 
+def test_the_deadline_counts_more_than_the_wish_of_the_service() -> None:
+    handle, asked = in_turn(*[problem(503, "queue-full", **{"Retry-After": "30"})] * 2)
+    with pytest.raises(DeadlineExceeded, match="It is queue-full") as exceeded:
+        ask(handle, deadline=0.5, patience=60)
+    assert len(asked) == 1 and isinstance(exceeded.value.__cause__, problems.QueueFull)
+
+
 def test_the_problem_of_the_service_is_a_deadline_too() -> None:
     handle, _ = in_turn(problem(503, "deadline-exceeded", **{"Retry-After": "1"}))
     with pytest.raises(DeadlineExceeded) as exceeded:
