@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
 
 from tests.clients.ros2.proxy import Door
 from tests.clients.ros2.robot import Robot, until
+from tests.clients.ros2.soak import MOST_GROWTH, drive
 from tests.service.server import Server
 
 
@@ -138,3 +140,11 @@ def test_a_session_that_was_ended_elsewhere_is_begun_anew(driving: Robot) -> Non
     robot.look(number=2)
     until_answered(robot, 3)
     assert "The session ended" in robot.log()
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_ten_minutes_of_images_do_not_let_it_grow(network: None, tmp_path: Path) -> None:
+    done = drive(tmp_path, minutes=10, rate=30)
+    assert done.answered > 1000
+    assert done.growth < MOST_GROWTH

@@ -1,7 +1,7 @@
 """What the ROS 2 node adds to an answer: the time from a published image to the published answer, beside HTTP.
 
-    python -m benchmarks.ros2               # on drawn frames
-    python -m benchmarks.ros2 --corridor    # the real corridor, played as a bag at 10 Hz, beside the same over HTTP
+    python -m benchmarks.clients.ros2               # on drawn frames
+    python -m benchmarks.clients.ros2 --corridor    # the real corridor, played as a bag at 10 Hz, beside the same over HTTP
 
 Two sessions of one service get the same frames in turn, one over HTTP from this process, one by the node, whose peer
 publishes each frame and hears the answer.  All of them are in a network of their own and need ``.venv-ros``
@@ -30,7 +30,7 @@ from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import Server
 
 LIMIT = 5.0
-CORRIDOR = Path(__file__).parents[2] / "shared" / "datasets" / "eval" / "corridor"
+CORRIDOR = Path(__file__).parents[3] / "shared" / "datasets" / "eval" / "corridor"
 BASE = 1_763_800_000.0
 RATE = 10.0
 WIDTH, HEIGHT = 640, 480
