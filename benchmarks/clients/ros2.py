@@ -1,11 +1,11 @@
 """What the ROS 2 node adds to an answer: the time from a published image to the published answer, beside HTTP.
 
-    python -m benchmarks.clients.ros2               # on drawn frames
-    python -m benchmarks.clients.ros2 --corridor    # the real corridor, played as a bag at 10 Hz, beside the same over HTTP
+    PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2               # on drawn frames
+    PYTHONPATH=clients/ros2 python -m benchmarks.clients.ros2 --corridor    # the real corridor as a bag at 10 Hz
 
-Two sessions of one service get the same frames in turn, one over HTTP from this process, one by the node, whose peer
-publishes each frame and hears the answer.  All of them are in a network of their own and need ``.venv-ros``
-(``. scripts/environment; environment ros``).
+For the times, two sessions of one service get the same frames in turn, one over HTTP from this process, one by the
+node, whose peer publishes each frame and hears the answer.  The corridor's verdicts and places are compared with those
+over HTTP.  All of it runs in a network of its own and needs ``.venv-ros`` (``. scripts/environment; environment ros``).
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     python -m tests.clients.ros2.soak --minutes 60 [--rate 10]
 
-It needs ``.venv-ros`` and a machine that allows network namespaces.  ``scripts/soak ros`` runs it.  The walk is driven
-up and down; every few minutes the session is begun anew, the node is deactivated and activated, and a picture is
-looked at, so that all that could leak is done many times.
+It needs ``.venv-ros`` and a machine that allows network namespaces.  ``scripts/soak ros --minutes 60`` runs it.  The
+walk is driven up and down; every few minutes the session is begun anew, the node is deactivated and activated, and
+pictures are looked at, so that all that could leak is done many times.
 """
 
 from __future__ import annotations

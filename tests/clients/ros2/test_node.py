@@ -109,10 +109,11 @@ def test_a_late_subscriber_hears_no_old_pose(image: Robot) -> None:
     try:
         late.do("listen", topic="pose")
         late.do("listen", topic="answer")
+        late.hears(1)
         stamp = robot.look(number=3)
         heard = until(lambda: late.take("pose"))
         assert [round(one["stamp"], 3) for one in heard] == [round(stamp, 3)]
-        assert len(late.take("answer")) == 1
+        assert len(until(lambda: late.take("answer"))) == 1
     finally:
         late.stop()
     assert robot.peer.take("pose") == []
