@@ -94,7 +94,7 @@ def write_video(folder: Path, path: Path) -> None:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 4.0, (first.shape[1], first.shape[0]))
     for pixels in pictures:
         assert pixels is not None
-        writer.write(pixels)
+        writer.write(cv2.resize(pixels, (first.shape[1], first.shape[0])))  # the last of each place are narrower
     writer.release()
 
 

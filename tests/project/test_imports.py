@@ -19,18 +19,7 @@ from packaging.utils import canonicalize_name
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tests.project.sources import (
-    CLIENT,
-    FILES,
-    FOLDERS,
-    NODE,
-    OF_CLIENT,
-    OF_NODE,
-    ROOT,
-    forbidden_imports,
-    imports_of,
-    module_of,
-)
+from tests.project.sources import CLIENT, FILES, FOLDERS, NODE, ROOT, forbidden_imports, imports_of, module_of
 from tests.project.test_lock import locked
 
 MOST_MODULES = 16
@@ -88,12 +77,12 @@ def test_examples_know_nothing_of_the_project() -> None:
 def test_the_client_knows_nothing_of_the_project() -> None:
     """It is installed where nothing else of the project is."""
     forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
-    assert forbidden_imports(OF_CLIENT, forbidden) == []
+    assert forbidden_imports("clients/python/placerec_client", forbidden) == []
 
 
 def test_the_node_knows_nothing_of_the_project_but_the_client() -> None:
     forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
-    assert forbidden_imports(OF_NODE, forbidden) == []
+    assert forbidden_imports("clients/ros2/placerec_ros", forbidden) == []
 
 
 def test_the_node_imports_what_its_package_declares() -> None:
@@ -101,7 +90,7 @@ def test_the_node_imports_what_its_package_declares() -> None:
     package = ElementTree.parse(NODE / "package.xml").getroot()
     depends = {str(entry.text).removeprefix("python3-") for entry in package.iter("exec_depend")}
     known = set(sys.stdlib_module_names) | {"placerec_client", "placerec_ros"} | depends
-    files = [*(ROOT / OF_NODE).rglob("*.py"), *(NODE / "launch").glob("*.py")]
+    files = [*(NODE / "placerec_ros").rglob("*.py"), *(NODE / "launch").glob("*.py")]
     used = {name.split(".")[0] for path in files for name, _ in imports_of(path)}
     assert used - known == set()
     assert depends - used == set()

@@ -7,10 +7,9 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
 
+from core.errors import PlacerecError
 from placerec_client import Enrolled, NewPlace
 from placerec_client.errors import InvalidFrame
-
-from core.errors import PlacerecError
 from service.commands.connection.client import Service, failures
 from service.commands.traverse import Frame
 
