@@ -273,7 +273,7 @@ class Localizer:
         self._sent = frame
         if generation != self._generation:
             return  # deactivated meanwhile
-        answered = self._judged(frame, answer, run)
+        answered = self._judged(frame, answer, run, took)
         self._health.answered(took, None if answered.robot is None else str(moment_of(frame.stamp) or "no stamp"))
         self._outlet.answered(answered)
         self._annotate(frame, picture, run)
@@ -307,7 +307,7 @@ class Localizer:
             return None
         return increment(before, after, math.radians(self._settings.camera_yaw))
 
-    def _judged(self, frame: Frame, answer: Mapping[str, Any], run: Run) -> Answered:
+    def _judged(self, frame: Frame, answer: Mapping[str, Any], run: Run, took: float) -> Answered:
         found = estimate(answer, run.radius)
         if found is None and answer["verdict"] == "recognized":
             pose = answer["place"]["pose"] if answer["place"] else None
@@ -334,6 +334,7 @@ class Localizer:
             "probability": answer["probability"],
             "place": None if answer["place"] is None else answer["place"]["id"],
             "pose_source": None if found is None else found.source,
+            "request_milliseconds": round(1e3 * took, 3),
             "answer": dict(answer),
         }
         return Answered(frame, report, found, robot, correction)
