@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from pydantic import BaseModel, ValidationError
 from rich.markup import escape
 
-from service.commands.connection.batches import Outcome, enrol_frames
+from core.places import Sequence as SequenceName
+from service.commands.connection.batches import Frame, Outcome, enrol_frames
 from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
 from service.commands.console import Failure, complain, output, progress
 from service.commands.jobs import show_outcome, submit
@@ -29,7 +31,6 @@ from service.commands.recordings import (
     TrajectoryFile,
     TrajectoryTimes,
 )
-from service.commands.traverse import Frame, check_sequence
 
 
 @dataclass
@@ -115,7 +116,7 @@ def enroll(
     target = Target(url, data_dir)
     began = time.monotonic()
     with options.open(recording, id_prefix) as opened:
-        name = check_sequence(opened.name if sequence is None else sequence)
+        name = _checked_sequence(opened.name if sequence is None else sequence)
 
         def choose(used: str | None) -> list[Frame]:
             return [Frame(taken, name, camera) for taken in options.choose(opened, used)]
@@ -126,6 +127,22 @@ def enroll(
         _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
     if report.failures:
         raise typer.Exit(1)
+
+
+class _Sequence(BaseModel):
+    name: SequenceName
+
+
+def _checked_sequence(name: str) -> str:
+    """Return ``name`` if a traverse may have it.
+
+    Raises:
+        Failure: a traverse may not have this name.
+    """
+    try:
+        return _Sequence(name=name).name
+    except ValidationError as error:
+        raise Failure(f"A sequence cannot have the name {name!r}; give another one with --sequence.") from error
 
 
 def _show_aligned(job: dict[str, Any]) -> None:

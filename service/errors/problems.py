@@ -180,6 +180,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.RateExceeded: Kind(429, "rate-exceeded", "Too many requests a second"),
     faults.UnknownKey: Kind(404, "unknown-key", "The key does not exist"),
     faults.KeyExists: Kind(409, "key-exists", "Another key has this name"),
+    faults.FirstKeyLocal: Kind(403, "first-key-local", "The first key is created on the service's own machine"),
     faults.KeyEnded: Kind(409, "key-ended", "The key is revoked or has expired"),
     faults.KeyWidened: Kind(409, "key-widened", "A key can only be narrowed"),
     faults.LastAdminKey: Kind(409, "last-admin-key", "No key could manage the service any more"),

@@ -12,7 +12,7 @@ from typing import Any
 
 import placerec_client
 from placerec_client import errors, parameters
-from placerec_client._sync import client, jobs, maps, places, sessions, streams
+from placerec_client._sync import client, jobs, keys, maps, places, sessions, streams
 
 INTRODUCTION = """
 # The Python client
@@ -39,6 +39,7 @@ OBJECTS: tuple[tuple[str, type], ...] = (
     ("client.jobs", jobs.Jobs),
     ("job", jobs.Job),
     ("client.encoders", client.Encoders),
+    ("client.keys", keys.Keys),
 )
 """What a caller has in hand, by the name that the examples give it."""
 

@@ -84,7 +84,12 @@ CLIENT_PROJECT = tomllib.loads((CLIENT / "pyproject.toml").read_text())["project
 FOR_TYPES = {"numpy"}
 """What the client imports for types alone: a caller who gives arrays has it."""
 
-EXTRAS = {"core/evaluation/report": {"report"}, "training": {"report"}}
+EXTRAS = {
+    "core/evaluation/report": {"report"},
+    "core/recordings": {"bags"},
+    "examples": {"bags"},
+    "training": {"report"},
+}
 """Folders that may import what an extra brings; tests and benchmarks may import all."""
 
 

@@ -483,7 +483,7 @@ class CalibrationReport(Model):
 
     map: str
     encoder: str
-    method: Known[Literal["frames", "sequence", "map"]]
+    method: Known[Literal["frames", "sequence", "map", "labels"]]
     target: Target
     stored: bool
     calibration: Calibration
@@ -592,6 +592,13 @@ class ClosureAnswer(Model):
     milliseconds: dict[str, float]
     change: Known[Literal["created", "unchanged"]] | None = None
     enrolled: PlaceView | None = None
+
+
+class ComparedTraverse(Model):
+    """A traverse of a comparison."""
+
+    sequence: str
+    places: list[str]
 
 
 class CreatedKey(Model):
@@ -704,6 +711,20 @@ class ExplanationView(Model):
     regions: list[RegionPair]
     cells: list[CellPair]
     grid: tuple[int, int]
+
+
+class ExportedLabel(Model):
+    """A frame whose place is known."""
+
+    id: int
+    at: datetime
+    sha256: str
+    camera: str | None = None
+    verdict: Known[Literal["recognized", "ambiguous", "unknown"]]
+    place: str | None = None
+    enrolled: bool
+    labelled_at: datetime
+    labelled_by: str | None = None
 
 
 class ForgottenPlaces(Model):
@@ -853,6 +874,43 @@ class KeypointsStatus(Model):
     bytes: int
 
 
+class LabelList(Model):
+    """All labels, the oldest frame first, on one page."""
+
+    items: list[ExportedLabel]
+    next_cursor: None = None
+
+
+class ReviewLabel(Model):
+    """What people say that a frame shows; one of the three is set."""
+
+    place: str | None = None
+    new: str | None = None
+    stranger: bool = False
+
+
+class ReviewFrameView(Model):
+    """A frame that is kept for review."""
+
+    id: int
+    at: datetime
+    sha256: str
+    bytes: int
+    answer: dict[str, Any]
+    label: ReviewLabel | None = None
+    labelled_at: datetime | None = None
+    labelled_by: str | None = None
+
+
+class Labelled(Model):
+    """What became of a frame."""
+
+    id: int
+    discarded: bool
+    frame: ReviewFrameView | None = None
+    enrolled: PlaceView | None = None
+
+
 class Layer(Model):
     """A layer of the network from which regions come."""
 
@@ -922,6 +980,14 @@ class MapMatch(Model):
     place: PlaceView
 
 
+class ReviewSetting(Model):
+    """Which frames a map keeps so that people can say later what they show, and how many at most."""
+
+    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]] = ["ambiguous", "unknown"]
+    most_frames: int = 500
+    most_bytes: int = 268435456
+
+
 class StorageStatus(Model):
     """What a map takes on disk."""
 
@@ -952,6 +1018,7 @@ class MapView(Model):
     same_place_radius: float
     same_place_frames: int
     verification: bool
+    review: ReviewSetting | None = None
     calibration: Calibration | None = None
     index: IndexStatus
     storage: StorageStatus
@@ -1167,6 +1234,15 @@ class RequestsState(Model):
     operations: list[OperationState]
 
 
+class ReviewPage(Model):
+    """Kept frames, the newest first."""
+
+    items: list[ReviewFrameView]
+    next_cursor: str | None = None
+    frames: int
+    bytes: int
+
+
 class SequenceSummary(Model):
     """One traverse of a map; the times are those of its first and last frames that have one."""
 
@@ -1301,6 +1377,39 @@ class SeveralAnswer(Model):
     matches: list[MapMatch]
     maps: list[MapAnswer]
     frames: list[FrameReport]
+    milliseconds: dict[str, float]
+
+
+class SharedPath(Model):
+    """A stretch that two traverses share, as sequence matching finds it."""
+
+    gain: float
+    query: list[int]
+    reference: list[int]
+
+
+class SimilarityScale(Model):
+    """What the 8-bit values of the matrix mean: a score is `low` + value / 255 · (`high` - `low`)."""
+
+    low: float
+    high: float
+
+
+class SimilarityView(Model):
+    """How alike two traverses of a map are: about the matrix of their scores."""
+
+    map: str
+    encoder: str
+    query: ComparedTraverse
+    reference: ComparedTraverse
+    rows: int
+    columns: int
+    scale: SimilarityScale
+    stretches: list[SharedPath]
+    truth: list[int | None] | None = None
+    radius: float
+    aligned: bool
+    counterparts: list[int | None] | None = None
     milliseconds: dict[str, float]
 
 

@@ -526,6 +526,16 @@ class SendFrame(TypedDict, total=False):
     """Name or identity that the map's encoder must have (409 otherwise)."""
 
 
+class ListReview(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/review``."""
+
+    limit: int
+    """Most items on a page."""
+
+    labelled: bool | None
+    """Only frames with a label, or only those without one."""
+
+
 class ListAnswers(TypedDict, total=False):
     """Parameters of ``/v1/maps/{map}/answers``."""
 
@@ -586,6 +596,10 @@ class CheckHealth(TypedDict, total=False):
 
     limit: int
     """How many places, gaps and stretches are listed at most, each."""
+
+
+class CompareTraverses(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/similarity``."""
 
 
 class ImportMap(TypedDict, total=False):
@@ -698,6 +712,9 @@ class NewMap(TypedDict, total=False):
     name of it), or by what suits its size (auto): compact from 256 places.
     """
 
+    review: ReviewSetting | None
+    """Which frames are kept to be reviewed by people; null: none."""
+
     encoder: str | None
     """Name or full identity of the encoder; the default encoder if left out."""
 
@@ -720,6 +737,9 @@ class MapChanges(TypedDict, total=False):
 
     index: Literal["auto", "exact", "compact", "inverted"] | None
     """auto, exact or compact (auto from 256 places on); inverted is compact."""
+
+    review: ReviewChanges | None
+    """null: no frames are kept from now on."""
 
     calibration: CalibrationChanges | None
 
@@ -859,6 +879,12 @@ class CalibrationOrder(TypedDict, total=False):
     most: int
     """How many frames are asked at most; they are chosen evenly."""
 
+    beside: Literal["encoder", "map", "none"]
+    """With the method labels, what the labels join, since they are few and of the doubtful frames. `encoder`: the
+    encoder's calibration, whose curve is moved as far as the labels demand; the target is not used then. `map`: the
+    map's own frames, which are asked as well. `none`: nothing.
+    """
+
     labels: Sequence[Label] | None
     """One label for each frame of the form."""
 
@@ -954,3 +980,58 @@ class Label(TypedDict):
 
     camera: NotRequired[str | None]
     """The camera of the map that took the frame; its mask is applied."""
+
+
+class NewKey(TypedDict, total=False):
+    """A key to create."""
+
+    maps: Sequence[str] | None
+    """Limit it to these maps; null or left out: all maps."""
+
+    expires_at: datetime | str | None
+    """When it expires; null or left out: never."""
+
+
+class KeyChanges(TypedDict, total=False):
+    """A merge patch (RFC 7396) of a key; what is left out stays. The key can only be narrowed."""
+
+    role: Literal["query", "enrol", "admin"] | None
+    """Not higher than now."""
+
+    maps: Sequence[str] | None
+    """Some of the present ones; null: all maps."""
+
+    expires_at: datetime | str | None
+    """Not later than now; null: never."""
+
+
+class Forgetting(TypedDict, total=False):
+    """Which places to forget: those of some ids, or those that fulfil some conditions."""
+
+    ids: Sequence[str] | None
+    """Ids of places; those that are gone are told."""
+
+    filter: PlaceConditions | None
+    """Conditions, at least one."""
+
+    dry_run: bool
+    """Only say which places would be forgotten."""
+
+
+class PlaceConditions(TypedDict):
+    """Conditions on a place; all that are given have to hold."""
+
+    sequence: NotRequired[str | None]
+    """It belongs to this traverse."""
+
+    camera: NotRequired[str | None]
+    """This camera took its frame."""
+
+    after: NotRequired[datetime | str | None]
+    """It has this timestamp or a later one."""
+
+    before: NotRequired[datetime | str | None]
+    """It has this timestamp or an earlier one."""
+
+    where: NotRequired[Mapping[str, Any] | None]
+    """Its metadata has these values under these keys, at its top level."""

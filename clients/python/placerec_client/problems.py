@@ -29,6 +29,10 @@ class KeyRefused(Problem):
     """401 ``key-refused``: The key is not valid."""
 
 
+class FirstKeyLocal(Problem):
+    """403 ``first-key-local``: The first key is created on the service's own machine."""
+
+
 class ForeignPage(Problem):
     """403 ``foreign-page``: Requests from other web sites are refused."""
 
@@ -51,6 +55,10 @@ class UnknownCamera(Problem):
 
 class UnknownExplanation(Problem):
     """404 ``unknown-explanation``: The picture does not exist or is no longer kept."""
+
+
+class UnknownFrame(Problem):
+    """404 ``unknown-frame``: The frame is not kept for review."""
 
 
 class UnknownJob(Problem):
@@ -285,6 +293,10 @@ class TooFewFrames(Problem):
     """422 ``too-few-frames``: The sequence is too short to be aligned."""
 
 
+class TooManyPairs(Problem):
+    """422 ``too-many-pairs``: The traverses have too many frames to be compared."""
+
+
 class TooManyToForget(Problem):
     """422 ``too-many-to-forget``: Too many places would be forgotten at once."""
 
@@ -435,12 +447,14 @@ BY_SLUG: dict[str, type[Problem]] = {
     "malformed-head": MalformedHead,
     "key-needed": KeyNeeded,
     "key-refused": KeyRefused,
+    "first-key-local": FirstKeyLocal,
     "foreign-page": ForeignPage,
     "map-forbidden": MapForbidden,
     "role-too-low": RoleTooLow,
     "no-thumbnail": NoThumbnail,
     "unknown-camera": UnknownCamera,
     "unknown-explanation": UnknownExplanation,
+    "unknown-frame": UnknownFrame,
     "unknown-job": UnknownJob,
     "unknown-key": UnknownKey,
     "unknown-map": UnknownMap,
@@ -499,6 +513,7 @@ BY_SLUG: dict[str, type[Problem]] = {
     "nothing-to-measure": NothingToMeasure,
     "plan-too-large": PlanTooLarge,
     "too-few-frames": TooFewFrames,
+    "too-many-pairs": TooManyPairs,
     "too-many-to-forget": TooManyToForget,
     "truncated-image": TruncatedImage,
     "unfit-intrinsics": UnfitIntrinsics,

@@ -6,15 +6,52 @@ from collections.abc import Callable, Sequence
 from contextlib import aclosing
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 from core.errors import PlacerecError
 from placerec_client import Enrolled, NewPlace
 from placerec_client.errors import InvalidFrame
 from service.commands.connection.client import Service, failures
-from service.commands.traverse import Frame
+
+if TYPE_CHECKING:
+    from core.recordings import Frame as TakenFrame
 
 PATIENCE = 120.0
 """Seconds for which a batch is repeated while the service is overloaded or restarts."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame to enrol.
+
+    taken: as the recording tells it.
+    sequence: the name of the traverse.
+    camera: the camera of the map that took it; None for none.
+    """
+
+    taken: TakenFrame
+    sequence: str
+    camera: str | None = None
+
+    @property
+    def id(self) -> str:
+        """The id of its place."""
+        return self.taken.id
+
+    @property
+    def name(self) -> str:
+        """What a message calls it."""
+        return self.taken.name
+
+    def parameters(self, data: bytes) -> dict[str, str]:
+        """What goes into the query string beside the frame's bytes ``data``."""
+        told = self.taken.described(data)
+        given = {} if told.pose is None else {name: repr(value) for name, value in told.pose if value is not None}
+        if told.timestamp is not None:
+            given["timestamp"] = told.timestamp.isoformat()
+        if self.camera is not None:
+            given["camera"] = self.camera
+        return {**given, "sequence": self.sequence}
 
 
 @dataclass(frozen=True)

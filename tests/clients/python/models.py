@@ -24,11 +24,11 @@ METHODS = ("get", "post", "put", "patch", "delete")
 SENT = (
     *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Merging", "Reencoding"),
     *("CalibrationOrder", "CameraDefinition", "CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics"),
-    "Label",
+    *("Label", "NewKey", "KeyChanges", "Forgetting", "PlaceConditions"),
 )
 """Schemas of what is sent. Those of bodies lose their required fields, which the calls take by position."""
 
-NESTED = ("CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics", "Label")
+NESTED = ("CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics", "Label", "PlaceConditions")
 """Those of them that stand within a body; a caller writes them as dictionaries."""
 
 LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str", "bbox": "float"}

@@ -13,10 +13,12 @@ import httpx
 import numpy as np
 import pytest
 
-from placerec_client import AsyncClient, Client, NewPlace, Problem, models, problems
+from placerec_client import AsyncClient, Client, Map, NewPlace, Problem, models, problems
 from placerec_client.model import Model
+from service.access.keys import KeyStore
 from tests.clients.python.models import operations
 from tests.service.scenes import encoded, jpeg, scene, seen_again, stranger
+from tests.service.server import Server
 
 EVERY = {(method, re.compile(re.sub(r"\{\w+\}", "[^/]+", path))) for method, path, _ in operations()}
 
@@ -81,18 +83,41 @@ def calibration_frames() -> dict[str, bytes]:
     return {f"f{n}": encoded(seen_again(scene(n % 8), n) if n < 16 else stranger(n + 20)) for n in range(32)}
 
 
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """The address and an administrator's key of a service that has keys."""
+    folder = tmp_path_factory.mktemp("guarded")
+    (folder / "data").mkdir()
+    _, key = KeyStore(folder / "data").create("ann", "admin")
+    running = Server(folder, key=key).wait()
+    yield str(running.client.base_url), key
+    assert running.stop() == 0
+
+
 @pytest.mark.timeout(300)
-def test_every_operation_has_a_call(url: str, tmp_path: Path) -> None:
+def test_every_operation_has_a_call(guarded: tuple[str, str], tmp_path: Path) -> None:
     recording = Recording()
-    with Client(url, transport=recording) as client:
-        assert client.liveness().status == "ok" and client.readiness().status == "ready"
-        assert client.version().name == "placerec" and "placerec_" in client.metrics()
-        assert any(encoder.default for encoder in client.encoders)
+    url, key = guarded
+    with Client(url, key=key, transport=recording) as client:
         tour(client, tmp_path)
     assert_every_operation(recording.seen)
 
 
+def the_service(client: Client) -> None:
+    assert client.liveness().status == "ok" and client.readiness().status == "ready"
+    assert client.version().name == "placerec" and "placerec_" in client.metrics()
+    assert any(encoder.default for encoder in client.encoders)
+    assert client.own_key().role == "admin" and client.state().version
+    made = client.keys.create("robot-7", "enrol", maps=["tour"])
+    assert made.key.startswith("placerec_") and client.keys.read(made.id).name == "robot-7"
+    assert client.keys.narrow(made.id, {"role": "query"}).role == "query"
+    assert client.keys.revoke(made.id).state == "revoked"
+    assert made.id in [key.id for key in client.keys]
+    assert "create_key" in [entry.operation for entry in client.audit()]
+
+
 def tour(client: Client, folder: Path) -> None:
+    the_service(client)
     lab = client.maps.create("tour", keep="image", description="a map")
     assert lab.view and lab.view.keep == "image"
     assert lab.cameras.put("front", mask={"polygons": [[(0, 0.9), (1, 0.9), (1, 1)]]}).name == "front"
@@ -107,6 +132,9 @@ def tour(client: Client, folder: Path) -> None:
     assert lab.places.edit("p1", {"pose": {"heading": 90}}).pose == models.Pose(x=2, y=0, heading=90)
     assert lab.places.thumbnail("p1").startswith(b"\xff\xd8")
     lab.places.forget("q2")
+    assert lab.places.forget_many(ids=["q1", "q9"], dry_run=False).missing == ["q9"]
+    plan = lab.plan()
+    assert len(plan.ids) == plan.places == 13
     answer = lab.query(jpeg(3), k=2, explain=True, where={"floor": 3}, camera="front")
     assert answer.verdict == "recognized" and answer.place and answer.place.id == "p3"
     assert answer.explanation and answer.explanation.picture
@@ -126,6 +154,8 @@ def tour(client: Client, folder: Path) -> None:
     assert client.draw_regions(jpeg(1)).startswith(b"\x89PNG")
     assert client.match(jpeg(1), scene(1)).score > 0.5 and client.draw_match(jpeg(1), jpeg(2)).startswith(b"\x89PNG")
     session(lab)
+    assert lab.answers(limit=5).items and lab.places.matches("p3").items
+    assert lab.calibration(threshold=0.5).map == "tour"
     report = lab.calibrate("frames", frames=calibration_frames(), labels=LABELS, target=TARGET, dry_run=True)
     assert not report.stored and report.measurement.frames == 32
     assert lab.verify().ok and lab.verify(background=True).wait().state == "succeeded"
@@ -178,17 +208,15 @@ def jobs(client: Client, folder: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-def test_every_call_is_there_asynchronously(url: str, tmp_path: Path) -> None:
+def test_every_call_is_there_asynchronously(guarded: tuple[str, str], tmp_path: Path) -> None:
     """The halves have the same names, so the same tour goes through both: each await is done for it."""
     recording = AsyncRecording()
 
     async def work() -> None:
-        async with AsyncClient(url, transport=recording) as client:
+        async with AsyncClient(guarded[0], key=guarded[1], transport=recording) as client:
             loop = asyncio.get_running_loop()
             stand_in = Awaited(client, loop)
             await asyncio.to_thread(tour, stand_in, tmp_path)  # type: ignore[arg-type]
-            await asyncio.gather(client.liveness(), client.readiness(), client.version(), client.metrics())
-            assert [one async for one in client.encoders]
 
     asyncio.run(work())
     assert_every_operation(recording.seen)
@@ -236,7 +264,12 @@ class Awaited:
             yield item
 
 
-def test_the_whole_answer_arrives(client: Client, lab: Any) -> None:
+def test_the_whole_answer_arrives(guarded: tuple[str, str]) -> None:
+    with Client(guarded[0], key=guarded[1]) as client:
+        compare(client, client.maps.create("whole"))
+
+
+def compare(client: Client, lab: Map) -> None:
     for number in range(3):
         lab.places.put(f"p{number}", scene(number), x=number, y=0, heading=np.float64(1.5))
     asked = client.connection

@@ -20,6 +20,8 @@ NAMES = {
     "_async": "_sync",
     "enter_async_context": "enter_context",
     "aread": "read",
+    "handle_async_request": "handle_request",
+    "AsyncByteStream": "SyncByteStream",
     "aclose": "close",
     "aclosing": "closing",
     "aiter_bytes": "iter_bytes",

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self, Unpack
 from placerec_client import models, parameters
 from placerec_client._async.connection import AsyncConnection
 from placerec_client._async.jobs import AsyncJobs
+from placerec_client._async.keys import AsyncKeys
 from placerec_client._async.maps import AsyncMaps
 from placerec_client._http import httpx
 from placerec_client.frames import Frame, frame_bytes, media_type
@@ -40,6 +41,7 @@ class AsyncClient:
         maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
         encoders: its encoders; iterated, their definitions.
+        keys: its keys.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class AsyncClient:
         self.maps = AsyncMaps(connection)
         self.jobs = AsyncJobs(connection)
         self.encoders = AsyncEncoders(connection)
+        self.keys = AsyncKeys(connection)
 
     async def __aenter__(self) -> Self:
         return self
@@ -184,6 +187,20 @@ class AsyncClient:
     async def version(self) -> models.Version:
         """Return the versions of the service and its libraries."""
         return await self.connection.ask(models.Version, "GET", "/version")
+
+    async def state(self) -> models.ServiceState:
+        """Return what the service is doing: its queue, latencies, memory, disk and limits, and what this key may do."""
+        return await self.connection.ask(models.ServiceState, "GET", "/v1/service")
+
+    async def own_key(self) -> models.OwnKey:
+        """Return what the key of this client may do."""
+        return await self.connection.ask(models.OwnKey, "GET", "/v1/key")
+
+    async def audit(self, **options: Unpack[parameters.ReadAudit]) -> AsyncIterator[models.AuditEntry]:
+        """Yield who changed what, the newest first; ``map``, ``key``, ``operation``, ``after``, ``before`` choose."""
+        async for page in self.connection.pages(models.AuditPage, "/v1/audit", dict(options)):
+            for item in page.items:
+                yield item
 
     async def metrics(self) -> str:
         """Return the metrics in the text format of Prometheus."""

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from placerec_client._async.concurrency import sleep
+from placerec_client._async.lanes import AsyncLanes
 from placerec_client._http import httpx
 from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
@@ -64,12 +65,15 @@ class AsyncConnection:
             raise ConnectionFailed(f"{url} is not a URL of a service: it has to start with http:// or https://.")
         self.url, self.name, self.timeout, self.retry = url.rstrip("/"), name or url, timeout, retry
         try:
-            host = httpx.URL(self.url).netloc
-            limits = httpx.Limits(max_connections=None, max_keepalive_connections=100, keepalive_expiry=IDLE_SECONDS)
-            self._http = httpx.AsyncClient(transport=transport, limits=limits, timeout=timeout)
+            parsed_url = httpx.URL(self.url)
         except (httpx.InvalidURL, ValueError) as error:
             raise ConnectionFailed(f"{url} is not a URL: {error}.") from error
-        self.headers = [(b"Host", host), (b"Accept", b"*/*"), (b"User-Agent", f"placerec-client/{VERSION}".encode())]
+        self._transport = transport or AsyncLanes(parsed_url, IDLE_SECONDS)
+        self.headers = [
+            (b"Host", parsed_url.netloc),
+            (b"Accept", b"*/*"),
+            (b"User-Agent", f"placerec-client/{VERSION}".encode()),
+        ]
         if key is not None:
             self.headers.append((b"Authorization", f"Bearer {key}".encode("ascii", "replace")))
         self._urls: dict[str, httpx.URL] = {}
@@ -87,7 +91,7 @@ class AsyncConnection:
 
     async def close(self) -> None:
         """Close all connections."""
-        await self._http.aclose()
+        await self._transport.aclose()
 
     async def request(
         self,
@@ -168,7 +172,13 @@ class AsyncConnection:
         body = content() if callable(content) else content
         request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": times})
         try:
-            return await self._http.send(request)
+            response = await self._transport.handle_async_request(request)
+            response.request = request
+            try:
+                await response.aread()
+            finally:
+                await response.aclose()
+            return response
         except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
             return self._failure("cannot be reached", error)
         except httpx.TimeoutException as error:
@@ -227,7 +237,8 @@ class AsyncConnection:
         times = {"connect": CONNECT_SECONDS, "read": limit, "write": limit, "pool": limit}
         request = httpx.Request("GET", self.url_of(path), headers=sent, extensions={"timeout": times})
         try:
-            response = await self._http.send(request, stream=True)
+            response = await self._transport.handle_async_request(request)
+            response.request = request
             try:
                 if not response.is_success:
                     await response.aread()

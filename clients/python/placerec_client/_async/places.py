@@ -8,7 +8,7 @@ from typing import Unpack
 from placerec_client import models, parameters, problems
 from placerec_client._async.connection import AsyncConnection
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import quoted
+from placerec_client.requests import fields, quoted
 
 
 class AsyncPlaces:
@@ -20,9 +20,13 @@ class AsyncPlaces:
     def __aiter__(self) -> AsyncIterator[models.PlaceView]:
         return self.list()
 
-    async def list(self, *, sequence: str | None = None) -> AsyncIterator[models.PlaceView]:
-        """Yield the places in the order of their enrolment, all or those of one traverse."""
-        async for page in self._connection.pages(models.PlacePage, self._path, {"sequence": sequence}):
+    async def list(self, **options: Unpack[parameters.ListPlaces]) -> AsyncIterator[models.PlaceView]:
+        """Yield the places in the order of their enrolment.
+
+        Args:
+            options: which places: ``sequence``, ``camera``, ``after``, ``before``, ``where``.
+        """
+        async for page in self._connection.pages(models.PlacePage, self._path, dict(options)):
             for item in page.items:
                 yield item
 
@@ -71,6 +75,19 @@ class AsyncPlaces:
         except problems.UnknownPlace as problem:
             if not problem.after_loss:
                 raise
+
+    async def forget_many(self, **options: Unpack[parameters.Forgetting]) -> models.ForgottenPlaces:
+        """Delete the places of these ``ids``, or those that a ``filter`` lets through, in one commit.
+
+        It only reports which these are unless ``dry_run=False``.
+        """
+        path = self._path + ":forget"
+        return await self._connection.ask(models.ForgottenPlaces, "POST", path, json=fields(options))
+
+    async def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
+        """Return the latest answers in which a place was a match."""
+        path = self._of(place_id) + "/matches"
+        return await self._connection.ask(models.PlaceMatchList, "GET", path, params=options)
 
     async def thumbnail(self, place_id: str) -> bytes:
         """Return a small picture of a place, a JPEG file, if the map keeps one."""

@@ -11,6 +11,7 @@ from placerec_client import models, parameters
 from placerec_client._http import httpx
 from placerec_client._sync.connection import Connection
 from placerec_client._sync.jobs import Jobs
+from placerec_client._sync.keys import Keys
 from placerec_client._sync.maps import Maps
 from placerec_client.frames import Frame, frame_bytes, media_type
 from placerec_client.requests import Part, form
@@ -41,6 +42,7 @@ class Client:
         maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.
         jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
         encoders: its encoders; iterated, their definitions.
+        keys: its keys.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Client:
         self.maps = Maps(connection)
         self.jobs = Jobs(connection)
         self.encoders = Encoders(connection)
+        self.keys = Keys(connection)
 
     def __enter__(self) -> Self:
         return self
@@ -185,6 +188,20 @@ class Client:
     def version(self) -> models.Version:
         """Return the versions of the service and its libraries."""
         return self.connection.ask(models.Version, "GET", "/version")
+
+    def state(self) -> models.ServiceState:
+        """Return what the service is doing: its queue, latencies, memory, disk and limits, and what this key may do."""
+        return self.connection.ask(models.ServiceState, "GET", "/v1/service")
+
+    def own_key(self) -> models.OwnKey:
+        """Return what the key of this client may do."""
+        return self.connection.ask(models.OwnKey, "GET", "/v1/key")
+
+    def audit(self, **options: Unpack[parameters.ReadAudit]) -> Iterator[models.AuditEntry]:
+        """Yield who changed what, the newest first; ``map``, ``key``, ``operation``, ``after``, ``before`` choose."""
+        for page in self.connection.pages(models.AuditPage, "/v1/audit", dict(options)):
+            for item in page.items:
+                yield item
 
     def metrics(self) -> str:
         """Return the metrics in the text format of Prometheus."""

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 from placerec_client._http import httpx
 from placerec_client._sync.concurrency import sleep
+from placerec_client._sync.lanes import Lanes
 from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
 from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
 from placerec_client.model import Model
@@ -65,12 +66,15 @@ class Connection:
             raise ConnectionFailed(f"{url} is not a URL of a service: it has to start with http:// or https://.")
         self.url, self.name, self.timeout, self.retry = url.rstrip("/"), name or url, timeout, retry
         try:
-            host = httpx.URL(self.url).netloc
-            limits = httpx.Limits(max_connections=None, max_keepalive_connections=100, keepalive_expiry=IDLE_SECONDS)
-            self._http = httpx.Client(transport=transport, limits=limits, timeout=timeout)
+            parsed_url = httpx.URL(self.url)
         except (httpx.InvalidURL, ValueError) as error:
             raise ConnectionFailed(f"{url} is not a URL: {error}.") from error
-        self.headers = [(b"Host", host), (b"Accept", b"*/*"), (b"User-Agent", f"placerec-client/{VERSION}".encode())]
+        self._transport = transport or Lanes(parsed_url, IDLE_SECONDS)
+        self.headers = [
+            (b"Host", parsed_url.netloc),
+            (b"Accept", b"*/*"),
+            (b"User-Agent", f"placerec-client/{VERSION}".encode()),
+        ]
         if key is not None:
             self.headers.append((b"Authorization", f"Bearer {key}".encode("ascii", "replace")))
         self._urls: dict[str, httpx.URL] = {}
@@ -88,7 +92,7 @@ class Connection:
 
     def close(self) -> None:
         """Close all connections."""
-        self._http.close()
+        self._transport.close()
 
     def request(
         self,
@@ -169,7 +173,13 @@ class Connection:
         body = content() if callable(content) else content
         request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": times})
         try:
-            return self._http.send(request)
+            response = self._transport.handle_request(request)
+            response.request = request
+            try:
+                response.read()
+            finally:
+                response.close()
+            return response
         except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
             return self._failure("cannot be reached", error)
         except httpx.TimeoutException as error:
@@ -228,7 +238,8 @@ class Connection:
         times = {"connect": CONNECT_SECONDS, "read": limit, "write": limit, "pool": limit}
         request = httpx.Request("GET", self.url_of(path), headers=sent, extensions={"timeout": times})
         try:
-            response = self._http.send(request, stream=True)
+            response = self._transport.handle_request(request)
+            response.request = request
             try:
                 if not response.is_success:
                     response.read()

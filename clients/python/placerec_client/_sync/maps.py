@@ -164,6 +164,18 @@ class Map:
         """Report how well the map works, and which stretches should be recorded again."""
         return self.connection.ask(models.MapHealth, "GET", self.path + "/health", params=options)
 
+    def plan(self, **options: Unpack[parameters.ReadPlan]) -> models.PlanView:
+        """Return where all places are, column by column: made for maps of many places."""
+        return self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
+
+    def answers(self, **options: Unpack[parameters.ListAnswers]) -> models.RecentAnswerList:
+        """Return the latest answers that the service remembers, and the mix of verdicts."""
+        return self.connection.ask(models.RecentAnswerList, "GET", self.path + "/answers", params=options)
+
+    def calibration(self, **options: Unpack[parameters.ReadCalibration]) -> models.CalibrationState:
+        """Return the calibration, and what another ``threshold`` or ``margin`` would do."""
+        return self.connection.ask(models.CalibrationState, "GET", self.path + "/calibration", params=options)
+
     def query(
         self,
         frame: Frame,

@@ -9,7 +9,7 @@ from typing import Unpack
 from placerec_client import models, parameters, problems
 from placerec_client._sync.connection import Connection
 from placerec_client.frames import Frame, frame_bytes, media_type
-from placerec_client.requests import quoted
+from placerec_client.requests import fields, quoted
 
 
 class Places:
@@ -21,9 +21,13 @@ class Places:
     def __iter__(self) -> Iterator[models.PlaceView]:
         return self.list()
 
-    def list(self, *, sequence: str | None = None) -> Iterator[models.PlaceView]:
-        """Yield the places in the order of their enrolment, all or those of one traverse."""
-        for page in self._connection.pages(models.PlacePage, self._path, {"sequence": sequence}):
+    def list(self, **options: Unpack[parameters.ListPlaces]) -> Iterator[models.PlaceView]:
+        """Yield the places in the order of their enrolment.
+
+        Args:
+            options: which places: ``sequence``, ``camera``, ``after``, ``before``, ``where``.
+        """
+        for page in self._connection.pages(models.PlacePage, self._path, dict(options)):
             for item in page.items:
                 yield item
 
@@ -72,6 +76,19 @@ class Places:
         except problems.UnknownPlace as problem:
             if not problem.after_loss:
                 raise
+
+    def forget_many(self, **options: Unpack[parameters.Forgetting]) -> models.ForgottenPlaces:
+        """Delete the places of these ``ids``, or those that a ``filter`` lets through, in one commit.
+
+        It only reports which these are unless ``dry_run=False``.
+        """
+        path = self._path + ":forget"
+        return self._connection.ask(models.ForgottenPlaces, "POST", path, json=fields(options))
+
+    def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
+        """Return the latest answers in which a place was a match."""
+        path = self._of(place_id) + "/matches"
+        return self._connection.ask(models.PlaceMatchList, "GET", path, params=options)
 
     def thumbnail(self, place_id: str) -> bytes:
         """Return a small picture of a place, a JPEG file, if the map keeps one."""
