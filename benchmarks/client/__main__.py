@@ -41,21 +41,8 @@ RUNS = 9
 
 def client_robots(url: str, frames: Path, robots: int, seconds: float, verify: str) -> dict[str, Any]:
     """The measurement of robots that use the client, in a process of their own."""
-    words = [
-        "--url",
-        url,
-        "--map",
-        MAP,
-        "--frames",
-        frames,
-        "--robots",
-        robots,
-        "--seconds",
-        seconds,
-        "--verify",
-        verify,
-    ]
-    command = [sys.executable, ROBOTS_PROGRAM, *map(str, words)]
+    words = {"url": url, "map": MAP, "frames": frames, "robots": robots, "seconds": seconds, "verify": verify}
+    command = [sys.executable, str(ROBOTS_PROGRAM), *(f"--{name}={value}" for name, value in words.items())]
     found: dict[str, Any] = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     return found
 

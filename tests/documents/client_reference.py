@@ -12,7 +12,7 @@ from typing import Any
 
 import placerec_client
 from placerec_client import errors, parameters
-from placerec_client._sync import client, jobs, keys, maps, places, sessions, streams
+from placerec_client._sync import client, jobs, keys, maps, places, review, sessions, streams
 
 INTRODUCTION = """
 # The Python client
@@ -33,6 +33,7 @@ OBJECTS: tuple[tuple[str, type], ...] = (
     ("lab.places", places.Places),
     ("lab.sequences", maps.Sequences),
     ("lab.cameras", maps.Cameras),
+    ("lab.review", review.Review),
     ("lab.sessions", sessions.Sessions),
     ("session", sessions.Session),
     ("stream", streams.Stream),

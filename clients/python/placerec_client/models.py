@@ -983,7 +983,9 @@ class MapMatch(Model):
 class ReviewSetting(Model):
     """Which frames a map keeps so that people can say later what they show, and how many at most."""
 
-    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]] = ["ambiguous", "unknown"]
+    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]] = Field(
+        default_factory=lambda: ["ambiguous", "unknown"]
+    )
     most_frames: int = 500
     most_bytes: int = 268435456
 

@@ -899,89 +899,6 @@ class CameraDefinition(TypedDict, total=False):
     """Of the upright frame, as in ROS's CameraInfo; null if they are not known."""
 
 
-class CalibrationChanges(TypedDict):
-    """Values of a calibration to set by hand; null restores the encoder's value."""
-
-    threshold: NotRequired[float | None]
-
-    margin: NotRequired[float | None]
-
-
-class PoseChanges(TypedDict):
-    """Part of a pose; null removes a coordinate."""
-
-    x: NotRequired[float | None]
-
-    y: NotRequired[float | None]
-
-    z: NotRequired[float | None]
-
-    latitude: NotRequired[float | None]
-
-    longitude: NotRequired[float | None]
-
-    heading: NotRequired[float | None]
-
-
-class Target(TypedDict):
-    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
-    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
-    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
-    has no value.
-    """
-
-    rule: Literal["precision", "false_accept_rate", "mean_of_negatives"]
-
-    value: NotRequired[float | None]
-
-
-class Mask(TypedDict):
-    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
-    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
-    covered.
-    """
-
-    polygons: Sequence[Sequence[tuple[float, float]]]
-
-
-class Intrinsics(TypedDict):
-    """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
-
-    width: int
-    """Pixels of a row of the upright frame for which the other values hold."""
-
-    height: int
-
-    fx: float
-    """Focal length in pixels, as is fy."""
-
-    fy: float
-
-    cx: float
-    """Principal point in pixels, as is cy; the first pixel's centre is at 0."""
-
-    cy: float
-
-    distortion_model: NotRequired[Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]]
-    """As in ROS's CameraInfo; equidistant: fisheye."""
-
-    distortion: NotRequired[Sequence[float]]
-    """k1, k2, p1, p2, k3 of plumb_bob, and k4, k5, k6; k1 to k4 of equidistant."""
-
-
-class Label(TypedDict):
-    """The true place of one frame of a form."""
-
-    file: str
-    """Name of the file part that holds the frame."""
-
-    place: str | None
-    """Id of the place that the frame shows; null if the map lacks that place."""
-
-    camera: NotRequired[str | None]
-    """The camera of the map that took the frame; its mask is applied."""
-
-
 class NewKey(TypedDict, total=False):
     """A key to create."""
 
@@ -1018,6 +935,81 @@ class Forgetting(TypedDict, total=False):
     """Only say which places would be forgotten."""
 
 
+class LabelOrder(TypedDict, total=False):
+    """What a frame shows, or that it is thrown away: exactly one of these."""
+
+    place: str | None
+    """It shows this place of the map."""
+
+    new: NewPlace | None
+    """It shows a new place, as which it is enrolled."""
+
+    stranger: bool
+    """It shows no place of this map."""
+
+    discard: bool
+    """It is thrown away."""
+
+
+class Label(TypedDict):
+    """The true place of one frame of a form."""
+
+    file: str
+    """Name of the file part that holds the frame."""
+
+    place: str | None
+    """Id of the place that the frame shows; null if the map lacks that place."""
+
+    camera: NotRequired[str | None]
+    """The camera of the map that took the frame; its mask is applied."""
+
+
+class Target(TypedDict):
+    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
+    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
+    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
+    has no value.
+    """
+
+    rule: Literal["precision", "false_accept_rate", "mean_of_negatives"]
+
+    value: NotRequired[float | None]
+
+
+class Intrinsics(TypedDict):
+    """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
+
+    width: int
+    """Pixels of a row of the upright frame for which the other values hold."""
+
+    height: int
+
+    fx: float
+    """Focal length in pixels, as is fy."""
+
+    fy: float
+
+    cx: float
+    """Principal point in pixels, as is cy; the first pixel's centre is at 0."""
+
+    cy: float
+
+    distortion_model: NotRequired[Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]]
+    """As in ROS's CameraInfo; equidistant: fisheye."""
+
+    distortion: NotRequired[Sequence[float]]
+    """k1, k2, p1, p2, k3 of plumb_bob, and k4, k5, k6; k1 to k4 of equidistant."""
+
+
+class Mask(TypedDict):
+    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
+    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
+    covered.
+    """
+
+    polygons: Sequence[Sequence[tuple[float, float]]]
+
+
 class PlaceConditions(TypedDict):
     """Conditions on a place; all that are given have to hold."""
 
@@ -1035,3 +1027,86 @@ class PlaceConditions(TypedDict):
 
     where: NotRequired[Mapping[str, Any] | None]
     """Its metadata has these values under these keys, at its top level."""
+
+
+class NewPlace(TypedDict):
+    """The place as which a frame is enrolled."""
+
+    x: NotRequired[float | None]
+    """Metres in the map's frame; with y."""
+
+    y: NotRequired[float | None]
+    """Metres in the map's frame; with x."""
+
+    z: NotRequired[float | None]
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: NotRequired[float | None]
+    """Degrees, WGS 84."""
+
+    longitude: NotRequired[float | None]
+    """Degrees, WGS 84."""
+
+    heading: NotRequired[float | None]
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: NotRequired[datetime | str | None]
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: NotRequired[str | None]
+    """The traverse that the frame belongs to."""
+
+    camera: NotRequired[str | None]
+    """The camera of the map that took the frame; its mask is applied."""
+
+    id: str
+    """Id of the place."""
+
+    metadata: NotRequired[Mapping[str, Any]]
+
+
+class CalibrationChanges(TypedDict):
+    """Values of a calibration to set by hand; null restores the encoder's value."""
+
+    threshold: NotRequired[float | None]
+
+    margin: NotRequired[float | None]
+
+
+class ReviewChanges(TypedDict):
+    """Which frames to keep for review; null restores a default."""
+
+    verdicts: NotRequired[Sequence[Literal["recognized", "ambiguous", "unknown"]] | None]
+
+    most_frames: NotRequired[int | None]
+
+    most_bytes: NotRequired[int | None]
+
+
+class ReviewSetting(TypedDict):
+    """Which frames a map keeps so that people can say later what they show, and how many at most."""
+
+    verdicts: NotRequired[Sequence[Literal["recognized", "ambiguous", "unknown"]]]
+    """Frames that are answered with one of these are kept."""
+
+    most_frames: NotRequired[int]
+    """Most frames; the oldest go first."""
+
+    most_bytes: NotRequired[int]
+    """Most bytes of their files together; the oldest go first."""
+
+
+class PoseChanges(TypedDict):
+    """Part of a pose; null removes a coordinate."""
+
+    x: NotRequired[float | None]
+
+    y: NotRequired[float | None]
+
+    z: NotRequired[float | None]
+
+    latitude: NotRequired[float | None]
+
+    longitude: NotRequired[float | None]
+
+    heading: NotRequired[float | None]

@@ -23,13 +23,9 @@ METHODS = ("get", "post", "put", "patch", "delete")
 
 SENT = (
     *("NewMap", "MapChanges", "PlaceChanges", "NewSession", "Aligning", "Pruning", "Merging", "Reencoding"),
-    *("CalibrationOrder", "CameraDefinition", "CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics"),
-    *("Label", "NewKey", "KeyChanges", "Forgetting", "PlaceConditions"),
+    *("CalibrationOrder", "CameraDefinition", "NewKey", "KeyChanges", "Forgetting", "LabelOrder"),
 )
-"""Schemas of what is sent. Those of bodies lose their required fields, which the calls take by position."""
-
-NESTED = ("CalibrationChanges", "PoseChanges", "Target", "Mask", "Intrinsics", "Label", "PlaceConditions")
-"""Those of them that stand within a body; a caller writes them as dictionaries."""
+"""Schemas of bodies. They lose their required fields, which the calls take by position."""
 
 LISTS = {"sequences": "str", "kinds": "str", "verdicts": "str", "soft": "str", "maps": "str", "bbox": "float"}
 OBJECTS = {"where", "metadata", "cameras"}
@@ -157,6 +153,8 @@ def model_field(name: str, schema: Mapping[str, Any], required: bool) -> str:
     kind = annotation(schema, sent=False)
     nullable = "None" in kind.split(" | ")
     default = schema.get("default")
+    if isinstance(default, list) and default:
+        return f"    {name}: {kind} = Field(default_factory=lambda: {default!r})"
     if default not in (None, []) and not isinstance(default, dict):
         return f"    {name}: {kind} = {default!r}"
     if nullable or (not required and not kind.startswith("list")):
@@ -193,8 +191,8 @@ def parameters() -> str:
             for one in found:
                 if one["name"] not in BY_CALL and not one.get("required"):
                     lines += [f"    {one['name']}: {parameter_type(one)}", text(one.get("description", "")), ""]
-    for name in SENT:
-        lines += body(name, SCHEMAS[name])
+    for name in [*SENT, *nested()]:
+        lines += body(name, SCHEMAS[name], name not in SENT)
     return "\n".join(lines)
 
 
@@ -207,8 +205,13 @@ def parameter_type(parameter: Mapping[str, Any]) -> str:
     return annotation(parameter["schema"], sent=True)
 
 
-def body(name: str, schema: Mapping[str, Any]) -> list[str]:
-    nested, required = name in NESTED, schema.get("required", ())
+def nested() -> list[str]:
+    """The schemas that stand within bodies; a caller writes them as dictionaries."""
+    return [name for name in ordered(set(SENT)) if name not in SENT]
+
+
+def body(name: str, schema: Mapping[str, Any], nested: bool) -> list[str]:
+    required = schema.get("required", ())
     lines = ["", f"class {name}(TypedDict{'' if nested else ', total=False'}):"]
     lines += [text(schema.get("description") or f"Fields of {name}."), ""]
     for field, one in schema["properties"].items():

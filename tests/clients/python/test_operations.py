@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -118,7 +119,8 @@ def the_service(client: Client) -> None:
 
 def tour(client: Client, folder: Path) -> None:
     the_service(client)
-    lab = client.maps.create("tour", keep="image", description="a map")
+    review: Any = {"verdicts": ["recognized", "ambiguous", "unknown"], "most_frames": 20}
+    lab = client.maps.create("tour", keep="image", description="a map", review=review)
     assert lab.view and lab.view.keep == "image"
     assert lab.cameras.put("front", mask={"polygons": [[(0, 0.9), (1, 0.9), (1, 1)]]}).name == "front"
     assert lab.cameras.read("front").mask and [one.name for one in lab.cameras] == ["front"]
@@ -171,6 +173,16 @@ def tour(client: Client, folder: Path) -> None:
         client.maps[name].delete()
 
 
+def labelling(lab: Any) -> None:
+    until = time.monotonic() + 60
+    while not (kept := list(lab.review)) and time.monotonic() < until:  # frames are kept behind the answers
+        time.sleep(0.05)
+    assert lab.review.picture(kept[0].id)[:2] in (b"\xff\xd8", b"\x89P")
+    assert lab.review.label(kept[0].id, place="p3").frame is not None
+    assert [one.place for one in lab.review.labels()] == ["p3"]
+    assert lab.review.label(kept[0].id, discard=True).discarded
+
+
 def session(lab: Any) -> None:
     with lab.sessions.begin(filter="bayes", advance=1) as one:
         first = one.send(jpeg(0))
@@ -189,6 +201,8 @@ def jobs(client: Client, folder: Path) -> None:
     sent = lab.enrol_by_job([NewPlace(f"t{n}", jpeg(n), {"sequence": "tuesday"}) for n in range(12)], align=True)
     result = sent.wait().result
     assert result and result["changes"] == {"created": 12}
+    assert lab.compare("tuesday", "monday").columns == 12
+    assert lab.draw_comparison("tuesday", "monday").startswith(b"\x89PNG")
     assert lab.align("tuesday", dry_run=True).wait().result
     assert lab.prune(max_recall_loss=0.1).wait().state == "succeeded"
     assert lab.reencode("tour-2").wait().state == "succeeded"

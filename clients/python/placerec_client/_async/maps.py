@@ -14,6 +14,7 @@ from placerec_client._async.enrolment import AsyncEnrolment, enrol_by_job
 from placerec_client._async.following import follow
 from placerec_client._async.jobs import AsyncJob
 from placerec_client._async.places import AsyncPlaces
+from placerec_client._async.review import AsyncReview
 from placerec_client._async.sessions import AsyncSessions
 from placerec_client._async.transfers import Progress, export, upload
 from placerec_client.answers import parsed
@@ -99,6 +100,7 @@ class AsyncMap:
         sequences: its traverses.
         cameras: its cameras.
         sessions: its sessions.
+        review: frames of queries that it keeps for review.
     """
 
     def __init__(self, connection: AsyncConnection, map_id: str) -> None:
@@ -110,6 +112,7 @@ class AsyncMap:
         self.sequences = AsyncSequences(connection, self.path)
         self.cameras = AsyncCameras(connection, self.path)
         self.sessions = AsyncSessions(connection, self.path)
+        self.review = AsyncReview(connection, self.path)
         self._query = self.path + "/query"
 
     def __repr__(self) -> str:
@@ -166,6 +169,17 @@ class AsyncMap:
     async def plan(self, **options: Unpack[parameters.ReadPlan]) -> models.PlanView:
         """Return where all places are, column by column: made for maps of many places."""
         return await self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
+
+    async def compare(self, query: str, reference: str) -> models.SimilarityView:
+        """Compare two traverses frame by frame: what they share, and the size and scale of the matrix of scores."""
+        params = {"query": query, "reference": reference}
+        return await self.connection.ask(models.SimilarityView, "GET", self.path + "/similarity", params=params)
+
+    async def draw_comparison(self, query: str, reference: str) -> bytes:
+        """Return the matrix of scores of two traverses as a grey picture, a PNG file."""
+        params, headers = {"query": query, "reference": reference}, {"Accept": "image/png"}
+        response = await self.connection.request("GET", self.path + "/similarity", params=params, headers=headers)
+        return response.content
 
     async def answers(self, **options: Unpack[parameters.ListAnswers]) -> models.RecentAnswerList:
         """Return the latest answers that the service remembers, and the mix of verdicts."""
@@ -324,7 +338,7 @@ class AsyncMap:
     @overload
     async def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -335,7 +349,7 @@ class AsyncMap:
     @overload
     async def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -345,7 +359,7 @@ class AsyncMap:
     ) -> AsyncJob: ...
     async def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -356,7 +370,8 @@ class AsyncMap:
         """Measure when the map's answers can be believed, and store the result.
 
         Args:
-            method: ``frames`` with labels, a ``sequence`` of the map, or the ``map`` itself.
+            method: ``frames`` with labels, a ``sequence`` of the map, the ``map`` itself, or the ``labels`` of reviewed
+                frames.
             frames: with ``frames``: those that ``labels`` names as files.
             if_match: the revision that the map must have.
             deadline: seconds after which an answer is of no use.

@@ -15,6 +15,7 @@ from placerec_client._sync.enrolment import Enrolment, enrol_by_job
 from placerec_client._sync.following import follow
 from placerec_client._sync.jobs import Job
 from placerec_client._sync.places import Places
+from placerec_client._sync.review import Review
 from placerec_client._sync.sessions import Sessions
 from placerec_client._sync.transfers import Progress, export, upload
 from placerec_client.answers import parsed
@@ -100,6 +101,7 @@ class Map:
         sequences: its traverses.
         cameras: its cameras.
         sessions: its sessions.
+        review: frames of queries that it keeps for review.
     """
 
     def __init__(self, connection: Connection, map_id: str) -> None:
@@ -111,6 +113,7 @@ class Map:
         self.sequences = Sequences(connection, self.path)
         self.cameras = Cameras(connection, self.path)
         self.sessions = Sessions(connection, self.path)
+        self.review = Review(connection, self.path)
         self._query = self.path + "/query"
 
     def __repr__(self) -> str:
@@ -167,6 +170,17 @@ class Map:
     def plan(self, **options: Unpack[parameters.ReadPlan]) -> models.PlanView:
         """Return where all places are, column by column: made for maps of many places."""
         return self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
+
+    def compare(self, query: str, reference: str) -> models.SimilarityView:
+        """Compare two traverses frame by frame: what they share, and the size and scale of the matrix of scores."""
+        params = {"query": query, "reference": reference}
+        return self.connection.ask(models.SimilarityView, "GET", self.path + "/similarity", params=params)
+
+    def draw_comparison(self, query: str, reference: str) -> bytes:
+        """Return the matrix of scores of two traverses as a grey picture, a PNG file."""
+        params, headers = {"query": query, "reference": reference}, {"Accept": "image/png"}
+        response = self.connection.request("GET", self.path + "/similarity", params=params, headers=headers)
+        return response.content
 
     def answers(self, **options: Unpack[parameters.ListAnswers]) -> models.RecentAnswerList:
         """Return the latest answers that the service remembers, and the mix of verdicts."""
@@ -321,7 +335,7 @@ class Map:
     @overload
     def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -332,7 +346,7 @@ class Map:
     @overload
     def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -342,7 +356,7 @@ class Map:
     ) -> Job: ...
     def calibrate(
         self,
-        method: Literal["frames", "sequence", "map"],
+        method: Literal["frames", "sequence", "map", "labels"],
         *,
         frames: Mapping[str, Frame] | None = None,
         if_match: int | str | None = None,
@@ -353,7 +367,8 @@ class Map:
         """Measure when the map's answers can be believed, and store the result.
 
         Args:
-            method: ``frames`` with labels, a ``sequence`` of the map, or the ``map`` itself.
+            method: ``frames`` with labels, a ``sequence`` of the map, the ``map`` itself, or the ``labels`` of reviewed
+                frames.
             frames: with ``frames``: those that ``labels`` names as files.
             if_match: the revision that the map must have.
             deadline: seconds after which an answer is of no use.
