@@ -153,7 +153,9 @@ def model_field(name: str, schema: Mapping[str, Any], required: bool) -> str:
     kind = annotation(schema, sent=False)
     nullable = "None" in kind.split(" | ")
     default = schema.get("default")
-    if default is not None and not isinstance(default, list) and not isinstance(default, dict):
+    if isinstance(default, list) and default:
+        return f"    {name}: {kind} = Field(default={default!r})"
+    if default not in (None, []) and not isinstance(default, dict):
         return f"    {name}: {kind} = {default!r}"
     if nullable or (not required and not kind.startswith("list")):
         return f"    {name}: {kind if nullable else kind + ' | None'} = None"
