@@ -103,6 +103,10 @@ OPERATIONS: dict[str, Rule] = {
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
+    # The console's own files; what they ask for needs a key like any other request
+    "read_console": Rule("open", "none"),
+    "find_console": Rule("open", "none"),
+    "read_console_file": Rule("open", "none"),
     "read_metrics": Rule("query", "all"),  # its series name all maps
     # Maps
     "list_maps": Rule("query", "shown"),

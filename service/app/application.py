@@ -22,6 +22,7 @@ from service.access.keys import KeyStore
 from service.app import routes as root
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
+from service.console import routes as console
 from service.errors.problems import install_problems, problem_response
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
@@ -92,6 +93,7 @@ ROUTERS = (
     transfer_routes.router,
     jobs.router,
     root.encoders,
+    console.router,
 )
 
 
