@@ -240,7 +240,7 @@ function KeyForm({ done = () => {} }) {
 
 // Light and dark
 
-const THEMES = ["system", "light", "dark"];
+const THEMES = { system: "auto", light: "light", dark: "dark" };
 const theme = signal(document.documentElement.dataset.theme || "system");
 
 function choose(name) {
@@ -259,8 +259,8 @@ function Theme() {
   return html`
     <fieldset class="theme">
       <legend class="hidden">Colours</legend>
-      ${THEMES.map((name) => html`
-        <label><input type="radio" name="theme" checked=${theme.value === name} onChange=${() => choose(name)} /><span>${name}</span></label>
+      ${Object.entries(THEMES).map(([name, text]) => html`
+        <label><input type="radio" name="theme" checked=${theme.value === name} onChange=${() => choose(name)} /><span>${text}</span></label>
       `)}
     </fieldset>
   `;

@@ -140,8 +140,8 @@ export function Dialog({ title, close, wide = false, children }) {
   `;
 }
 
-/** A form in a dialog: it is sent once at a time, and shows what went wrong. */
-export function FormDialog({ title, action, danger = false, ready = true, close, send, wide, children }) {
+/** A form in a dialog: it is sent once at a time, and shows what went wrong; with `stay` it does not close by itself. */
+export function FormDialog({ title, action, danger = false, ready = true, stay = false, close, send, wide, children }) {
   const [error, setError] = useState(null);
   const [busy, setBusy] = useState(false);
   const submit = async (event) => {
@@ -151,7 +151,7 @@ export function FormDialog({ title, action, danger = false, ready = true, close,
     setError(null);
     try {
       await send();
-      close();
+      if (!stay) close();
     } catch (problem) {
       setError(problem);
     }

@@ -58,8 +58,8 @@ function Table({ items, open, close, changed }) {
       <table>
         <thead>
           <tr>
-            <th>Map</th><th>Health</th><th>Answers of the last day</th><th class="number">Places</th><th class="number">On disk</th>
-            <th>Encoder</th><th>Precision</th><th>Searched</th><th class="number">Revision</th><th>Edited</th><th><span class="hidden">Actions</span></th>
+            <th>Map</th><th>Health</th><th>Last day</th><th class="number">Places</th><th class="number">On disk</th>
+            <th>Encoder</th><th class="number">Revision</th><th>Edited</th><th><span class="hidden">Actions</span></th>
           </tr>
         </thead>
         <tbody>${items.map((map) => html`<${Row} key=${map.id} map=${map} open=${open} close=${close} changed=${changed} />`)}</tbody>
@@ -82,9 +82,10 @@ function Row({ map, open, close, changed }) {
       <td class="nowrap"><${VerdictMix} counts=${map.last_day} /></td>
       <td class="number">${integer(map.places)}</td>
       <td class="number" title=${`${integer(map.storage.bytes_per_place)} bytes a place`}>${bytes(descriptors + index + database)}</td>
-      <td title=${map.encoder}>${encoderName(map.encoder)}</td>
-      <td>${map.storage.precision}</td>
-      <td>${map.index.tier}${map.index.state === "building" && html` <span class="faint small">${Math.round(100 * map.index.progress)} %</span>`}</td>
+      <td class="nowrap">
+        <span title=${map.encoder}>${encoderName(map.encoder)}</span>
+        <div class="faint small">${map.storage.precision}, ${map.index.tier}${map.index.state === "building" && ` ${Math.round(100 * map.index.progress)} %`}</div>
+      </td>
       <td class="number">${map.revision}</td>
       <td class="nowrap"><${Moment} at=${map.updated_at} /></td>
       <td class="actions-cell">
