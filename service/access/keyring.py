@@ -103,6 +103,7 @@ class Keyring:
         self._read_at = self._looked_at = monotonic()
         self._used: dict[str, float] = {}
         self._written_at = monotonic()
+        self._looking = threading.Lock()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -179,7 +180,14 @@ class Keyring:
             self.look()
 
     def look(self) -> None:
-        """Read the file if it has changed, and write the last uses to it from time to time."""
+        """Read the file if it has changed, and write the last uses to it from time to time.
+
+        Whoever changes a key in this process calls this, so that the change counts at once.
+        """
+        with self._looking:
+            self._look()
+
+    def _look(self) -> None:
         self._looked_at = self._monotonic()
         try:
             if self._has_changed():

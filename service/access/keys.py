@@ -16,17 +16,27 @@ import re
 import secrets
 import sqlite3
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
 from core.places import check_map_id
 from service.access.roles import LEVELS, Role
-from service.errors.faults import InvalidRequest, KeysUnreadable
+from service.errors.faults import (
+    InvalidRequest,
+    KeyEnded,
+    KeyExists,
+    KeysUnreadable,
+    KeyWidened,
+    LastAdminKey,
+    TooManyKeys,
+    UnknownKey,
+)
 
 FILE = "keys.sqlite"
 MODE = 0o600
@@ -36,6 +46,9 @@ ID = re.compile(r"[0-9a-f]{12}")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 RESERVED = frozenset({"anonymous", "owner"})
 SECRET_BYTES = 32
+
+MOST_KEYS = 10_000
+"""Keys that a data directory may have, revoked ones included: a running service holds all of them in memory."""
 
 _TABLE = """CREATE TABLE keys (
     id TEXT PRIMARY KEY,
@@ -79,6 +92,12 @@ class Key:
     revoked_at: datetime | None = None
     last_used_at: datetime | None = None
 
+    def includes(self, other: Key) -> bool:
+        """Whether its holder may do whatever the holder of ``other`` may do, and for as long."""
+        of_maps = self.maps is None or (other.maps is not None and other.maps <= self.maps)
+        as_long = self.expires_at is None or (other.expires_at is not None and other.expires_at <= self.expires_at)
+        return LEVELS[other.role] <= LEVELS[self.role] and of_maps and as_long
+
     def seal(self) -> bytes:
         """The checksum of all fields but the last use."""
         values = [
@@ -118,13 +137,23 @@ class KeyStore:
         return True
 
     def create(
-        self, name: str, role: Role, maps: Iterable[str] | None = None, expires_at: datetime | None = None
+        self,
+        name: str,
+        role: Role,
+        maps: Iterable[str] | None = None,
+        expires_at: datetime | None = None,
+        keep_admin: bool = False,
     ) -> tuple[Key, str]:
         """Create a key; return it and its text, which is not stored.  It is on disk when this returns.
 
+        Args:
+            keep_admin: refuse a first key that cannot manage the service.
+
         Raises:
-            InvalidRequest: the name, the role or the expiry cannot be used, or another key in force has the name.
+            InvalidRequest: the name, the role or the expiry cannot be used.
+            KeyExists: another key in force has the name.
             InvalidIdentifier: the id of a map is not valid.
+            TooManyKeys, LastAdminKey.
         """
         if not NAME.fullmatch(name) or ID.fullmatch(name) or name in RESERVED:
             raise InvalidRequest(
@@ -136,14 +165,21 @@ class KeyStore:
         now = datetime.now(UTC)
         if expires_at is not None and expires_at <= now:
             raise InvalidRequest("The expiry of the key is in the past.")
-        if not self.exists():
-            self._make()
         identity = secrets.token_hex(6)
         token = f"placerec_{identity}_{secrets.token_urlsafe(SECRET_BYTES)}"
         key = Key(identity, name, role, limits, digest_of(token.encode()), now, expires_at)
+        if not self.exists():
+            if keep_admin:
+                _check_admin([key], now)  # before there is a file, with which keys are needed
+            self._make()
         with self.changing() as connection:
-            if any(other.name == name and in_force(other, now) for other in read_keys(connection)):
-                raise InvalidRequest(f"There is already a key {name!r}. Revoke it first, or choose another name.")
+            keys = read_keys(connection)
+            if any(other.name == name and in_force(other, now) for other in keys):
+                raise KeyExists(f"There is already a key {name!r}. Revoke it first, or choose another name.")
+            if len(keys) >= MOST_KEYS:
+                raise TooManyKeys(f"{MOST_KEYS} keys were created, which is the most that one data directory holds.")
+            if keep_admin:
+                _check_admin([*keys, key], now)
             _put(connection, key)
         return key, token
 
@@ -154,24 +190,79 @@ class KeyStore:
         with closing(self.open()) as connection, _refusals(self.path):
             return read_keys(connection)
 
-    def revoke(self, id_or_name: str) -> Key:
-        """Revoke a key; it is no error if it is already revoked.
+    def find(self, key_id: str) -> Key:
+        """The key of this id.
 
         Raises:
-            InvalidRequest: there is no such key, or several have the name.
+            UnknownKey: there is none.
+        """
+        return _of_id(self.all(), key_id)
+
+    def narrow(self, key_id: str, changes: Mapping[str, Any], keep_admin: bool = False) -> Key:
+        """Let the holder of a key do less, or for a shorter time.
+
+        Args:
+            changes: new values of ``role``, ``maps`` and ``expires_at``; what is left out stays.
+            keep_admin: refuse to narrow the last key that can manage the service.
+
+        Raises:
+            UnknownKey, KeyEnded, LastAdminKey.
+            KeyWidened: the holder could do more than before: a key keeps the terms on which it was given away.
+            InvalidRequest: the expiry is in the past.
+            InvalidIdentifier: the id of a map is not valid.
         """
         now = datetime.now(UTC)
         if not self.exists():
-            raise InvalidRequest("No key was ever created in this data directory.")
+            raise _unknown(key_id)
+        with self.changing() as connection:
+            keys = read_keys(connection)
+            before = _of_id(keys, key_id)
+            if not in_force(before, now):
+                raise KeyEnded(f"The key {before.name!r} is revoked or has expired; create another one.")
+            after = replace(before, **changes)
+            for map_id in after.maps or ():
+                check_map_id(map_id)
+            if not before.includes(after):
+                raise KeyWidened(
+                    f"The holder of the key {before.name!r} could do more than before. Create another key, and revoke "
+                    "this one."
+                )
+            if after.expires_at is not None and after.expires_at <= now:
+                raise InvalidRequest("The expiry of the key is in the past. Revoke it instead.")
+            if keep_admin and is_admin(before):
+                _check_admin([after if key is before else key for key in keys], now)
+            _put(connection, after)
+        return after
+
+    def revoke(self, id_or_name: str, keep_admin: bool = False) -> Key:
+        """Revoke a key; it is no error if it is already revoked.
+
+        Args:
+            keep_admin: refuse to revoke the last key that can manage the service.
+
+        Raises:
+            UnknownKey: there is no such key.
+            InvalidRequest: several keys have the name.
+            LastAdminKey.
+        """
+        now = datetime.now(UTC)
+        if not self.exists():
+            raise UnknownKey("No key was ever created in this data directory.")
         with self.changing() as connection:
             keys = read_keys(connection)
             found = [key for key in keys if key.id == id_or_name]
             found = found or [key for key in keys if key.name == id_or_name and key.revoked_at is None]
             found = found or [key for key in keys if key.name == id_or_name]
-            if len(found) != 1:
-                many = "Several keys have this name; give an id" if found else "There is no such key"
-                raise InvalidRequest(f"{many} ({id_or_name[:80]!r}).")
-            key = found[0] if found[0].revoked_at is not None else replace(found[0], revoked_at=now)
+            if not found:
+                raise _unknown(id_or_name)
+            if len(found) > 1:
+                raise InvalidRequest(f"Several keys have this name; give an id ({id_or_name[:80]!r}).")
+            before = found[0]
+            if before.revoked_at is not None:
+                return before
+            if keep_admin and is_admin(before) and in_force(before, now):
+                _check_admin([key for key in keys if key is not before], now)
+            key = replace(before, revoked_at=now)
             _put(connection, key)
         return key
 
@@ -230,6 +321,31 @@ class KeyStore:
 def in_force(key: Key, now: datetime) -> bool:
     """Whether a key is neither revoked nor expired at a moment."""
     return key.revoked_at is None and (key.expires_at is None or now < key.expires_at)
+
+
+def is_admin(key: Key) -> bool:
+    """Whether a key can manage the service: it has the role admin, and is not limited to maps."""
+    return key.role == "admin" and key.maps is None
+
+
+def _check_admin(keys: Iterable[Key], now: datetime) -> None:
+    """Raise LastAdminKey if no key in force can manage the service."""
+    if not any(is_admin(key) and in_force(key, now) for key in keys):
+        raise LastAdminKey(
+            "No key of the role admin for all maps would be in force, and only a command on the service's machine "
+            "could create one. Create such a key first, or send ?lock_out=true."
+        )
+
+
+def _of_id(keys: Iterable[Key], key_id: str) -> Key:
+    for key in keys:
+        if key.id == key_id:
+            return key
+    raise _unknown(key_id)
+
+
+def _unknown(id_or_name: str) -> UnknownKey:
+    return UnknownKey(f"There is no such key ({id_or_name[:80]!r}).")
 
 
 def read_keys(connection: sqlite3.Connection) -> list[Key]:

@@ -103,11 +103,20 @@ OPERATIONS: dict[str, Rule] = {
     "read_openapi": Rule("open", "none"),
     "read_documentation": Rule("open", "none"),
     "read_documentation_file": Rule("open", "none"),
+    "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
+    "read_metrics": Rule("query", "all"),  # its series name all maps
     # The console's own files; what they ask for needs a key like any other request
     "read_console": Rule("open", "none"),
     "find_console": Rule("open", "none"),
     "read_console_file": Rule("open", "none"),
-    "read_metrics": Rule("query", "all"),  # its series name all maps
+    # Keys and the audit trail: they tell of all maps, and of everybody
+    "read_own_key": Rule("query", "none"),
+    "list_keys": Rule("admin", "all"),
+    "create_key": Rule("admin", "all", changes=True),
+    "read_key": Rule("admin", "all"),
+    "narrow_key": Rule("admin", "all", changes=True),
+    "revoke_key": Rule("admin", "all", changes=True),
+    "read_audit": Rule("admin", "all"),
     # Maps
     "list_maps": Rule("query", "shown"),
     "read_map": Rule("query", "path"),

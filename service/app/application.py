@@ -19,7 +19,9 @@ from service.access.audit import audit_file
 from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
 from service.access.keys import KeyStore
+from service.administration import audit_routes, key_routes
 from service.app import routes as root
+from service.app import service_state
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
 from service.console import routes as console
@@ -72,6 +74,8 @@ TAGS = [
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
+    {"name": "keys", "description": "A key says who asks, what its holder may do, and with which maps."},
+    {"name": "audit", "description": "The audit trail says who changed what, and who was refused."},
     {"name": "service", "description": "Health, metrics and version of the service."},
 ]
 
@@ -92,6 +96,10 @@ ROUTERS = (
     upkeep.router,
     transfer_routes.router,
     jobs.router,
+    key_routes.own,
+    key_routes.router,
+    audit_routes.router,
+    service_state.router,
     root.encoders,
     console.router,
 )
@@ -173,7 +181,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with audit_file(chosen.audit_file), keyring or nullcontext():
+        with audit_file(chosen.audit_file) as latest_lines, keyring or nullcontext():
+            app.state.audit_lines = latest_lines
             warn_if_exposed(gate, chosen)
             runtime = await to_thread.run_sync(Runtime, chosen, metrics)
             runtime.publish(app.state)
@@ -202,7 +211,7 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     for router in ROUTERS:
         app.include_router(router)
     app.router.default = _not_found
-    app.state.gate = gate
+    app.state.gate, app.state.key_store = gate, store
     app.state.metrics, app.state.upload_memory = metrics, UploadMemory(chosen.max_upload_memory)
     app.add_middleware(BodyLimit, settings=chosen, memory=app.state.upload_memory)
     app.add_middleware(Access, gate=gate, endpoints=endpoints_of(app.routes), metrics=metrics)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from contextlib import ExitStack, suppress
+from datetime import UTC, datetime
 from functools import partial
 
 from anyio import CapacityLimiter, to_thread
@@ -43,6 +44,7 @@ class Runtime:
 
     def __init__(self, settings: Settings, metrics: Metrics) -> None:
         self.settings = settings
+        self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
             self.engine = Engine(settings, metrics)
             opened.callback(self.engine.close)

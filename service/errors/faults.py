@@ -170,6 +170,30 @@ class ForeignPage(Fault):
     """While there are no keys: the request comes from a web page of another site, or is sent to another host name."""
 
 
+class UnknownKey(InvalidRequest):
+    """No key of this id or name was ever created."""
+
+
+class KeyExists(InvalidRequest):
+    """Another key in force has the name."""
+
+
+class KeyEnded(Fault):
+    """The key is revoked or has expired, so it cannot be changed."""
+
+
+class KeyWidened(Fault):
+    """The change would let the holder of a key do more than before."""
+
+
+class LastAdminKey(Fault):
+    """After the change no key could manage the service any more, and the caller did not say that this is wanted."""
+
+
+class TooManyKeys(Fault):
+    """As many keys were created as the file of the keys may hold."""
+
+
 class KeysUnreadable(Fault):
     """The file of the keys is damaged, missing or unreadable, so nobody is let in."""
 

@@ -170,6 +170,12 @@ KINDS: dict[type[Exception], Kind] = {
     faults.MapForbidden: Kind(403, "map-forbidden", "The key is limited to other maps"),
     faults.ForeignPage: Kind(403, "foreign-page", "Requests from other web sites are refused"),
     faults.RateExceeded: Kind(429, "rate-exceeded", "Too many requests a second"),
+    faults.UnknownKey: Kind(404, "unknown-key", "The key does not exist"),
+    faults.KeyExists: Kind(409, "key-exists", "Another key has this name"),
+    faults.KeyEnded: Kind(409, "key-ended", "The key is revoked or has expired"),
+    faults.KeyWidened: Kind(409, "key-widened", "A key can only be narrowed"),
+    faults.LastAdminKey: Kind(409, "last-admin-key", "No key could manage the service any more"),
+    faults.TooManyKeys: Kind(409, "too-many-keys", "No more keys can be created"),
     faults.KeysUnreadable: Kind(503, "keys-unreadable", "The keys cannot be read"),
 }
 

@@ -150,10 +150,12 @@ _PLACE = _MAP | {"place": "$request.path.place"}
 _CAMERA = _MAP | {"camera": "$request.path.camera"}
 _SESSION = _MAP | {"session": "$response.body#/id"}
 _SAME_SESSION = _MAP | {"session": "$request.path.session"}
+_MADE_KEY = {"key": "$response.body#/id"}
 _MADE_JOB = {"job": "$response.body#/id"}
 _JOB = {"job": "$request.path.job"}
 
 LINKS: dict[str, dict[str, dict[str, dict[str, str]]]] = {
+    "create_key": {"201": dict.fromkeys(("read_key", "narrow_key", "revoke_key"), _MADE_KEY)},
     "create_map": {
         "201": dict.fromkeys(
             (

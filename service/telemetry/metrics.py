@@ -11,6 +11,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from core.judgement.verdict import Verdict
+from service.telemetry.latencies import RecentLatencies
 
 FAST = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5)
 SECONDS = (*FAST, 5.0, 10.0, 30.0)
@@ -48,6 +49,7 @@ class Metrics:
         self._stages: dict[str, Histogram] = {}
         self._verdicts: dict[tuple[str, str], Counter] = {}
         self._scores: dict[str, Histogram] = {}
+        self.latencies = RecentLatencies()
         ProcessCollector(registry=self.registry)
         self.requests = Histogram(
             "placerec_request_seconds",
@@ -97,10 +99,15 @@ class Metrics:
 
     def observe_request(self, route: str, method: str, status: int, seconds: float) -> None:
         """Count a request and its duration."""
+        self.latencies.observe(method, route, status, seconds)
         key = (route, method, status)
         if key not in self._requests:  # looking up a series costs more than counting in it
             self._requests[key] = self.requests.labels(route, method, str(status))
         self._requests[key].observe(seconds)
+
+    def requests_under_way(self) -> float:
+        """The number of requests and WebSockets that are being answered."""
+        return self.under_way.collect()[0].samples[0].value
 
     def observe_stages(self, milliseconds: Mapping[str, float]) -> None:
         """Count the durations of the stages of an encoding."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import httpx
 
+from service.access.keys import KeyStore
 from tests.fuzz import api, http, images, streams
 from tests.fuzz.encoder import SMALL, install_small_encoder
 from tests.fuzz.pictures.originals import originals
@@ -23,14 +25,19 @@ WARM = 5000
 
 
 @contextmanager
-def service(url: str | None, **settings: object) -> Iterator[tuple[str, Server | None]]:
-    """The URL of a service: the given one, or a new server with a small encoder, which is stopped afterwards."""
+def service(url: str | None, key: bool = False, **settings: object) -> Iterator[tuple[str, Server | None]]:
+    """The URL of a service: the given one, or a new server with a small encoder, which is stopped afterwards.
+
+    Args:
+        key: let a new server have a key, which its client sends.
+    """
     if url is not None:
         yield url, None
         return
     with tempfile.TemporaryDirectory(prefix="placerec-fuzz-") as folder:
         install_small_encoder(Path(folder) / "models")
-        server = Server(Path(folder), {"encoder": SMALL, "log_level": "warning", **settings}).wait()
+        token = KeyStore(Path(folder) / "data").create("fuzzer", "admin")[1] if key else None
+        server = Server(Path(folder), {"encoder": SMALL, "log_level": "warning", **settings}, key=token).wait()
         try:
             yield str(server.client.base_url), server
         finally:
@@ -72,9 +79,10 @@ def fuzz_images(options: argparse.Namespace) -> int:
 
 def fuzz_api(options: argparse.Namespace) -> int:
     """schemathesis; 1 if a check failed."""
-    with service(options.url, **api.TIGHT) as (url, _):
+    with service(options.url, key=True, **api.TIGHT) as (url, server):
         seconds = str(round(60 * options.minutes))
-        done = api.run(url, options.seed, options.phases, ["--max-time", seconds])
+        key = os.environ.get("PLACEREC_KEY") if server is None else server.key
+        done = api.run(url, options.seed, options.phases, ["--max-time", seconds], key)
     print(done.stdout, done.stderr, sep="")
     return done.returncode
 

@@ -27,16 +27,22 @@ ALL = "examples,coverage,fuzzing,stateful"
 """The phases: the examples of the document, its boundaries, drawn requests, chains of requests along links."""
 
 
-def run(url: str, seed: int, phases: str = ALL, more: Sequence[str] = ()) -> subprocess.CompletedProcess[str]:
+def run(
+    url: str, seed: int, phases: str = ALL, more: Sequence[str] = (), key: str | None = None
+) -> subprocess.CompletedProcess[str]:
     """All checks on all operations; the status is 0 if every check held.
 
     Args:
         url: of the service.
         seed: of what is drawn.
         more: arguments of ``schemathesis run``.
+        key: of the service; None if it has no keys, which it gets as soon as a drawn request creates one.
     """
     command = [sys.executable, "-c", "from schemathesis.cli import schemathesis; schemathesis()"]
     command += ["--config-file", str(CONFIGURATION), "run", f"{url}/openapi.json", "--no-color"]
     command += ["--checks", "all", "--phases", phases, "--seed", str(seed), "--continue-on-failure", *more]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    if key is not None:
+        command += ["--header", f"Authorization: Bearer {key}"]
+        environment["PLACEREC_KEY"] = key  # for tests.fuzz.hooks
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)

@@ -6,6 +6,8 @@ request deletes is put back, except in runs through links, which make what they 
 
 from __future__ import annotations
 
+import os
+import uuid
 from typing import Any
 
 import httpx
@@ -30,8 +32,10 @@ class Fixtures:
     """What exists in a service, and how to put it back."""
 
     def __init__(self, url: str) -> None:
-        self._client = httpx.Client(base_url=url, timeout=30)
-        self.session = self.explanation = self.job = ""
+        key = os.environ.get("PLACEREC_KEY")
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        self._client = httpx.Client(base_url=url, timeout=30, headers=headers)
+        self.session = self.explanation = self.job = self.key = ""
 
     def put_back(self) -> None:
         """Make what is missing."""
@@ -50,14 +54,26 @@ class Fixtures:
         if not self.job or self._client.get(f"/v1/jobs/{self.job}").status_code != 200:
             self.job = self._client.post(f"/v1/maps/{OTHER_MAP}/prune", json={"dry_run": True}).json().get("id", "")
 
+        if self._client.get(f"/v1/keys/{self.key or 'none'}").json().get("state") != "in force":
+            new = {"name": f"spare-{uuid.uuid4()}", "role": "enrol"}
+            self.key = self._client.post("/v1/keys", json=new).json().get("id", "")
+
     def names(self) -> dict[str, str]:
         """Path parameter -> a name that exists."""
         known = {"map": MAP, "place": "p1", "camera": CAMERA, "sequence": SEQUENCE, "session": self.session}
-        return {name: value for name, value in (known | {"job": self.job}).items() if value}
+        return {name: value for name, value in (known | {"job": self.job, "key": self.key}).items() if value}
 
 
 _fixtures: dict[str, Fixtures] = {}
-_DELETES = ("delete_map", "forget_place", "delete_sequence", "forget_camera", "delete_session", "prune_map")
+_DELETES = (
+    "delete_map",
+    "forget_place",
+    "delete_sequence",
+    "forget_camera",
+    "delete_session",
+    "prune_map",
+    "revoke_key",
+)
 
 
 def _of(case: Case[Any]) -> Fixtures:

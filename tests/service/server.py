@@ -44,7 +44,7 @@ class Server:
         wrapper: Sequence[str] = (),
         key: str | None = None,
     ) -> None:
-        self.folder, self.port = folder, free_port()
+        self.folder, self.port, self.key = folder, free_port(), key
         self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
         folder.mkdir(parents=True, exist_ok=True)
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}

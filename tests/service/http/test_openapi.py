@@ -26,6 +26,7 @@ OPERATIONS = {
     "export_map", "import_map",
     "list_jobs", "read_job", "follow_job", "cancel_job",
     "encode", "regions", "match", "list_encoders",
+    "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "revoke_key", "read_audit", "read_service",
 }  # fmt: skip
 FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")
 

@@ -1,0 +1,180 @@
+"""Routes of keys: create, list, read, narrow and revoke them; and who asks.
+
+A change is on disk when it is answered, and counts for every later request.  The command line changes the same file
+(``placerec keys``), so a service that nobody may manage any more can be opened again on its own machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+
+from core import errors
+from core.storage.pagination import Listing, decode_name, encode_cursor
+from service.access.gate import Gate
+from service.access.keys import Key, KeyStore
+from service.administration.key_schemas import CreatedKey, KeyChanges, KeyPage, KeyView, NewKey, OwnKey
+from service.errors.faults import (
+    BodyTooLarge,
+    InvalidRequest,
+    KeyEnded,
+    KeyExists,
+    KeyWidened,
+    LastAdminKey,
+    MalformedBody,
+    TooManyKeys,
+    UnknownKey,
+    UnsupportedMediaType,
+)
+from service.errors.problems import problem_documentation
+from service.http.openapi import json_patch
+from service.http.routing import (
+    EngineDep,
+    FromState,
+    Page,
+    PrincipalDep,
+    StrictRoute,
+    json_body,
+    single_values,
+)
+
+LISTING: Listing = ["keys"]
+BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType, errors.InvalidIdentifier)
+
+router = APIRouter(prefix="/v1/keys", tags=["keys"], route_class=StrictRoute, dependencies=[Depends(single_values)])
+own = APIRouter(prefix="/v1/key", tags=["keys"], dependencies=[Depends(single_values)])
+
+GateDep = Annotated[Gate, Depends(FromState("gate"))]
+StoreDep = Annotated[KeyStore, Depends(FromState("key_store"))]
+KeyId = Annotated[str, Path(alias="key", max_length=64, description="Id of the key.", examples=["c69fcf6b7439"])]
+LockOut = Annotated[
+    bool,
+    Query(
+        description="Go on although no key of the role admin for all maps will be in force, so that only a command on "
+        "the service's machine can change keys."
+    ),
+]
+
+
+@own.get("")
+def read_own_key(gate: GateDep, store: StoreDep, principal: PrincipalDep) -> OwnKey:
+    """Read who asks, and what the key of the request allows."""
+    expires_at = None if principal.key_id is None else store.find(principal.key_id).expires_at
+    return OwnKey(
+        id=principal.key_id,
+        name=principal.name,
+        role=principal.role,
+        maps=None if principal.maps is None else sorted(principal.maps),
+        expires_at=expires_at,
+        keys_needed=gate.keyring is not None and gate.keyring.demanded,
+    )
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_keys(page: Page, store: StoreDep, principal: PrincipalDep) -> KeyPage:
+    """List every key that was ever created, the oldest first, without their secrets."""
+    after = decode_name(LISTING, page.cursor)
+    found = [key for key in store.all() if _position(key) > after]
+    more = encode_cursor(LISTING, _position(found[page.limit - 1])) if len(found) > page.limit else None
+    return KeyPage(items=[KeyView.of(key, principal.key_id) for key in found[: page.limit]], next_cursor=more)
+
+
+def _position(key: Key) -> str:
+    """Text that sorts as keys are listed."""
+    return f"{key.created_at:%Y-%m-%dT%H:%M:%S.%f} {key.id}"
+
+
+@router.post(
+    "",
+    status_code=201,
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(*BODY_PROBLEMS, KeyExists, TooManyKeys, LastAdminKey),
+)
+def create_key(
+    new: NewKey,
+    request: Request,
+    response: Response,
+    gate: GateDep,
+    store: StoreDep,
+    engine: EngineDep,
+    lock_out: LockOut = False,
+) -> CreatedKey:
+    """Create a key, which is shown only in this answer.
+
+    The first key of a service turns keys on: from this answer on every request needs one, also once all keys are
+    revoked or have expired. It has to be of the role admin for all maps, or `lock_out` has to be true.
+    """
+    request.state.noted = _noted(new.model_dump(include={"name", "role", "maps"}))
+    key, token = store.create(new.name, new.role, new.maps, new.expires_at, keep_admin=not lock_out)
+    _take_effect(gate)
+    request.state.noted["changed_key"] = key.id
+    response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{key.id}"
+    response.headers["Cache-Control"] = "no-store"
+    return CreatedKey.made(key, token)
+
+
+@router.get("/{key}", responses=problem_documentation(UnknownKey))
+def read_key(key_id: KeyId, store: StoreDep, principal: PrincipalDep) -> KeyView:
+    """Read a key without its secret."""
+    return KeyView.of(store.find(key_id), principal.key_id)
+
+
+@router.patch(
+    "/{key}",
+    dependencies=[Depends(json_body)],
+    openapi_extra=json_patch(KeyChanges),
+    responses=problem_documentation(*BODY_PROBLEMS, UnknownKey, KeyEnded, KeyWidened, LastAdminKey),
+)
+def narrow_key(
+    key_id: KeyId,
+    changes: KeyChanges,
+    request: Request,
+    gate: GateDep,
+    store: StoreDep,
+    principal: PrincipalDep,
+    lock_out: LockOut = False,
+) -> KeyView:
+    """Narrow a key by a merge patch: a lower role, fewer maps, an earlier expiry.
+
+    Its holder can never do more than on the day on which the key was created; for that, create another key.
+    """
+    given = changes.model_dump(exclude_unset=True)
+    request.state.noted = _noted({"key": key_id, **given})
+    if "role" in given and given["role"] is None:
+        raise InvalidRequest("role: a key has a role; give query, enrol or admin.")
+    if given.get("maps") is not None:
+        given["maps"] = frozenset(given["maps"])
+    key = store.narrow(key_id, given, keep_admin=not lock_out)
+    _take_effect(gate)
+    request.state.noted["changed_key_name"] = key.name
+    return KeyView.of(key, principal.key_id)
+
+
+@router.delete("/{key}", responses=problem_documentation(UnknownKey, LastAdminKey))
+def revoke_key(
+    key_id: KeyId, request: Request, gate: GateDep, store: StoreDep, principal: PrincipalDep, lock_out: LockOut = False
+) -> KeyView:
+    """Revoke a key: no later request is let in with it. Repeating this changes nothing."""
+    request.state.noted = _noted({"key": key_id})
+    store.find(key_id)  # the store would also take a name
+    key = store.revoke(key_id, keep_admin=not lock_out)
+    _take_effect(gate)
+    request.state.noted["changed_key_name"] = key.name
+    return KeyView.of(key, principal.key_id)
+
+
+def _take_effect(gate: Gate) -> None:
+    """Let the running service know of a change before it is answered."""
+    if gate.keyring is not None:
+        gate.keyring.look()
+
+
+def _noted(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """What the audit trail says of a change of a key, under names that do not hide who asked for it."""
+    names = {"key": "changed_key", "name": "changed_key_name"}
+    shown = {names.get(name, name): value for name, value in changes.items()}
+    if shown.get("expires_at") is not None:
+        shown["expires_at"] = shown["expires_at"].isoformat()
+    return shown
