@@ -206,6 +206,9 @@ class Settings(BaseSettings):
     job_watchers: int = Field(
         default=64, ge=1, le=10_000, description="Most clients that follow jobs at the same time."
     )
+    event_listeners: int = Field(
+        default=64, ge=1, le=10_000, description="Most clients that listen to the events of maps at the same time."
+    )
     statistics_seconds: Seconds = Field(
         default=30.0,
         description="Seconds between two writes of the statistics of queries; a crash loses the last ones.",

@@ -68,6 +68,12 @@ def asker_fields(asker: Asker) -> dict[str, Any]:
     return {name: value for name, value in asdict(asker).items() if value is not None}
 
 
+def asker_of_fields(fields: Mapping[str, Any]) -> Asker:
+    """Who asked, from what :func:`asker_fields` gave; nobody if there are none."""
+    known = Asker.__dataclass_fields__
+    return Asker(**{"principal": "", **{name: value for name, value in fields.items() if name in known}})
+
+
 def note_change(asker: Asker, path: Mapping[str, str], noted: Mapping[str, Any], status: int) -> None:
     """Log a request that changes a map, once it has been answered.
 

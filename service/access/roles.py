@@ -123,6 +123,7 @@ OPERATIONS: dict[str, Rule] = {
     "create_map": Rule("admin", "named", changes=True),
     "edit_map": Rule("admin", "path", changes=True),
     "delete_map": Rule("admin", "path", changes=True),
+    "follow_map": Rule("query", "path"),  # pictures need the role enrol, which also sees who asked
     "verify_map": Rule("admin", "path"),  # it reads all that is stored, which keeps the disk busy
     # Places, traverses, cameras: what an enrolment creates, replaces and deletes
     "enrol_place": Rule("enrol", "path", changes=True),

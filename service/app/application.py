@@ -26,11 +26,12 @@ from service.app.gauges import gauges
 from service.app.runtime import Runtime
 from service.console import routes as console
 from service.errors.problems import install_problems, problem_response
+from service.events.schemas import EnrolmentEvent, JobEvent, Listening, MapEvent, Missed, QueryEvent, SessionEvent
 from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
 from service.jobs import routes as jobs
-from service.maps import calibration, camera_routes, transfer_routes
+from service.maps import calibration, camera_routes, event_routes, transfer_routes
 from service.maps import routes as maps
 from service.maps.schemas import CalibrationOrder
 from service.places import routes as places
@@ -86,6 +87,7 @@ ROUTERS = (
     places.router,
     places.traverses,
     camera_routes.router,
+    event_routes.router,
     calibration.router,
     loop_closure.router,
     multi_map_routes.router,
@@ -105,6 +107,9 @@ ROUTERS = (
 )
 
 
+EVENTS = (Listening, Missed, QueryEvent, EnrolmentEvent, SessionEvent, JobEvent, MapEvent)
+
+
 def _operation_id(route: APIRoute) -> str:
     """An operation has the name of its function."""
     return route.name
@@ -114,8 +119,8 @@ class Application(FastAPI):
     """FastAPI with an OpenAPI document that also says what every operation can answer."""
 
     def openapi(self) -> dict[str, Any]:
-        """The document, with the models of bodies that routes read by hand."""
-        return document(self, (BatchItem, CalibrationOrder))
+        """The document, with the models of bodies that routes read by hand, and of events."""
+        return document(self, (BatchItem, CalibrationOrder, *EVENTS))
 
 
 class RootPath:

@@ -54,9 +54,10 @@ class Runtime:
                 settings.job_queue,
                 settings.job_history,
                 settings.job_watchers,
+                self.engine.events,
             )
             opened.callback(self.jobs.close, 0.0)
-            self.sessions = Sessions(settings)
+            self.sessions = Sessions(settings, self.engine.events)
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.batch_order = BatchOrder()

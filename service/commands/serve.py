@@ -59,6 +59,7 @@ def _serve_logged(settings: Settings) -> None:
 
     def stop() -> None:
         application.state.jobs.stop_soon()
+        application.state.engine.events.stop_soon()
 
     try:
         serve_application(

@@ -1,4 +1,4 @@
-"""The engine: maps, encoders, the queue in front of the encoders, searches, and one lock for each map."""
+"""The engine: maps, encoders, the queue in front of the encoders, searches, events, and one lock for each map."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from service.engine.encoder_threads import AfterEncoding, Encoded
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
+from service.events.events import Events
 from service.settings import Settings
 from service.telemetry.metrics import MapCollector, Metrics
 from service.worker_threads import in_thread as in_thread
@@ -75,7 +76,7 @@ async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
 
 
 class Engine:
-    """The maps of a data directory, the installed encoders, the queue in front of them, and a lock for each map.
+    """The maps of a data directory, their events, the installed encoders with their queue, and a lock for each map.
 
     Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
@@ -90,6 +91,7 @@ class Engine:
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
         self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
         self.searches = Searches()
+        self.events = Events(settings.event_listeners)
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
         self._locks = MapLocks()
@@ -104,6 +106,7 @@ class Engine:
 
     def close(self) -> None:
         """Cancel the waiting frames and release the data directory; blocks."""
+        self.events.stop_soon()
         self.metrics.registry.unregister(self._map_collector)
         self.queue.close()
         self.atlas.close()

@@ -126,6 +126,10 @@ class TooManyWatchers(Fault):
     """Too many clients follow jobs."""
 
 
+class TooManyListeners(Fault):
+    """Too many clients listen to the events of maps."""
+
+
 class UnknownSession(Fault):
     """The map has no session of this id."""
 

@@ -151,6 +151,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.StagingFull: Kind(503, "staging-full", "Too many frames are waiting to be enrolled"),
     faults.JobQueueFull: Kind(503, "job-queue-full", "Too many jobs are waiting"),
     faults.TooManyWatchers: Kind(503, "too-many-watchers", "Too many clients follow jobs"),
+    faults.TooManyListeners: Kind(503, "too-many-listeners", "Too many clients listen to events"),
     faults.NotReady: Kind(503, "not-ready", "The service is not ready"),
     faults.Stopping: Kind(503, "stopping", "The service is stopping"),
     faults.TooManyConnections: Kind(503, "too-many-connections", "Too many connections are open"),
@@ -197,6 +198,7 @@ RETRY_LATER = (
     faults.TooManyExports,
     faults.TooManyImports,
     faults.TooManyWatchers,
+    faults.TooManyListeners,
     faults.TooManySessions,
     faults.TooManyConnections,
     faults.Stopping,
@@ -208,6 +210,7 @@ RETRY_LATE = (
     faults.TooManyImports,
     faults.JobQueueFull,
     faults.TooManyWatchers,
+    faults.TooManyListeners,
     faults.TooManySessions,
     faults.Stopping,
 )

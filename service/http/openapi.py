@@ -232,7 +232,7 @@ def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, 
     """The application's OpenAPI document; it is made once and kept.
 
     Args:
-        models: models of bodies that routes parse themselves, which the framework therefore does not find.
+        models: models of bodies that routes parse themselves, and of events, which the framework does not find.
     """
     if app.openapi_schema is None:
         made = get_openapi(
@@ -247,7 +247,8 @@ def document(app: FastAPI, models: Iterable[type[BaseModel]] = ()) -> dict[str, 
         unseen: list[type[BaseModel]] = [Problem, *models]
         for model in unseen:
             described = model.model_json_schema(ref_template=COMPONENT + "{model}")
-            schemas.update(described.pop("$defs", {}))
+            for name, nested in described.pop("$defs", {}).items():
+                schemas.setdefault(name, nested)
             schemas[model.__name__] = described
         made["components"]["headers"] = {"X-Request-Id": REQUEST_ID}
         made["components"]["examples"] = problem_examples()

@@ -22,9 +22,11 @@ from pathlib import Path
 from typing import Any
 
 from core.errors import PlacerecError
-from service.access.audit import note_job, now_asking
+from service.access.audit import ASKER, asker_of_fields, note_job, now_asking
 from service.errors.faults import JobEnded, JobLost, JobQueueFull, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_of
+from service.events.events import Events
+from service.events.schemas import JobEvent
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
 from service.jobs.records import DAMAGED, Job, JobRecords
 
@@ -32,6 +34,9 @@ __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jo
 
 MOST_RESULT_BYTES = 4 << 20
 """The longest result, as JSON, that a job may have."""
+
+TELLING_SECONDS = 1.0
+"""Listeners of a map are told of a job's progress at most once in this time."""
 
 Discard = Callable[[Job], None]
 """Removes the files of a job once the job has ended."""
@@ -48,6 +53,7 @@ class Jobs:
         longest_queue: how many jobs may wait.
         history: how many ended jobs are remembered.
         most_watchers: how many clients may follow jobs at one time.
+        events: is told how the jobs go on; None: nobody is.
 
     Raises:
         DataDirectoryTooNew: a later version of placerec wrote the jobs' file.
@@ -61,9 +67,11 @@ class Jobs:
         longest_queue: int = 32,
         history: int = 200,
         most_watchers: int = 64,
+        events: Events | None = None,
     ) -> None:
         self._workers, self._longest_queue, self._history = workers, longest_queue, history
-        self._most_watchers = most_watchers
+        self._most_watchers, self._events = most_watchers, events
+        self._told: dict[str, tuple[str, float]] = {}  # of running jobs: the state that was told last, and when
         self.stopping = False
         self._changed = threading.Condition()  # held while a job is changed
         self._records = JobRecords(directory)
@@ -170,6 +178,7 @@ class Jobs:
             self._last_number = job.number
             self._works[job.id], self._jobs[job.id] = chosen, job
             self._changed.notify_all()
+        self._tell(job)
         log.info("job queued", extra={"job": job.id, "kind": kind, "map": map_id})
         return job
 
@@ -255,6 +264,7 @@ class Jobs:
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
         context = JobContext(self, job)
+        ASKER.set(asker_of_fields(job.asker))  # what it does is done for who asked for it
         try:
             result = dict(self._works[job.id](context))
             if len(json.dumps(result, allow_nan=False)) > MOST_RESULT_BYTES:
@@ -380,10 +390,40 @@ class Jobs:
 
     def _notify(self, job_id: str | None) -> None:
         """Wake the watchers of a job; all watchers for None."""
+        if job_id is not None and (job := self._jobs.get(job_id)) is not None:
+            self._tell(job)
         for watched, loop, event in self._watchers.copy():
             if job_id in (None, watched):
                 with suppress(RuntimeError):  # its loop has ended
                     loop.call_soon_threadsafe(event.set)
+
+    def _tell(self, job: Job) -> None:
+        """Tell the listeners of the job's maps how it is; that it only went on is told at most once in a while."""
+        used, events = job.used_maps(), self._events
+        if events is None or not any(events.heard(name) for name in used if name is not None):
+            return
+        state, now = f"{job.state} {job.cancelling}", time.monotonic()
+        told, moment = self._told.get(job.id, ("", 0.0))
+        if told == state and now - moment < TELLING_SECONDS:
+            return
+        self._told[job.id] = (state, now)
+        if job.ended:
+            del self._told[job.id]
+        for name in used - {None}:
+            events.publish(_event(str(name), job), maps=frozenset(used))
+
+
+def _event(map_id: str, job: Job) -> JobEvent:
+    return JobEvent.now(
+        map_id,
+        asker_of_fields(job.asker),
+        job=job.id,
+        job_kind=job.kind,
+        state=job.state,
+        progress={"done": job.done, "total": job.total, "message": job.message},
+        cancelling=job.cancelling,
+        problem=job.problem,
+    )
 
 
 def _problem(error: Exception) -> dict[str, Any]:

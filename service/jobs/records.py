@@ -98,6 +98,11 @@ class Job:
         """Whether the job has succeeded, failed or been cancelled."""
         return self.state in ENDED
 
+    def used_maps(self) -> set[str | None]:
+        """The ids of the maps that the job uses; None is among them if the job works on no map in particular."""
+        named = {self.arguments.get(name) for name in ("from", "to")}
+        return {self.map_id, *self.maps, *(name for name in named if isinstance(name, str))}
+
     @property
     def version(self) -> str:
         """Identifies this state of the job; every change gives another version."""

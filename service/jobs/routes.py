@@ -8,7 +8,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Header, Path, Query, Request
+from fastapi import APIRouter, Depends, Path, Query, Request
 from pydantic import Field
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
@@ -17,6 +17,16 @@ from core.storage.pagination import Listing, decode_number, encode_cursor
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
+from service.http.event_stream import (
+    HEARTBEAT,
+    HEARTBEAT_SECONDS,
+    OPENING,
+    LastEventId,
+    described,
+    event_text,
+    set_within,
+    stream_response,
+)
 from service.http.routing import FromState, PrincipalDep, single_values
 from service.http.schemas import PageParameters
 from service.jobs.context import NOTICE_SECONDS
@@ -26,10 +36,6 @@ from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
-
-EVENT_STREAM = "text/event-stream"
-HEARTBEAT_SECONDS = 10.0
-"""A stream of events sends a comment at least so often, so that connections stay open."""
 
 LONGEST_WAIT = 60.0
 """The longest time, in seconds, that a read of a job waits for its end."""
@@ -57,10 +63,6 @@ class JobPageParameters(PageParameters):
 
 JobPageQuery = Annotated[JobPageParameters, Query()]
 JobId = Annotated[str, Path(alias="job", max_length=64, description="Id of the job.", examples=["5f0c6a1de2b94c77"])]
-LastEventId = Annotated[
-    str | None,
-    Header(max_length=64, description="The id of the last event that was received; the stream goes on after it."),
-]
 Wait = Annotated[
     float,
     Query(
@@ -81,7 +83,7 @@ async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) 
         and page.map in (None, job.map_id)
         and page.kind in (None, job.kind)
         and page.state in (None, job.state)
-        and principal.may_use(*maps_of(job))
+        and principal.may_use(*job.used_maps())
     ]
     shown = found[: page.limit]
     more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
@@ -96,7 +98,7 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
         until = time.monotonic() + wait
         with jobs.watching(job_id) as changed:
             while not (job := jobs.get(job_id)).ended and not jobs.stopping:
-                if not await _wait(changed, until - time.monotonic()):
+                if not await set_within(changed, until - time.monotonic()):
                     break
     return JobView.of(jobs.get(job_id))
 
@@ -105,11 +107,10 @@ async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: 
     "/{job}/events",
     response_class=StreamingResponse,
     responses={
-        200: {
-            "description": "Server-sent events. Each is named after the state of the job; its data is the job, and its "
-            "id identifies this version of the job. The stream ends with the job.",
-            "content": {EVENT_STREAM: {}},
-        },
+        200: described(
+            "Each is named after the state of the job; its data is the job, and its id identifies this version of the "
+            "job. The stream ends with the job."
+        ),
         204: {"description": "The job has ended, and the client has received its last event."},
         **problem_documentation(UnknownJob, TooManyWatchers),
     },
@@ -126,9 +127,7 @@ async def follow_job(
     if job.ended and last_event_id == job.version:
         return Response(status_code=204)  # this status stops a browser from reconnecting
     stream = _events(jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
-    first = await anext(stream)  # TooManyWatchers is answered as a problem, not within the stream
-    headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(_after(first, stream), media_type=EVENT_STREAM, headers=headers)
+    return await stream_response(request, stream)
 
 
 @router.post(
@@ -147,12 +146,6 @@ def cancel_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep) -> JobView
     return JobView.of(jobs.cancel(job_id))
 
 
-def maps_of(job: Job) -> set[str | None]:
-    """The ids of the maps that a job uses; None is among them if the job works on no map in particular."""
-    named = {job.arguments.get(name) for name in ("from", "to")}
-    return {job.map_id, *job.maps, *(name for name in named if isinstance(name, str))}
-
-
 def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
     """A job, if the caller may use all its maps.
 
@@ -160,26 +153,15 @@ def _job_for(jobs: Jobs, principal: Principal, job_id: str) -> Job:
         UnknownJob: there is no such job, or the caller may not use one of its maps.
     """
     job = jobs.get(job_id)
-    if not principal.may_use(*maps_of(job)):
+    if not principal.may_use(*job.used_maps()):
         raise UnknownJob(f"There is no job {job_id[:80]!r}.")
     return job
-
-
-async def _wait(changed: asyncio.Event, seconds: float) -> bool:
-    """Whether the event was set within some seconds; clears it."""
-    try:
-        async with asyncio.timeout(max(0.0, seconds)):
-            await changed.wait()
-    except TimeoutError:
-        return False
-    changed.clear()
-    return True
 
 
 async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable[[], object]) -> AsyncIterator[str]:
     """The events after ``last``, until the job ends, the service stops or the caller's key is revoked."""
     with jobs.watching(job_id) as changed:
-        yield ": placerec\n\n"
+        yield OPENING
         while True:
             try:
                 job = jobs.get(job_id)
@@ -190,8 +172,8 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
                 yield _event(job)
             if job.ended or jobs.stopping:
                 return
-            if not await _wait(changed, HEARTBEAT_SECONDS):
-                yield ": still there\n\n"
+            if not await set_within(changed, HEARTBEAT_SECONDS):
+                yield HEARTBEAT
             await asyncio.sleep(NOTICE_SECONDS)
             try:
                 check_key()
@@ -200,11 +182,5 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
 
 
 def _event(job: Job) -> str:
-    data = json.dumps(JobView.of(job).model_dump(mode="json"), ensure_ascii=False)
-    return f"id: {job.version}\nevent: {job.state}\ndata: {data}\n\n"
-
-
-async def _after(first: str, rest: AsyncIterator[str]) -> AsyncIterator[str]:
-    yield first
-    async for text in rest:
-        yield text
+    data = json.dumps(JobView.of(job).model_dump(mode="json"))
+    return event_text(job.version, job.state, data)

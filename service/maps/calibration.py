@@ -49,6 +49,7 @@ from service.http.uploads import FORM, check_part, is_file, json_part, media_typ
 from service.jobs.context import JobContext, creation_time, yield_to_requests
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
+from service.maps.map_events import tell_map
 from service.maps.schemas import CalibrationOrder, CalibrationReport
 from service.worker_threads import in_thread
 
@@ -140,6 +141,7 @@ async def calibrate_map(
     report = await in_thread(measure, map_, encoder, order, encodings, advance)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
+        tell_map(engine, map_, "calibrated")
     return report
 
 
@@ -302,4 +304,5 @@ def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     if not order.dry_run:
         context.remember(report=result)
         store(map_, report.calibration, None if replaces is None else Calibration.model_validate(replaces), expected)
+        tell_map(engine, map_, "calibrated")
     return result

@@ -12,6 +12,7 @@ from core.places import Camera
 from service.errors.faults import UnsupportedMediaType
 from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, MapId, StrictRoute, json_body, single_values
+from service.maps.map_events import tell_map
 from service.maps.schemas import CameraDefinition, CameraList, CameraView
 
 router = APIRouter(
@@ -43,7 +44,9 @@ def put_camera(
     until their frames are sent again. Intrinsics hold for all frames of the camera, enrolled ones included. What is
     left out is removed.
     """
-    made, is_new = engine.atlas.get(map_id).cameras.put(name, definition.mask, definition.intrinsics)
+    map_ = engine.atlas.get(map_id)
+    made, is_new = map_.cameras.put(name, definition.mask, definition.intrinsics)
+    tell_map(engine, map_, "cameras")
     response.status_code = 201 if is_new else 200
     return CameraView(**made.__dict__)
 
@@ -63,4 +66,6 @@ def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraVie
 @router.delete("/{camera}", status_code=204, responses=problem_documentation(errors.UnknownCamera, errors.StorageFull))
 def forget_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
     """Forget a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
-    engine.atlas.get(map_id).cameras.forget(name)
+    map_ = engine.atlas.get(map_id)
+    map_.cameras.forget(name)
+    tell_map(engine, map_, "cameras")

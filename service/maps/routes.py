@@ -23,6 +23,7 @@ from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps import storage_jobs
 from service.maps.limits import check_map_count
+from service.maps.map_events import tell_end, tell_map
 from service.maps.schemas import (
     CalibrationChanges,
     MapChanges,
@@ -148,7 +149,9 @@ def edit_map(
     """
     map_ = engine.atlas.get(map_id)
     expected = expected_revision(if_match, map_.record.revision)
-    edited = map_.edit(_settings_changes(engine, map_, changes), expected)
+    settings = _settings_changes(engine, map_, changes)
+    edited = map_.edit(settings, expected)
+    tell_map(engine, map_, "edited", sorted(settings))
     response.headers["ETag"] = entity_tag(edited.revision)
     return show_map(engine, map_)
 
@@ -186,6 +189,7 @@ def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> No
         expected_revision(if_match, engine.atlas.find(map_id).record.revision)
     engine.atlas.delete(map_id)
     engine.metrics.forget_map(map_id)
+    tell_end(engine, map_id)
 
 
 @router.post(

@@ -17,6 +17,7 @@ from service.engine.engine import Engine
 from service.engine.queue import AHEAD, RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import BatchTurn, Stage
+from service.places.place_events import tell_enrolment
 from service.worker_threads import in_thread
 
 
@@ -188,6 +189,7 @@ def _commit(
         found = zip(items, map_.enrol(list(items.values())), strict=True)
         done = {i: stored for i, stored in found if stored is not None}
     engine.metrics.commits.observe(time.perf_counter() - began)
+    tell_enrolment(engine, map_, list(done.values()))
     return done
 
 

@@ -48,6 +48,7 @@ from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
 from service.places.enrolment import FrameToEnrol, enrol
 from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
+from service.places.place_events import tell_change, tell_deletion, tell_enrolment
 from service.places.schemas import (
     BatchResult,
     BatchResults,
@@ -262,13 +263,17 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
     with engine.writing(map_id):
         if changes.metadata is not None:
             check_metadata(merge_patch(map_.place(place_id).metadata, changes.metadata), engine.settings)
-        return PlaceView.of(map_.patch(place_id, changes.model_dump(exclude_unset=True)))
+        place = map_.patch(place_id, changes.model_dump(exclude_unset=True))
+    tell_enrolment(engine, map_, [(place, "updated")])
+    return PlaceView.of(place)
 
 
 @router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
 def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     """Delete a place: no later query finds it."""
-    engine.atlas.get(map_id).forget(place_id)
+    map_ = engine.atlas.get(map_id)
+    map_.forget(place_id)
+    tell_deletion(engine, map_, place_id)
 
 
 @router.get(
@@ -295,6 +300,8 @@ def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage
 @traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
 def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
     """Delete all places of a traverse at once."""
-    count = engine.atlas.get(map_id).forget_sequence(sequence)
+    map_ = engine.atlas.get(map_id)
+    count = map_.forget_sequence(sequence)
+    tell_change(engine, map_, "deleted", count, sequence)
     request.state.noted = {"places": count}
     return ForgottenSequence(name=sequence, places=count)

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
+from core.storage import Map
 from service.engine.encoder_threads import Encoded
 from service.engine.engine import Engine
 from service.errors.faults import (
@@ -31,10 +32,11 @@ from service.http.routing import (
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
+from service.queries.answer_events import tell_answer
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
-from service.queries.schemas import FrameReport, MapAnswer, MapMatch, SeveralAnswer
+from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
 from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
 
@@ -83,6 +85,9 @@ async def query_maps(
         # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
         if report is recognized or len(reports) == 1:
             _count_for_health(engine, statistics, report)
+    total = rounded({"total": milliseconds_since(started(request))})
+    for report in reports:
+        _tell(engine, report, frames, total)
     matches = _matches(reports, options.k)
     place = pose = None
     if recognized is not None and recognized.answer is not None:
@@ -98,7 +103,7 @@ async def query_maps(
         matches=matches,
         maps=answers,
         frames=[*shown, *broken],
-        milliseconds=rounded({"total": milliseconds_since(started(request))}),
+        milliseconds=total,
     )
 
 
@@ -188,11 +193,25 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
 
 def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
     """Count an answer in the statistics of its map."""
+    if (found := _whole_answer(report)) is not None:
+        count_for_map(engine, statistics, report.map_id, found[1])
+
+
+def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
+    """The map of a report, and its answer as one query of that map would give it; None if it did not answer."""
     seen = next((one for one in report.frames if isinstance(one, Encoded)), None)
     if report.map_ is None or report.error is not None or seen is None:
-        return
-    answer = blank_answer(report.map_, seen) if report.answer is None else answer_of(report.map_, seen, report.answer)
-    count_for_map(engine, statistics, report.map_id, answer)
+        return None
+    if report.answer is None:
+        return report.map_, blank_answer(report.map_, seen)
+    return report.map_, answer_of(report.map_, seen, report.answer)
+
+
+def _tell(engine: Engine, report: MapReport, frames: Sequence[RigFrame], milliseconds: dict[str, float]) -> None:
+    """Tell the listeners of a map how it answered; of a rig the first frame is shown."""
+    if engine.events.heard(report.map_id) and (found := _whole_answer(report)) is not None:
+        map_, answer = found
+        tell_answer(engine, map_, answer, frames[0].data, frames[0].camera, milliseconds=milliseconds)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

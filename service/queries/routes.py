@@ -33,6 +33,7 @@ from service.http.routing import (
 )
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
+from service.queries.answer_events import tell_answer
 from service.queries.answers import StatisticsDep, counted_answer
 from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.parameters import QueryParameters
@@ -85,6 +86,7 @@ async def query(
         answer.explanation = await explain_match(engine, pictures, map_, encoded, recognized.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
+    tell_answer(engine, map_, answer, data, options.camera)
     return answer
 
 
@@ -137,7 +139,8 @@ async def query_batch(
         map_, list(encoded.values()), options.k, selection, options.verify, options.camera
     )
     for index, one in zip(encoded, recognized, strict=True):
-        items[index].answer = counted_answer(engine, statistics, map_, one)
+        answer = items[index].answer = counted_answer(engine, statistics, map_, one)
+        tell_answer(engine, map_, answer, files[index].data, options.camera, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)

@@ -13,8 +13,10 @@ from core.storage import Map
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
+from service.events.schemas import SessionEvent
 from service.http.routing import rounded
 from service.places.schemas import PlaceView
+from service.queries.answer_events import tell_answer
 from service.queries.answers import counted_answer
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
@@ -74,12 +76,37 @@ async def process_frame(
         single = counted_answer(engine, statistics, map_, recognized)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
-            return await in_thread(
+            answer = await in_thread(
                 _advance, sessions, map_, session, run, recognized.answer, view, single, options, request_id, began
             )
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
+    total = {"total": answer.milliseconds["total"]}
+    tell_answer(engine, map_, single, data, session.options.camera, session.id, options.frame, milliseconds=total)
+    tell_belief(engine, map_, session, answer)
+    return answer
+
+
+def tell_belief(engine: Engine, map_: Map, session: Session, answer: SessionAnswer) -> None:
+    """Tell the listeners of a map, if it has any, where a session's robot is believed to be after a frame."""
+    if not engine.events.heard(map_.record.id):
+        return
+    event = SessionEvent.now(
+        map_.record.id,
+        session=session.id,
+        change="moved",
+        camera=session.options.camera,
+        frame=answer.frame,
+        frames=answer.frames,
+        verdict=answer.verdict,
+        probability=answer.probability,
+        unknown=answer.unknown,
+        lost=answer.lost,
+        place=None if answer.place is None else answer.place.id,
+        pose=None if answer.place is None else answer.place.pose,
+    )
+    engine.events.publish(event)
 
 
 def _found_run(sessions: Sessions, map_: Map, session: Session) -> Run:

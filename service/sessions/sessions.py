@@ -12,6 +12,7 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from core.recognition.selection import Conditions, Selection
 from core.recognition.stages import neighborhood_of
 from core.storage import Map, Snapshot
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
+from service.events.events import Events
+from service.events.schemas import NOBODY_ASKED, SessionEvent
 from service.sessions.schemas import NewSession
 from service.sessions.store import SessionStore, StoredSession
 from service.settings import Settings
@@ -139,10 +142,14 @@ class _CachedGraph:
 
 
 class Sessions:
-    """All sessions.  Thread-safe."""
+    """All sessions.  Thread-safe.
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    Args:
+        events: is told when a session begins and ends.
+    """
+
+    def __init__(self, settings: Settings, events: Events) -> None:
+        self._settings, self._events = settings, events
         self._store = SessionStore(settings.data_dir)
         self._lock = threading.RLock()
         self._graph_lock = threading.Lock()
@@ -224,6 +231,7 @@ class Sessions:
             with self._lock:
                 self._living.pop(session.id, None)
             raise
+        self._tell(session, "begun")
         return session
 
     def find(self, map_: Map, session_id: str) -> Session:
@@ -272,6 +280,18 @@ class Sessions:
                 self._store.forget(session.id)
             self._living.pop(session.id, None)
             self._drop_unused_graphs()
+        self._tell(session, "ended", "It was deleted.")
+
+    def _tell(self, session: Session, change: Literal["begun", "ended"], reason: str | None = None) -> None:
+        """Tell the listeners of a session's map, if it has any; a session that ends by itself was ended by nobody."""
+        if not self._events.heard(session.map_id):
+            return
+        by = NOBODY_ASKED if reason in (EXPIRED, MAP_GONE, STATE_LOST) else None
+        camera = session.options.camera
+        event = SessionEvent.now(
+            session.map_id, by, session=session.id, change=change, reason=reason, camera=camera, frame=session.number
+        )
+        self._events.publish(event)
 
     def _sweep(self) -> None:
         now = time.monotonic()
@@ -289,6 +309,7 @@ class Sessions:
             self._store.end(session.id, reason, time.time())
         except sqlite3.Error as error:
             log.warning("the end of session %s is not saved: %s", session.id, error)
+        self._tell(session, "ended", reason)
 
     def _forget_on_disk(self, session_id: str) -> None:
         self._ended.pop(session_id)

@@ -26,6 +26,7 @@ from core.storage.transfer import Outline
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
 from service.jobs.context import JobContext, JobInterrupted, yield_to_requests
+from service.places.place_events import tell_change
 
 KIND = "merge"
 
@@ -212,6 +213,7 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         with engine.writing(map_.record.id):
             _remove_copies(context, map_, other, error)
         raise
+    tell_change(engine, map_, "created", len(context.notes["coming"]))
     return dict(context.notes["report"]) | {"places": map_.count_places()}
 
 

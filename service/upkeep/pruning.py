@@ -16,6 +16,7 @@ from core.upkeep.redundancy import Thinning, Trial, best_thinning, neighbour_pai
 from service.engine.engine import Engine
 from service.errors.faults import NothingToMeasure
 from service.jobs.context import JobContext, yield_to_requests
+from service.places.place_events import tell_change
 
 KIND = "prune"
 
@@ -54,7 +55,8 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         context.check_cancelled()  # no earlier attempt has removed them
     context.progress(0, len(digests), "removing places")
     with engine.writing(map_.record.id):
-        map_.transfer.forget(digests)
+        count = map_.transfer.forget(digests)
+    tell_change(engine, map_, "deleted", count)
     context.progress(len(digests), len(digests))
     return dict(report) | {"places_after": map_.count_places()}
 

@@ -16,6 +16,7 @@ from tests.service.server import ROOT
 OPERATIONS = {
     "check_liveness", "check_readiness", "read_metrics", "read_version",
     "create_map", "list_maps", "read_map", "edit_map", "delete_map", "verify_map",
+    "follow_map",
     "enrol_place", "enrol_places", "list_places", "read_place", "edit_place", "forget_place", "see_thumbnail",
     "list_sequences", "delete_sequence",
     "put_camera", "list_cameras", "read_camera", "forget_camera",

@@ -21,7 +21,7 @@ Kinds = Mapping[str, Callable[[JobContext], Mapping[str, Any]]]
 
 
 @contextmanager
-def running(folder: Path, kinds: Kinds | None = None, **limits: int) -> Iterator[Jobs]:
+def running(folder: Path, kinds: Kinds | None = None, **limits: Any) -> Iterator[Jobs]:
     jobs = Jobs(folder, **limits)
     for kind, work in (kinds or {}).items():
         jobs.register(kind, work)

@@ -1,0 +1,177 @@
+"""The live events of all maps.
+
+Nothing is kept of a map that nobody listens to: a request then costs the question whether there is a feed.  The feed of
+a map begins with its first listener, and stays for a while after the last one, so that a listener whose connection
+broke can go on where it was.  Listeners read from the feed; nobody waits for them.
+"""
+
+from __future__ import annotations
+
+import base64
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+from core.errors import PlacerecError
+from core.frames.images import ANY_SIZE, decode, encode_thumbnail
+from service.errors.faults import TooManyListeners
+from service.events.feed import Feed, Listener
+from service.events.schemas import PRIVATE, Event, QueryEvent
+
+LINGER_SECONDS = 120.0
+"""How long the events of a map are kept after its last listener has left."""
+
+PICTURE_SIDE, PICTURE_QUALITY = 160, 70
+"""Longer side in pixels and JPEG quality of the pictures of frames."""
+
+MOST_DRAWING, MOST_DRAWING_BYTES = 8, 32 << 20
+"""The most frames, and bytes of their files, of which pictures are being made; further ones are told without."""
+
+log = logging.getLogger("placerec.events")
+
+
+class Events:
+    """The feeds of the maps that somebody listens to.  Any thread may publish; nobody is ever blocked by a listener.
+
+    Args:
+        most_listeners: how many clients may listen at one time.
+        clock: seconds, never going back.
+    """
+
+    def __init__(self, most_listeners: int = 64, clock: Callable[[], float] = time.monotonic) -> None:
+        self._most_listeners, self._clock = most_listeners, clock
+        self._feeds: dict[str, Feed] = {}
+        self._lock = threading.Lock()
+        self._drawing = self._drawing_bytes = 0
+        self._artist: ThreadPoolExecutor | None = None
+        self.listeners = 0
+        self.stopping = False
+
+    def heard(self, map_id: str) -> bool:
+        """Whether an event of a map would be told or kept; ask this before an event is made."""
+        return map_id in self._feeds
+
+    def publish(self, event: Event, frame: bytes | None = None, maps: frozenset[str | None] | None = None) -> None:
+        """Tell an event to the listeners of its map, if it is heard.
+
+        Args:
+            frame: the file of the frame that a query was about, if a picture of it may be shown.
+            maps: ids of the maps that a caller must be allowed to use to see it; None: its own map.
+        """
+        feed = self._feeds.get(event.map)
+        if feed is None or self._is_forgotten(event.map, feed):
+            return
+        if frame is not None and any(listener.pictures for listener in feed.listeners) and self._may_draw(len(frame)):
+            try:
+                self._thread().submit(self._draw, feed, event, frame, maps)
+            except RuntimeError:  # the service stops
+                return
+        else:
+            self._add(feed, event, maps, None)
+
+    def _add(self, feed: Feed, event: Event, maps: frozenset[str | None] | None, picture: str | None) -> None:
+        # ASCII, since some clients take characters such as U+2028 for the end of a line.
+        full = event.model_dump_json(ensure_ascii=True)
+        public = event.model_dump_json(ensure_ascii=True, exclude=set(PRIVATE))
+        verdict = event.verdict if isinstance(event, QueryEvent) else None
+        with self._lock:
+            if not feed.ended:
+                feed.add(event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
+
+    def _is_forgotten(self, map_id: str, feed: Feed) -> bool:
+        """Drop a feed that nobody has listened to for a while; whether it was dropped."""
+        if feed.left_at is None or self._clock() - feed.left_at < LINGER_SECONDS:
+            return False
+        with self._lock:
+            if feed.listeners or self._feeds.get(map_id) is not feed:
+                return False
+            del self._feeds[map_id]
+        return True
+
+    # Pictures
+
+    def _may_draw(self, size: int) -> bool:
+        with self._lock:
+            room = self._drawing < MOST_DRAWING and self._drawing_bytes + size <= MOST_DRAWING_BYTES
+            if room and not self.stopping:
+                self._drawing, self._drawing_bytes = self._drawing + 1, self._drawing_bytes + size
+                return True
+        return False
+
+    def _thread(self) -> ThreadPoolExecutor:
+        with self._lock:
+            if self._artist is None:
+                self._artist = ThreadPoolExecutor(1, "event-pictures")
+            return self._artist
+
+    def _draw(self, feed: Feed, event: Event, frame: bytes, maps: frozenset[str | None] | None) -> None:
+        picture = None
+        try:
+            small = encode_thumbnail(decode(frame, ANY_SIZE), PICTURE_SIDE, PICTURE_QUALITY)
+            picture = f"data:image/jpeg;base64,{base64.b64encode(small).decode()}"
+        except (PlacerecError, MemoryError) as error:
+            log.warning("a frame cannot be shown to listeners: %s", error)
+        finally:
+            with self._lock:
+                self._drawing, self._drawing_bytes = self._drawing - 1, self._drawing_bytes - len(frame)
+            self._add(feed, event, maps, picture)
+
+    # Listeners
+
+    @contextmanager
+    def listening(self, map_id: str, resumed: str | None = None, pictures: bool = False) -> Iterator[Listener]:
+        """A listener of a map; use this on an event loop.
+
+        Args:
+            resumed: the id of the last event that the listener has seen.
+            pictures: whether it wants pictures of the frames of queries.
+
+        Raises:
+            TooManyListeners: too many clients listen already.
+        """
+        with self._lock:
+            if self.listeners >= self._most_listeners:
+                raise TooManyListeners("Too many clients listen to events already; try again later.")
+            self.listeners += 1
+            feed = self._feeds.setdefault(map_id, Feed(self._lock))
+            feed.left_at = None
+            listener = Listener(feed, resumed, pictures)
+            feed.listeners.append(listener)
+            self._drop_left()
+        try:
+            yield listener
+        finally:
+            with self._lock:
+                self.listeners -= 1
+                feed.listeners.remove(listener)
+                if not feed.listeners:
+                    feed.left_at = self._clock()
+
+    def _drop_left(self) -> None:
+        """Drop the feeds without listeners that were left for long, and the longest left ones if they are too many."""
+        now = self._clock()
+        left = sorted((feed.left_at, map_id) for map_id, feed in self._feeds.items() if feed.left_at is not None)
+        for index, (moment, map_id) in enumerate(left):
+            if now - moment >= LINGER_SECONDS or len(left) - index > self._most_listeners:
+                del self._feeds[map_id]
+
+    def end(self, map_id: str) -> None:
+        """End the streams of a map that was deleted; what was published before is still read."""
+        with self._lock:
+            feed = self._feeds.pop(map_id, None)
+            if feed is not None:
+                feed.ended = True
+                feed.wake()
+
+    def stop_soon(self) -> None:
+        """End all streams; returns at once."""
+        self.stopping = True
+        with self._lock:
+            artist, feeds = self._artist, list(self._feeds.values())
+            for feed in feeds:
+                feed.wake()
+        if artist is not None:
+            artist.shutdown(wait=False, cancel_futures=True)

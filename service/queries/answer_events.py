@@ -1,0 +1,57 @@
+"""Events of queries: what the listeners of a map are told of an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from core.storage import Map
+from service.access.audit import ASKER
+from service.engine.engine import Engine
+from service.events.schemas import QueryEvent
+from service.queries.schemas import QueryAnswer
+
+
+def tell_answer(
+    engine: Engine,
+    map_: Map,
+    answer: QueryAnswer,
+    frame: bytes,
+    camera: str | None = None,
+    session: str | None = None,
+    number: int | None = None,
+    file: str | None = None,
+    milliseconds: Mapping[str, float] | None = None,
+) -> None:
+    """Tell the listeners of a map, if it has any, how a frame was answered.
+
+    Args:
+        frame: the bytes of the frame's file; a picture of it is shown only if the map keeps pictures.
+        camera: the name of the camera that took the frame; None: not known.
+        session, number: the session that the frame belongs to, and the robot's number of it.
+        file: the name of the file part that the frame was.
+        milliseconds: of the whole request, where the answer does not say it.
+    """
+    if not engine.events.heard(map_.record.id):
+        return
+    explanation = answer.explanation
+    event = QueryEvent.now(
+        map_.record.id,
+        operation=ASKER.get().operation,
+        verdict=answer.verdict,
+        probability=answer.probability,
+        place=None if answer.place is None else answer.place.id,
+        best=answer.matches[0].place.id if answer.matches else None,
+        pose=None if answer.pose is None else answer.pose.model_dump(exclude_none=True),
+        score=answer.score,
+        decision=answer.decision,
+        threshold=answer.threshold,
+        reason=answer.reason,
+        camera=camera,
+        session=session,
+        frame=number,
+        file=file,
+        milliseconds={**answer.milliseconds, **(milliseconds or {})},
+        revision=answer.revision,
+        explanation=None if explanation is None else explanation.picture,
+    )
+    engine.events.publish(event, frame if map_.record.keep != "none" else None)

@@ -1,0 +1,51 @@
+"""The stream of a map's events, read at any pace."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from core.storage import MapSettings
+from service.access.roles import OWNER
+from service.events.feed import MOST_KEPT
+from service.events.schemas import MapEvent
+from service.maps.event_routes import EventParameters, MapStream
+from tests.service.engines import ENCODER, runtime_at
+from tests.service.events.listening import events_of
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_a_listener_that_does_not_read_delays_nobody_and_learns_what_it_missed(tmp_path: Path) -> None:
+    with runtime_at(tmp_path) as runtime:
+        engine = runtime.engine
+        map_ = engine.atlas.create("lab", ENCODER, 8, MapSettings())
+        texts = MapStream(engine, map_, EventParameters(), lambda: OWNER).texts(None)
+        heard = list(events_of((await anext(texts)).splitlines()))
+        for number in range(MOST_KEPT + 500):
+            engine.events.publish(MapEvent.now("lab", change="edited", revision=number))
+        engine.events.end("lab")
+        async for text in texts:
+            heard += events_of(text.splitlines())
+    names = [one.name for one in heard]
+    assert names == ["listening", "missed", *["map"] * MOST_KEPT]
+    assert heard[1].data["count"] == 500
+    assert [one.data["revision"] for one in heard[2:]] == list(range(500, MOST_KEPT + 500))
+    numbers = [int(one.id.rpartition("-")[2]) for one in heard]
+    assert numbers == [0, *range(500, MOST_KEPT + 501)], "who resumes after 'missed' misses nothing more"
+
+
+async def test_every_event_is_one_line_of_json_whatever_it_says(tmp_path: Path) -> None:
+    strange = "one\ntwo\r\n\r\ndata: three\u2028four\x85 </script> \u0000"
+    with runtime_at(tmp_path) as runtime:
+        map_ = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings())
+        texts = MapStream(runtime.engine, map_, EventParameters(), lambda: OWNER).texts(None)
+        await anext(texts)
+        runtime.engine.events.publish(MapEvent.now("lab", change="edited", fields=[strange], revision=1))
+        text = await anext(texts)
+        await texts.aclose()
+    assert text.splitlines() == text.split("\n")[:-1], "whatever a client takes for the end of a line"
+    assert [line.partition(":")[0] for line in text.split("\n")] == ["id", "event", "data", "", ""]
+    (event,) = events_of(text.splitlines())
+    assert event.data["fields"] == [strange]
