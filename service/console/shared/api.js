@@ -195,8 +195,8 @@ export async function get(path, query, options) {
 }
 
 /** A resource and its ETag, for an edit with If-Match. */
-export async function getTagged(path) {
-  const answer = await send("GET", path);
+export async function getTagged(path, query, signal) {
+  const answer = await send("GET", path, { query, signal });
   return { data: await answer.json(), tag: answer.headers.get("etag") };
 }
 
