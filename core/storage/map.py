@@ -34,6 +34,7 @@ from core.storage.database.connections import DatabaseClosed
 from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, open_map
 from core.storage.pagination import page_of_places, page_of_sequences
+from core.storage.plan import Plan
 from core.storage.records import (
     Change,
     Enrolment,
@@ -117,6 +118,7 @@ class Map:
         self.cameras = Cameras(self._reading, self._writing)
         self.attributes = Attributes(self._reading)
         self.counterparts = Counterparts(self._reading, self._writing)
+        self.plan = Plan(self._reading)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
         self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
@@ -141,6 +143,11 @@ class Map:
     def is_open(self) -> bool:
         """Whether the map is in service and was read from disk."""
         return self._opened is not None
+
+    @property
+    def state(self) -> object:
+        """An object that stays the same until the map is written to; the map is opened if it is not open yet."""
+        return self._expect_open().database.state
 
     def open(self) -> None:
         """Read the map from disk, unless that was done before."""

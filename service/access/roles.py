@@ -133,6 +133,7 @@ OPERATIONS: dict[str, Rule] = {
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path"),
+    "read_plan": Rule("query", "path"),
     "list_sequences": Rule("query", "path"),
     "delete_sequence": Rule("enrol", "path", changes=True),
     "list_cameras": Rule("query", "path"),

@@ -20,6 +20,7 @@ from service.maps.exports import Exports
 from service.maps.imports import Imports
 from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder
+from service.places.plans import Plans
 from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
@@ -60,7 +61,7 @@ class Runtime:
             self.sessions = Sessions(settings, self.engine.events)
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
-        self.batch_order = BatchOrder()
+        self.batch_order, self.plans = BatchOrder(), Plans()
         self.statistics = QueryStatistics.of_engine(self.engine)
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
@@ -91,7 +92,7 @@ class Runtime:
         """Make the parts available to the routes, which find them by name (``service.http.routing.FromState``)."""
         state.runtime = self
         state.engine, state.jobs, state.sessions = self.engine, self.jobs, self.sessions
-        state.staging, state.batch_order = self.staging, self.batch_order
+        state.staging, state.batch_order, state.plans = self.staging, self.batch_order, self.plans
         state.statistics, state.explanation_pictures = self.statistics, self.explanation_pictures
         state.health_examinations = self.health_examinations
         state.exports, state.imports = self.exports, self.imports

@@ -250,6 +250,10 @@ class TooManyPlaces(Fault):
     """The map already has the most places that it may have."""
 
 
+class PlanTooLarge(Fault):
+    """The plan would list more places than one answer may."""
+
+
 class TooManyExports(Fault):
     """The most exports that may be kept are already being downloaded."""
 

@@ -98,6 +98,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
+    faults.PlanTooLarge: Kind(422, "plan-too-large", "The plan would list too many places"),
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),
     errors.NoThumbnail: Kind(404, "no-thumbnail", "The map keeps no picture of the place"),
     errors.CalibrationImpossible: Kind(422, "calibration-impossible", "The map cannot be calibrated with these frames"),

@@ -47,6 +47,15 @@ def _quality(parameters: list[str]) -> float:
     return 1.0
 
 
+def accepts_gzip(accept_encoding: str | None) -> bool:
+    """Whether an Accept-Encoding header allows gzip (section 12.5.3)."""
+    weights: dict[str, float] = {}
+    for entry in (accept_encoding or "").lower().split(","):
+        name, *parameters = (part.strip() for part in entry.split(";"))
+        weights[name] = _quality(parameters)
+    return weights.get("gzip", weights.get("*", 0.0)) > 0
+
+
 # Entity tags and conditional requests (section 13)
 
 

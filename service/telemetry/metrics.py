@@ -107,7 +107,7 @@ class Metrics:
 
     def requests_under_way(self) -> float:
         """The number of requests and WebSockets that are being answered."""
-        return self.under_way.collect()[0].samples[0].value
+        return next(iter(self.under_way.collect())).samples[0].value
 
     def observe_stages(self, milliseconds: Mapping[str, float]) -> None:
         """Count the durations of the stages of an encoding."""

@@ -1,0 +1,69 @@
+"""A plan of a map: where all its places are, as columns of JSON, which SQLite writes without an object for each."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+HANDED_OVER, HAS_PICTURE = 1, 2
+"""Flags of a place: its pose is that of another place; a picture of its frame is kept."""
+
+# Metres to the millimetre, degrees of position to a centimetre on the ground.
+_OPTIONAL = {
+    "x": "round(x, 3)",
+    "y": "round(y, 3)",
+    "z": "round(z, 3)",
+    "latitude": "round(latitude, 7)",
+    "longitude": "round(longitude, 7)",
+    "heading": "round(heading, 2)",
+    "timestamp": "CAST(round((julianday(timestamp) - 2440587.5) * 86400000) AS INTEGER)",
+}
+_NAMES = (
+    "SELECT code, name, row_number() OVER (ORDER BY name) - 1 AS position FROM sequences"
+    " WHERE name IS NOT NULL AND EXISTS (SELECT 1 FROM places WHERE sequence = code)"
+)
+_COLUMNS = (
+    "SELECT json_group_array(id), json_group_array(position), json_group_array(flags),"
+    f" {', '.join(f'count({value}), json_group_array({value})' for value in _OPTIONAL.values())}"
+    f" FROM (SELECT p.*, coalesce(n.position, -1) AS position, (p.pose_of IS NOT NULL) * {HANDED_OVER}"
+    f" + (p.picture != 'none') * {HAS_PICTURE} AS flags"
+    f" FROM places p LEFT JOIN ({_NAMES}) n ON n.code = p.sequence"
+    " WHERE (p.number - 1) % ? = 0 ORDER BY p.number)"
+)
+
+
+class Plan:
+    """Reads the plan of one map.  Any thread may use it.
+
+    Args:
+        reading: opens a connection to the map's database; the method may raise what it raises.
+    """
+
+    def __init__(self, reading: Callable[[], AbstractContextManager[sqlite3.Connection]]) -> None:
+        self._reading = reading
+
+    def columns(self, step: int = 1) -> str:
+        """The places in the order of their enrolment as the members of a JSON object, without its braces.
+
+        The members: ``sequences``, the names of the traverses; arrays with a value for each place: ``ids``,
+        ``sequence`` (index into ``sequences``, -1 without one) and ``flags``; and ``x``, ``y``, ``z`` (metres),
+        ``latitude``, ``longitude``, ``heading`` (degrees) and ``timestamp`` (milliseconds since 1970 UTC), each an
+        array with null where a place has no value, or null if no place has one.
+
+        Args:
+            step: about every so many places are listed.
+        """
+        with self._reading() as connection:
+            connection.execute("BEGIN")  # both queries see the same moment
+            try:
+                names = connection.execute(f"SELECT name FROM ({_NAMES}) ORDER BY position").fetchall()
+                ids, sequence, flags, *optional = connection.execute(_COLUMNS, (step,)).fetchone()
+            finally:
+                connection.execute("COMMIT")
+        columns = {"sequences": json.dumps([name for (name,) in names]), "ids": ids, "sequence": sequence}
+        for name, count, values in zip(_OPTIONAL, optional[::2], optional[1::2], strict=True):
+            columns[name] = values if count else "null"
+        columns["flags"] = flags
+        return ",".join(f'"{name}":{values}' for name, values in columns.items())

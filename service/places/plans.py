@@ -1,0 +1,103 @@
+"""Plans of maps as they are sent: made one at a time, compressed, and kept until their map is written to."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from dataclasses import dataclass
+
+from anyio import CapacityLimiter
+
+from core.storage import Map
+from service.errors.faults import PlanTooLarge
+
+MOST_PLACES = 200_000
+"""Places that one plan lists."""
+
+MOST_BYTES = 64 * 1024 * 1024
+"""Bytes of all compressed plans that are kept together."""
+
+FAST = 1
+"""The level of gzip: a higher one takes longer than a local network saves."""
+
+PlanKey = tuple[str, str, int]
+"""The id of a map, the time of its creation, and the step."""
+
+
+@dataclass(frozen=True)
+class MadePlan:
+    """A plan.
+
+    state: of the map when it was read (``Map.state``).
+    revision: names the content; the same places have the same one.
+    compressed: its JSON, by gzip.
+    """
+
+    state: object
+    revision: str
+    compressed: bytes
+
+
+class Plans:
+    """The plans that were asked for last.  Any thread may use it."""
+
+    def __init__(self) -> None:
+        self.one_at_a_time = CapacityLimiter(1)
+        """Limits the threads that make plans, so that their memory is bounded and searches are not kept waiting."""
+        self._kept: OrderedDict[PlanKey, MadePlan] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def kept(self, map_: Map, step: int) -> MadePlan | None:
+        """The plan of a map if nothing was written to the map since it was made.
+
+        Raises:
+            UnknownMap, MapQuarantined.
+        """
+        state = map_.state
+        with self._lock:
+            found = self._kept.get(_key(map_, step))
+            if found is None or found.state is not state:
+                return None
+            self._kept.move_to_end(_key(map_, step))
+            return found
+
+    def make(self, map_: Map, step: int) -> MadePlan:
+        """The plan of a map, which is read from disk if it is not kept; blocks.
+
+        Raises:
+            PlanTooLarge: it would list more than ``MOST_PLACES``.
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+        if (found := self.kept(map_, step)) is not None:
+            return found
+        count = map_.count_places()
+        if count > MOST_PLACES * step:
+            raise PlanTooLarge(
+                f"The map has {count} places, and a plan lists at most {MOST_PLACES}: send "
+                f"step={-(-count // MOST_PLACES)} for every so manieth place."
+            )
+        state = map_.state  # of now: what is written while the plan is read makes it old
+        columns = map_.plan.columns(step)
+        revision = hashlib.sha256(columns.encode()).hexdigest()[:32]
+        head = {"map": map_.record.id, "revision": revision, "places": count, "step": step}
+        text = f"{json.dumps(head)[:-1]}, {columns}}}"
+        made = MadePlan(state, revision, gzip.compress(text.encode(), FAST, mtime=0))
+        self._keep(_key(map_, step), made)
+        return made
+
+    def _keep(self, key: PlanKey, plan: MadePlan) -> None:
+        with self._lock:
+            before = self._kept.pop(key, None)
+            self._bytes += len(plan.compressed) - (0 if before is None else len(before.compressed))
+            self._kept[key] = plan
+            while self._bytes > MOST_BYTES:
+                _, oldest = self._kept.popitem(last=False)
+                self._bytes -= len(oldest.compressed)
+
+
+def _key(map_: Map, step: int) -> PlanKey:
+    return map_.record.id, map_.record.created_at.isoformat(), step
