@@ -1,5 +1,5 @@
 // Where all places of a map lie: the columns of the API's plan, and what a drawing needs of them.
-import { all, send } from "./api.js";
+import { send } from "./api.js";
 import { mapPath } from "./map_path.js";
 
 const EARTH = 6_371_000;
@@ -7,13 +7,7 @@ const kept = { map: null, tag: null, plan: null };
 
 /** The plan of a map; what was read before is kept as long as the map has the same places. */
 export async function readPlan(map, signal) {
-  let answer;
-  try {
-    answer = await send("GET", mapPath(map, "plan"), { signal });
-  } catch (error) {
-    if (error.slug === "unknown-path") return prepared(await listed(map, signal));
-    throw error;
-  }
+  const answer = await send("GET", mapPath(map, "plan"), { signal });
   const tag = answer.headers.get("etag");
   if (kept.map === map && kept.tag === tag) return kept.plan;
   const plan = prepared(await answer.json());
@@ -149,13 +143,4 @@ export function stripsOf(plan) {
     });
   });
   return { x, y, height };
-}
-
-async function listed(map, signal) {
-  const items = await all(mapPath(map, "places"), {}, { signal });
-  const sequences = [...new Set(items.map((one) => one.sequence).filter(Boolean))].sort();
-  const column = (name) => items.map((one) => one.pose?.[name] ?? null);
-  const ids = items.map((one) => one.id);
-  const columns = Object.fromEntries(["x", "y", "z", "latitude", "longitude", "heading"].map((name) => [name, column(name)]));
-  return { ...columns, map, places: ids.length, sequences, ids, sequence: items.map((one) => sequences.indexOf(one.sequence)), timestamp: null, flags: ids.map(() => 2) };
 }

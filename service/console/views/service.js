@@ -17,7 +17,7 @@ export default function Service() {
 }
 
 function State({ data }) {
-  const { queue, storage, requests, jobs, sessions, maps, connections, listeners, memory, disk, checks } = data;
+  const { queue, storage, requests, jobs, sessions, maps, memory, disk, checks } = data;
   const bad = Object.entries(checks).filter(([, told]) => told !== "ok");
   return html`
     ${bad.map(([name, told]) => html`<p class="notice"><strong>${name}</strong>: ${told}</p>`)}
@@ -25,8 +25,6 @@ function State({ data }) {
       <${Figure} name="requests, 5 min" value=${integer(requests.count)} />
       <${Figure} name="under way" value=${integer(requests.under_way)} />
       <${Figure} name="failed (5xx)" value=${integer(requests.errors)} />
-      <${Figure} name="maps" value=${integer(maps)} />
-      <${Figure} name="sessions" value=${integer(sessions)} />
       <${Figure} name="jobs running" value=${integer(jobs.running)} />
       <${Figure} name="jobs waiting" value=${integer(jobs.queued)} />
       <${Figure} name="up" value=${duration(data.uptime_seconds)} />
@@ -35,24 +33,24 @@ function State({ data }) {
       <section class="panel">
         <h2>How full</h2>
         <${Level} name="Encoder's queue" value=${queue.waiting} of=${queue.limit} />
-        <${Level} name="Encoder's threads" value=${queue.encoding} of=${queue.threads} />
         <${Level} name="Storage threads" value=${storage.busy} of=${storage.threads} note=${storage.waiting ? `${integer(storage.waiting)} wait` : ""} />
         ${memory && html`<${Level} name="Memory of uploads" value=${memory.uploads} of=${memory.upload_limit} text=${bytes} />`}
         ${disk && html`<${Level} name="Disk" value=${disk.total - disk.free} of=${disk.total} text=${bytes} />`}
+      </section>
+      <section class="panel">
+        <h2>What it holds</h2>
         <${Facts} rows=${[
           memory && ["Memory of the process", bytes(memory.resident)],
           disk && ["Free on the disk", bytes(disk.free)],
-          connections !== undefined && ["Connections", integer(connections)],
-          listeners !== undefined && ["Listeners to events", integer(listeners)],
+          ["Maps", integer(maps)],
+          ["Sessions", integer(sessions)],
           ["Watchers of jobs", integer(jobs.watchers)],
-          ["Encoder", data.encoder],
+          ["Default encoder", data.encoder],
+          ["Checks", Object.entries(checks).map(([name, told]) => `${name} ${told}`).join(", ")],
         ]} />
       </section>
-      <section class="panel">
-        <h2>Answers of the last five minutes</h2>
-        <${Latencies} operations=${requests.operations} />
-      </section>
     </div>
+    <section class="stack"><h2>Answers of the last five minutes</h2><${Latencies} operations=${requests.operations} /></section>
     <${More} data=${data} />
   `;
 }
