@@ -145,6 +145,8 @@ OPERATIONS: dict[str, Rule] = {
     "query_batch": Rule("query", "path"),
     "query_maps": Rule("query", "named"),  # without names it asks the key's maps
     "query_or_enrol": Rule("enrol", "path", changes=True),
+    "list_answers": Rule("query", "path"),
+    "list_place_matches": Rule("query", "path"),
     "see_explanation": Rule("query", "path"),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),

@@ -37,7 +37,7 @@ from service.maps.schemas import CalibrationOrder
 from service.places import plan_routes
 from service.places import routes as places
 from service.places.parameters import BatchItem
-from service.queries import loop_closure, multi_map_routes
+from service.queries import answer_routes, loop_closure, multi_map_routes
 from service.queries import routes as queries
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
@@ -96,6 +96,7 @@ ROUTERS = (
     sessions.router,
     stream_routes.router,
     queries.explanations,
+    answer_routes.router,
     frames.router,
     upkeep.router,
     transfer_routes.router,

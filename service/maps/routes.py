@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import Annotated, Any
 
@@ -32,6 +34,9 @@ from service.maps.schemas import (
     NewMap,
     QuarantinedMap,
 )
+from service.queries.answers import StatisticsDep
+from service.queries.recent_answers import MapKey
+from service.queries.statistics import QueryStatistics, VerdictCounts, map_key
 
 router = APIRouter(
     prefix="/v1/maps",
@@ -40,6 +45,8 @@ router = APIRouter(
     dependencies=[Depends(single_values)],
     responses=problem_documentation(errors.StorageFailure, errors.MapQuarantined),
 )
+log = logging.getLogger("placerec.maps")
+
 ALL_MAPS = "(all)"
 """The lock held while a map is created, so that two requests cannot both create the last map that is allowed; no map
 can have this id."""
@@ -47,8 +54,12 @@ can have this id."""
 BODY_PROBLEMS = (MalformedBody, BodyTooLarge, UnsupportedMediaType)
 
 
-def show_map(engine: Engine, map_: Map) -> MapView:
-    """A map as JSON."""
+def show_map(engine: Engine, map_: Map, last_day: Mapping[MapKey, VerdictCounts] | None) -> MapView:
+    """A map as JSON.
+
+    Args:
+        last_day: the answers of the last day by map; None if they are not known.
+    """
     record = map_.record
     calibration = record.calibration or engine.default_calibration(record.encoder)
     return MapView(
@@ -57,7 +68,17 @@ def show_map(engine: Engine, map_: Map) -> MapView:
         index=map_.index_status(),
         storage=map_.storage_status(),
         places=map_.count_places(),
+        last_day=None if last_day is None else last_day.get(map_key(map_), VerdictCounts()),
     )
+
+
+def _last_day(statistics: QueryStatistics, map_: Map | None = None) -> Mapping[MapKey, VerdictCounts] | None:
+    """The answers of the last day, of one map or of all; None if the disk refuses, which hides no map."""
+    try:
+        return statistics.last_day(None if map_ is None else map_key(map_))
+    except errors.PlacerecError as error:
+        log.warning("the statistics of queries cannot be read: %s", error)
+        return None
 
 
 @router.post(
@@ -74,7 +95,12 @@ def show_map(engine: Engine, map_: Map) -> MapView:
     ),
 )
 def create_map(
-    new: NewMap, request: Request, engine: EngineDep, principal: PrincipalDep, response: Response
+    new: NewMap,
+    request: Request,
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    principal: PrincipalDep,
+    response: Response,
 ) -> MapView:
     """Create a map, bound for life to one encoder."""
     check_map_id(new.id)
@@ -91,20 +117,20 @@ def create_map(
     map_.open()
     response.headers["ETag"] = entity_tag(map_.record.revision)
     response.headers["Location"] = f"{engine.settings.root_path}{router.prefix}/{new.id}"
-    return show_map(engine, map_)
+    return show_map(engine, map_, _last_day(statistics, map_))
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-def list_maps(page: Page, engine: EngineDep, principal: PrincipalDep) -> MapPage:
+def list_maps(page: Page, engine: EngineDep, statistics: StatisticsDep, principal: PrincipalDep) -> MapPage:
     """List the maps in the order of their ids, and the damaged maps; a key limited to some maps sees only those."""
     if principal.maps is None:
         records, next_cursor = engine.atlas.records(page.cursor, page.limit)
     else:
         records, next_cursor = _records_among(engine, principal.maps, page)
-    items = []
+    items, last_day = [], _last_day(statistics)
     for record in records:
         try:
-            items.append(show_map(engine, engine.atlas.find(record.id)))
+            items.append(show_map(engine, engine.atlas.find(record.id), last_day))
         except (errors.UnknownMap, errors.MapQuarantined):
             continue  # it was deleted or found to be damaged since it was listed
     damaged = engine.atlas.quarantined().items()
@@ -124,11 +150,11 @@ def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters
 
 
 @router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
-def read_map(map_id: MapId, engine: EngineDep, response: Response) -> MapView:
+def read_map(map_id: MapId, engine: EngineDep, statistics: StatisticsDep, response: Response) -> MapView:
     """Read a map's settings, calibration and size; send its ETag as `If-Match` when you edit the map."""
     map_ = engine.atlas.get(map_id)
     response.headers["ETag"] = entity_tag(map_.record.revision)
-    return show_map(engine, map_)
+    return show_map(engine, map_, _last_day(statistics, map_))
 
 
 @router.patch(
@@ -140,7 +166,12 @@ def read_map(map_id: MapId, engine: EngineDep, response: Response) -> MapView:
     ),
 )
 def edit_map(
-    map_id: MapId, changes: MapChanges, engine: EngineDep, response: Response, if_match: IfMatch = None
+    map_id: MapId,
+    changes: MapChanges,
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    response: Response,
+    if_match: IfMatch = None,
 ) -> MapView:
     """Edit a map by a merge patch.
 
@@ -153,7 +184,7 @@ def edit_map(
     edited = map_.edit(settings, expected)
     tell_map(engine, map_, "edited", sorted(settings))
     response.headers["ETag"] = entity_tag(edited.revision)
-    return show_map(engine, map_)
+    return show_map(engine, map_, _last_day(statistics, map_))
 
 
 def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from core.places import Timestamp
 from core.storage import IndexStatus, Keep, MapSettings, Precision, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
+from service.queries.statistics import VerdictCounts
 
 MAP_EXAMPLE: dict[str, Any] = {
     "id": "lab",
@@ -50,6 +51,7 @@ MAP_EXAMPLE: dict[str, Any] = {
         "keypoints": {"places": 111, "bytes": 4348980},
     },
     "places": 111,
+    "last_day": {"recognized": 120, "ambiguous": 4, "unknown": 9},
     "revision": 1,
     "created_at": "2026-11-20T09:00:00Z",
     "updated_at": "2026-11-20T09:00:00Z",
@@ -81,6 +83,9 @@ class MapView(BaseModel):
     index: IndexStatus = Field(description="How the map is searched; to change its `setting`, send `index`.")
     storage: StorageStatus = Field(description="What the map occupies on disk.")
     places: int
+    last_day: VerdictCounts | None = Field(
+        description="Answers of the last 24 hours by their verdicts; null if the statistics cannot be read."
+    )
     revision: int = Field(description="Number of the last edit of the settings; the ETag contains it.")
     created_at: Timestamp
     updated_at: Timestamp

@@ -43,11 +43,12 @@ def count_answer(engine: Engine, statistics: QueryStatistics, map_: Map, answer:
 
 
 def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer) -> None:
-    """Count an answer in the statistics of its map, if the map still exists."""
+    """Count an answer in the statistics of its map, and keep it for a while, if the map still exists."""
     with suppress(PlacerecError):  # the map was deleted in the meantime
         key = map_key(engine.atlas.find(map_id))
         best = answer.matches[0].place.id if answer.matches else None
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
+        statistics.recent.add(key, answer)
 
 
 def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -16,27 +17,31 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict, Field
+
 from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import PlacerecError, UnknownMap
 from core.judgement.verdict import Verdict
+from core.places import Timestamp
 from core.storage import Map
 from core.upkeep.drift import SCORE_BINS, Week
 from service.engine.engine import Engine
+from service.queries.recent_answers import MapKey, RecentAnswers
 
 FILE = "statistics.sqlite"
 
 MOST_WEEKS = 260
 """How many weeks of a map are kept."""
 
+HOURS = 24
+"""The hours of the last day, which are counted one by one."""
+
 MOST_WAITING = 50_000
 """How many places may have counts that are not written yet; while the disk refuses, further counts are lost."""
 
 SPARE_PLACES = 1000
 """Counts of deleted places are removed once a map has so many more counted places than places."""
-
-MapKey = tuple[str, str]
-"""The id of a map and the time of its creation: a new map of the same id has statistics of its own."""
 
 log = logging.getLogger("placerec.statistics")
 
@@ -58,7 +63,46 @@ _TABLES = (
     f" {', '.join(f'bin{number} INTEGER NOT NULL' for number in range(SCORE_BINS))}, PRIMARY KEY (map, monday))"
     " STRICT, WITHOUT ROWID",
 )
-_SCHEMA = Schema(application_id=0, version=1, create=_TABLES)
+_LATER: Mapping[int, tuple[str, ...]] = {
+    1: (
+        "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour TEXT NOT NULL,"
+        " recognized INTEGER NOT NULL, ambiguous INTEGER NOT NULL, unknown INTEGER NOT NULL, PRIMARY KEY (map, hour))"
+        " STRICT, WITHOUT ROWID",
+    )
+}
+_SCHEMA = Schema(application_id=0, version=2, create=(*_TABLES, *_LATER[1]), migrations=_LATER)
+
+
+class VerdictCounts(BaseModel):
+    """How many answers had each verdict."""
+
+    model_config = ConfigDict(frozen=True)
+
+    recognized: int = 0
+    ambiguous: int = 0
+    unknown: int = 0
+
+    @classmethod
+    def of(cls, counts: Mapping[Verdict, int]) -> VerdictCounts:
+        """The counts of some answers."""
+        return VerdictCounts(
+            recognized=counts.get("recognized", 0),
+            ambiguous=counts.get("ambiguous", 0),
+            unknown=counts.get("unknown", 0),
+        )
+
+    def __add__(self, other: VerdictCounts) -> VerdictCounts:
+        return VerdictCounts(
+            recognized=self.recognized + other.recognized,
+            ambiguous=self.ambiguous + other.ambiguous,
+            unknown=self.unknown + other.unknown,
+        )
+
+
+class HourCount(VerdictCounts):
+    """How many answers had each verdict within an hour."""
+
+    hour: Timestamp = Field(description="When the hour began.")
 
 
 @dataclass(frozen=True)
@@ -99,12 +143,15 @@ class _Counts:
     since: str
     places: dict[str, PlaceCount] = field(default_factory=dict)
     weeks: dict[date, Week] = field(default_factory=dict)
+    hours: dict[str, Counter[Verdict]] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         for place, count in other.places.items():
             self.places[place] = self.places.get(place, PlaceCount()) + count
         for monday, week in other.weeks.items():
             self.weeks[monday] = self.weeks.get(monday, Week(monday)) + week
+        for hour, verdicts in other.hours.items():
+            self.hours.setdefault(hour, Counter()).update(verdicts)
 
 
 class QueryStatistics:
@@ -132,6 +179,8 @@ class QueryStatistics:
         self._lock = threading.Lock()
         self._counts: dict[MapKey, _Counts] = {}
         self._waiting = 0
+        self.recent = RecentAnswers()
+        """The latest answers, which are in memory alone."""
         self.lost = 0
         """How many counts were dropped because the disk refuses."""
         self._file = threading.Lock()  # held while the connection is used
@@ -191,6 +240,7 @@ class QueryStatistics:
         with self._lock:
             counts = self._counts.setdefault(key, _Counts(since=now.isoformat()))
             counts.weeks[counted.monday] = counts.weeks.get(counted.monday, Week(counted.monday)) + counted
+            counts.hours.setdefault(_hour(now), Counter())[verdict] += 1
             if best is None:
                 return
             if best not in counts.places:
@@ -219,6 +269,68 @@ class QueryStatistics:
             weeks = connection.execute("SELECT * FROM weeks WHERE map = ? ORDER BY monday", (code,)).fetchall()
             return Statistics(datetime.fromisoformat(since), counts, tuple(_week(row[1:]) for row in weeks))
         return Statistics()
+
+    def of_place(self, key: MapKey, place_id: str) -> PlaceCount:
+        """The counts of one place of a map, including those that are not written yet.
+
+        Raises:
+            StorageFull, StorageFailure: the file cannot be read or written.
+        """
+        self.flush()
+        query = (
+            "SELECT best, recognized, last FROM places p JOIN maps m ON m.code = p.map"
+            " WHERE m.id = ? AND m.made = ? AND p.id = ?"
+        )
+        with self._file, self._replacing_damage():
+            found = self._open().execute(query, (*key, place_id)).fetchone()
+            return PlaceCount() if found is None else PlaceCount(*found)
+        return PlaceCount()
+
+    def hours(self, key: MapKey) -> list[HourCount]:
+        """The answers of a map in the last ``HOURS`` hours, including those that are not written yet; hours in order.
+
+        Raises:
+            StorageFull, StorageFailure: the file cannot be read.
+        """
+        found = self._last_hours(key).get(key, {})
+        return [HourCount(hour=datetime.fromisoformat(hour), **counts.model_dump()) for hour, counts in found.items()]
+
+    def last_day(self, key: MapKey | None = None) -> dict[MapKey, VerdictCounts]:
+        """The answers of the last ``HOURS`` hours, of the maps that had any.
+
+        Args:
+            key: of the only map that is wanted; None: all.
+
+        Raises:
+            StorageFull, StorageFailure: the file cannot be read.
+        """
+        found = self._last_hours(key)
+        return {one: sum(hours.values(), VerdictCounts()) for one, hours in found.items()}
+
+    def _last_hours(self, key: MapKey | None) -> dict[MapKey, dict[str, VerdictCounts]]:
+        """The counts of the last hours by map and hour, in order."""
+        oldest = _hour(datetime.now(UTC) - timedelta(hours=HOURS - 1))
+        query = (
+            "SELECT m.id, m.made, h.hour, h.recognized, h.ambiguous, h.unknown FROM hours h JOIN maps m"
+            " ON m.code = h.map WHERE h.hour >= ?"
+        )
+        only, values = ("", ()) if key is None else (" AND m.id = ? AND m.made = ?", key)
+        found: dict[MapKey, dict[str, VerdictCounts]] = {}
+        with self._file:  # so that no counts are on their way from memory to the file
+            with self._replacing_damage():
+                for map_id, made, hour, *counts in self._open().execute(query + only, (oldest, *values)).fetchall():
+                    known = dict(zip(("recognized", "ambiguous", "unknown"), counts, strict=True))
+                    found.setdefault((map_id, made), {})[hour] = VerdictCounts(**known)
+            with self._lock:
+                for one, waiting in self._counts.items():
+                    if key in (None, one):
+                        of_map = found.setdefault(one, {})
+                        for hour, verdicts in waiting.hours.items():
+                            of_map[hour] = of_map.get(hour, VerdictCounts()) + VerdictCounts.of(verdicts)
+        return {
+            one: {hour: counts for hour, counts in sorted(hours.items()) if hour >= oldest}
+            for one, hours in found.items()
+        }
 
     @contextmanager
     def _replacing_damage(self) -> Iterator[None]:
@@ -299,6 +411,16 @@ class QueryStatistics:
             columns = _columns(week if stored is None else _week(stored[1:]) + week)
             marks = ", ".join("?" * (len(columns) + 1))
             connection.execute(f"INSERT OR REPLACE INTO weeks VALUES ({marks})", (code, *columns))
+        connection.executemany(
+            "INSERT INTO hours VALUES (?1, ?2, ?3, ?4, ?5) ON CONFLICT DO UPDATE SET recognized = recognized + ?3,"
+            " ambiguous = ambiguous + ?4, unknown = unknown + ?5",
+            [
+                (code, hour, verdicts["recognized"], verdicts["ambiguous"], verdicts["unknown"])
+                for hour, verdicts in counted.hours.items()
+            ],
+        )
+        last = _hour(datetime.now(UTC) - timedelta(hours=HOURS))
+        connection.execute("DELETE FROM hours WHERE map = ? AND hour < ?", (code, last))
         oldest = "SELECT monday FROM weeks WHERE map = ?1 ORDER BY monday DESC LIMIT 1 OFFSET ?2"
         connection.execute(f"DELETE FROM weeks WHERE map = ?1 AND monday <= ({oldest})", (code, MOST_WEEKS))
         (rows,) = connection.execute("SELECT count(*) FROM places WHERE map = ?", (code,)).fetchone()
@@ -311,6 +433,11 @@ class QueryStatistics:
 
 def _monday(day: date) -> date:
     return day - timedelta(days=day.weekday())
+
+
+def _hour(moment: datetime) -> str:
+    """The hour of a moment as text, which sorts by time."""
+    return moment.replace(minute=0, second=0, microsecond=0).isoformat()
 
 
 def _columns(week: Week) -> tuple[object, ...]:

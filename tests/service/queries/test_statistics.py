@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
-from datetime import date, timedelta
+from contextlib import closing
+from datetime import UTC, date, datetime, timedelta, tzinfo
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,18 @@ from hypothesis import strategies as st
 
 from core.upkeep.drift import Week
 from service.queries import statistics
-from service.queries.statistics import FILE, MOST_WEEKS, SPARE_PLACES, MapKey, QueryStatistics, _Counts
+from service.queries.recent_answers import MapKey
+from service.queries.statistics import (
+    _LATER,
+    _TABLES,
+    FILE,
+    MOST_WEEKS,
+    SPARE_PLACES,
+    PlaceCount,
+    QueryStatistics,
+    VerdictCounts,
+    _Counts,
+)
 
 LAB: MapKey = ("lab", "2026-11-20T09:00:00+00:00")
 HALL: MapKey = ("hall", "2026-11-20T09:00:00+00:00")
@@ -136,3 +148,66 @@ def test_a_damaged_file_is_put_aside(tmp_path: Path, maps: Maps) -> None:
     assert counted.read(LAB).places["p1"].best == 1
     counted.close()
     assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
+
+
+# The last day
+
+
+class Now(datetime):
+    """A clock that is set by hand."""
+
+    moment = datetime(2026, 11, 22, 18, 30, tzinfo=UTC)
+
+    @classmethod
+    def now(cls, tz: tzinfo | None = None) -> datetime:  # type: ignore[override]
+        return cls.moment
+
+
+def test_the_last_day_is_counted_by_the_hour(tmp_path: Path, maps: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "datetime", Now)
+    monkeypatch.setattr(Now, "moment", Now.moment)  # set back at the end
+    counted = counting(tmp_path, maps)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    counted.flush()
+    counted.observe(LAB, "unknown", None, None, None)
+    counted.observe(HALL, "ambiguous", "p2", 0.5, 2.0)
+    assert counted.last_day() == {LAB: VerdictCounts(recognized=1, unknown=1), HALL: VerdictCounts(ambiguous=1)}
+    Now.moment += timedelta(hours=2)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    counted.close()
+    again = counting(tmp_path, maps)
+    assert [(one.hour.hour, one.recognized, one.unknown) for one in again.hours(LAB)] == [(18, 1, 1), (20, 1, 0)]
+    Now.moment += timedelta(hours=22)
+    assert [(one.hour.hour, one.recognized) for one in again.hours(LAB)] == [(20, 1)], "18:30 is 24 hours ago"
+    assert again.last_day(HALL) == {} and again.last_day(LAB) == {LAB: VerdictCounts(recognized=1)}
+    Now.moment += timedelta(days=3)
+    again.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    again.close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as connection:
+        assert connection.execute("SELECT count(*) FROM hours h JOIN maps m ON m.code = h.map").fetchone() == (2,)
+
+
+def test_counts_of_one_place(tmp_path: Path, maps: Maps) -> None:
+    counted = counting(tmp_path, maps)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    counted.observe(LAB, "unknown", "p1", 0.1, 0.2)
+    found = counted.of_place(LAB, "p1")
+    assert (found.best, found.recognized) == (2, 1) and found.last
+    assert counted.of_place(LAB, "p2") == counted.of_place(HALL, "p1") == PlaceCount()
+    counted.close()
+
+
+def test_statistics_of_the_first_version_get_the_new_table(tmp_path: Path, maps: Maps) -> None:
+    with closing(sqlite3.connect(tmp_path / FILE)) as connection:
+        for statement in (*_TABLES, "PRAGMA user_version = 1"):
+            connection.execute(statement)
+        connection.execute(
+            "INSERT INTO maps VALUES (1, 'lab', '2026-11-20T09:00:00+00:00', '2026-11-20T09:00:00+00:00')"
+        )
+        connection.execute("INSERT INTO places VALUES (1, 'p1', 7, 5, '2026-11-21T09:00:00+00:00')")
+        connection.commit()
+    counted = counting(tmp_path, maps)
+    counted.observe(LAB, "recognized", "p1", 0.5, 2.0)
+    assert counted.of_place(LAB, "p1").best == 8 and counted.last_day()[LAB].recognized == 1
+    counted.close()
+    assert not list(tmp_path.glob("*damaged*")) and list(_LATER) == [1]
