@@ -76,11 +76,14 @@ function View() {
     scrollTo(0, 0);
     if (map) remember(map);
   }, [name, map]);
-  if (!entry) return html`<${Missing} />`;
-  if (!may(entry[2]) || (entry[3] && !everyMap.value)) return html`<${Forbidden} role=${entry[2]} />`;
-  if (loaded.name !== name) return html`<${Loading} />`;
-  if (loaded.error) return html`<${Stale} />`;
-  return html`<${loaded.component} key=${map} map=${map} rest=${rest} query=${route.value.query} />`;
+  const shown = () => {
+    if (!entry) return html`<${Missing} />`;
+    if (!may(entry[2]) || (entry[3] && !everyMap.value)) return html`<${Forbidden} role=${entry[2]} />`;
+    if (loaded.name !== name) return html`<${Loading} />`;
+    if (loaded.error) return html`<${Stale} />`;
+    return html`<${loaded.component} key=${map} map=${map} rest=${rest} query=${route.value.query} />`;
+  };
+  return html`<div class="view" data-view=${route.value.parts.join("/")}>${shown()}</div>`;
 }
 
 function Missing() {

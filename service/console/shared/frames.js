@@ -26,3 +26,9 @@ async function asPng(picture) {
   canvas.getContext("2d").drawImage(picture, 0, 0);
   return canvas.convertToBlob({ type: "image/png" });
 }
+
+/** The blob of a data: URL, which the page's policy does not let it fetch. */
+export function blobOf(url) {
+  const [, type, text] = /^data:([a-z/]+);base64,(.*)$/.exec(url);
+  return new Blob([Uint8Array.from(atob(text), (one) => one.charCodeAt(0))], { type });
+}

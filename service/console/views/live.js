@@ -2,7 +2,7 @@
 import { epoch, follow, get, may } from "../shared/api.js";
 import { Bar, Dialog, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
 import { decimal, integer, metres, percent, poseText } from "../shared/formats.js";
-import { handedOver } from "../shared/frames.js";
+import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
 import { Timings } from "../shared/answer.js";
@@ -116,8 +116,8 @@ function Line({ map, event, open }) {
 
 function Details({ map, event, close }) {
   const { verdict, probability, place, best, pose, score, decision, threshold, reason, picture, explanation } = event;
-  const again = async () => {
-    handedOver.value = await (await fetch(picture)).blob();
+  const again = () => {
+    handedOver.value = blobOf(picture);
     go("maps", map, "try");
   };
   return html`
