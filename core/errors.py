@@ -112,6 +112,10 @@ class UnknownPlace(PlacerecError):
     """The map has no place with this id."""
 
 
+class TooManyToForget(PlacerecError):
+    """More places fulfil the conditions than may be forgotten at once; none was."""
+
+
 class UnknownSequence(PlacerecError):
     """The map has no place in this sequence."""
 

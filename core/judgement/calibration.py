@@ -164,6 +164,53 @@ class Held(BaseModel):
     reliability: Reliability = Field(description="Of the probabilities.")
 
 
+class Mix(BaseModel):
+    """How many queries had each verdict."""
+
+    recognized: int
+    ambiguous: int
+    unknown: int
+
+
+class Effect(BaseModel):
+    """What a calibration does with queries whose truth is known.
+
+    The calibration may have been fitted to the same queries, so these figures are a little too good; those of
+    :class:`Measurement` are cross-validated.  A best match that does not stand out counts as unknown, also where rivals
+    explain it.
+    """
+
+    threshold: float
+    margin: float
+    verdicts: Mix
+    precision: Share = Field(description="Right ones among the recognized.")
+    recall: Share = Field(description="Recognized and right, of the queries whose place is in the map.")
+    false_accept_rate: Share = Field(description="Recognized, of the queries whose place is not.")
+    reliability: Reliability | None = Field(description="Of the probabilities; null for a calibration without a curve.")
+
+
+def effect_of(trials: Trials, calibration: Calibration) -> Effect:
+    """What a calibration does with some trials, at least one."""
+    recognized, believed = trials.recognized(calibration), trials.standing_out(calibration)
+    passed, known = recognized & trials.right, trials.known
+    told = None
+    if calibration.curve is not None:
+        told = reliability(trials.probabilities(calibration), trials.right)
+    return Effect(
+        threshold=calibration.threshold,
+        margin=calibration.margin,
+        verdicts=Mix(
+            recognized=int(recognized.sum()),
+            ambiguous=int((believed & ~recognized).sum()),
+            unknown=int((~believed).sum()),
+        ),
+        precision=wilson(int(passed.sum()), int(recognized.sum())),
+        recall=wilson(int(passed.sum()), int(known.sum())),
+        false_accept_rate=wilson(int((recognized & ~known).sum()), int((~known).sum())),
+        reliability=told,
+    )
+
+
 class Measurement(BaseModel):
     """What was measured in making a calibration."""
 
@@ -181,10 +228,11 @@ class Measurement(BaseModel):
 
 @dataclass(frozen=True)
 class FittedCalibration:
-    """A calibration fitted to trials on a map, and what was measured while fitting it."""
+    """A calibration fitted to trials on a map, what was measured while fitting it, and the trials."""
 
     calibration: Calibration
     measurement: Measurement
+    trials: Trials
 
 
 def fit_map_calibration(trials: Trials, base: Calibration, target: Target, source: str) -> FittedCalibration:
@@ -218,7 +266,7 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
         cross_validated=cross_validated(trials, base, target),
         points=_thinned(points),
     )
-    return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement)
+    return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement, trials)
 
 
 def blocks_of(frame: NDArray[np.int64], count: int = BLOCKS) -> list[Flags]:

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.verdict import Calibration, Judgement, probability_of, stands_out
+
+_STORED: Mapping[str, tuple[Any, float]] = {
+    "decision": (np.float64, 0.0),
+    "margin": (np.float64, np.inf),
+    "known": (np.bool_, False),
+    "right": (np.bool_, False),
+    "frame": (np.int64, 0),
+    "imagined": (np.float64, 0.0),
+    "evidence": (np.float64, np.nan),
+}
+"""The type of each column, and the value that null stands for."""
 
 _NUMBERS = ("decision", "margin", "known", "right", "imagined", "evidence")
 
@@ -50,15 +62,41 @@ class Trials:
         """The trials that are chosen, bool [n]."""
         return Trials(*(getattr(self, column.name)[chosen] for column in fields(self)))
 
+    def standing_out(self, calibration: Calibration) -> Flags:
+        """Which of them are believed by a calibration if their lead is large enough, bool [n]."""
+        believed = [stands_out(d, calibration, share, found) for d, _, share, found in self._rows()]
+        return np.array(believed, np.bool_)
+
     def recognized(self, calibration: Calibration) -> Flags:
         """Which of them are recognized by a calibration, bool [n]."""
-        believed = [stands_out(d, calibration, share, found) for d, _, share, found in self._rows()]
-        return np.array(believed, np.bool_) & (self.margin >= calibration.margin)
+        return self.standing_out(calibration) & (self.margin >= calibration.margin)
 
     def probabilities(self, calibration: Calibration) -> Values:
         """The probability that each is right, by a calibration with a curve, float64 [n]."""
         stated = [probability_of(d, margin, calibration, share, found) for d, margin, share, found in self._rows()]
         return np.array(stated, np.float64)
+
+    def record(self) -> dict[str, list[float | None]]:
+        """The trials as lists for JSON, by the names of the fields; null stands for infinite and missing values."""
+        return {
+            column.name: [value if np.isfinite(value) else None for value in getattr(self, column.name).tolist()]
+            for column in fields(self)
+        }
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Sequence[float | None]]) -> Trials:
+        """The trials of lists that :meth:`record` made.
+
+        Raises:
+            KeyError, TypeError, ValueError: the lists are others.
+        """
+        found = {}
+        for name, (dtype, missing) in _STORED.items():
+            values = [missing if value is None else value for value in record[name]]
+            found[name] = np.array(values, dtype)
+        if len({len(values) for values in found.values()}) > 1:
+            raise ValueError("the lists are of different lengths")
+        return cls(**found)
 
     def _rows(self) -> Iterator[tuple[float, float, float, float | None]]:
         """Decision value, margin, imagined share and evidence of each."""

@@ -26,6 +26,7 @@ from core.places import NO_POSE, Neighborhood
 from core.recognition.selection import SearchScope
 from core.recognition.stages import agree, neighborhood_of
 from core.storage import Map, Ranking, Snapshot
+from core.storage.place_filter import PlaceFilter
 
 Item = TypeVar("Item")
 Flags = NDArray[np.bool_]
@@ -307,10 +308,11 @@ def _rows_of(map_: Map, snapshot: Snapshot, places: Sequence[str]) -> dict[str, 
 
 def _members(map_: Map, sequence: str) -> list[str]:
     """The ids of the places of a sequence in the order of their enrolment."""
-    found, cursor = map_.places(None, 1000, sequence)
+    wanted = PlaceFilter(sequence=sequence)
+    found, cursor = map_.places(None, 1000, wanted)
     members = [place.id for place in found]
     while cursor is not None:
-        found, cursor = map_.places(cursor, 1000, sequence)
+        found, cursor = map_.places(cursor, 1000, wanted)
         members += [place.id for place in found]
     if not members:
         raise UnknownSequence(f"The map has no sequence {sequence[:128]!r}.")

@@ -15,15 +15,16 @@ Scalar = str | int | float | bool | None
 FEW = 5000
 """Up to so many rows are looked up one by one, which is faster than reading all rows with a value."""
 
-_WANTED = (
+# A value "f" that is looked for, and a value "v" of a place that is equal.
+WANTED = (
     " v.key = f.key AND v.kind = CASE f.type WHEN 'true' THEN 'boolean' WHEN 'false' THEN 'boolean'"
     " WHEN 'integer' THEN 'number' WHEN 'real' THEN 'number' ELSE f.type END AND v.value = coalesce(f.atom, 0)"
 )
 # All rows as one text: a Python object for each takes several times as long.
-_ALL = f"SELECT group_concat(v.row) FROM json_each(?) f JOIN place_values v ON{_WANTED}"
+_ALL = f"SELECT group_concat(v.row) FROM json_each(?) f JOIN place_values v ON{WANTED}"
 _AMONG = (
     "SELECT group_concat(v.row) FROM json_each(?) f CROSS JOIN json_each(?) r CROSS JOIN place_values v"
-    f" ON{_WANTED} AND v.row = r.value"
+    f" ON{WANTED} AND v.row = r.value"
 )
 
 

@@ -19,6 +19,7 @@ from core.errors import (
     PlacerecError,
     RevisionMismatch,
     StorageFailure,
+    TooManyToForget,
     UnknownMap,
     UnknownSequence,
 )
@@ -34,6 +35,7 @@ from core.storage.database.connections import DatabaseClosed
 from core.storage.database.ledger import SegmentEntry, segment_entries
 from core.storage.opening import OpenMap, open_map
 from core.storage.pagination import page_of_places, page_of_sequences
+from core.storage.place_filter import EVERY_PLACE, PlaceFilter
 from core.storage.plan import Plan
 from core.storage.records import (
     Change,
@@ -410,6 +412,18 @@ class Map:
         with self._writing() as write:
             write.forget(ledger.expect(write.connection, place_id))
 
+    def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """Delete the places that fulfil some conditions, all in one commit; returns their ids.
+
+        Raises:
+            TooManyToForget: there are more than ``most``; none is deleted.
+        """
+        with self._writing() as write:
+            found = _not_more(ledger.ids_of(write.connection, wanted, most + 1), most)
+            for place_id in found:
+                write.forget(ledger.expect(write.connection, place_id))
+        return found
+
     def forget_sequence(self, name: str) -> int:
         """Delete all places of a sequence; returns how many.
 
@@ -450,14 +464,28 @@ class Map:
         with self._reading() as connection:
             return ledger.expect(connection, place_id).place
 
-    def places(self, cursor: str | None, limit: int, sequence: str | None = None) -> tuple[list[Place], str | None]:
+    def places(
+        self, cursor: str | None, limit: int, wanted: PlaceFilter = EVERY_PLACE
+    ) -> tuple[list[Place], str | None]:
         """A page of places in the order of their enrolment, and the cursor of the next page.
+
+        Args:
+            wanted: which places are listed.
 
         Raises:
             InvalidCursor.
         """
         with self._reading() as connection:
-            return page_of_places(connection, self._folder.name, cursor, limit, sequence)
+            return page_of_places(connection, self._folder.name, cursor, limit, wanted)
+
+    def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """The ids of the places that fulfil some conditions, in the order of their enrolment.
+
+        Raises:
+            TooManyToForget: there are more than ``most``.
+        """
+        with self._reading() as connection:
+            return _not_more(ledger.ids_of(connection, wanted, most + 1), most)
 
     def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
         """A page of sequences by name, and the cursor of the next page.
@@ -551,3 +579,10 @@ class Map:
                 connection.execute("BEGIN")
                 connection.execute("SELECT id FROM map").fetchall()  # a transaction sees the moment of its first read
             return inspect(self._folder, connection, snapshot, progress)
+
+
+def _not_more(ids: list[str], most: int) -> list[str]:
+    """The ids; raises TooManyToForget if they are more than ``most``."""
+    if len(ids) > most:
+        raise TooManyToForget(f"More than {most} places fulfil the conditions. Forget them in several requests.")
+    return ids

@@ -14,6 +14,7 @@ import sqlite3
 from core.errors import InvalidCursor
 from core.places import Place
 from core.storage.database import ledger
+from core.storage.place_filter import PlaceFilter
 from core.storage.records import SequenceSummary
 
 Listing = list[str | None]
@@ -62,16 +63,17 @@ def decode_name(listing: Listing, cursor: str | None) -> str:
 
 
 def page_of_places(
-    connection: sqlite3.Connection, map_id: str, cursor: str | None, limit: int, sequence: str | None
+    connection: sqlite3.Connection, map_id: str, cursor: str | None, limit: int, wanted: PlaceFilter
 ) -> tuple[list[Place], str | None]:
-    """Places in the order of their enrolment, and the cursor of the next page.
+    """Places that fulfil some conditions, in the order of their enrolment, and the cursor of the next page.
 
     Raises:
         InvalidCursor.
     """
-    listing: Listing = ["places", map_id, sequence]
+    listing: Listing = ["places", map_id, wanted.sequence]
+    listing += [] if (others := wanted.text()) is None else [others]
     after = decode_number(listing, cursor)
-    found = ledger.places_after(connection, after, _one_more(limit), sequence)
+    found = ledger.places_after(connection, after, _one_more(limit), wanted)
     more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None
     return [stored.place for stored in found[:limit]], more
 

@@ -130,6 +130,7 @@ OPERATIONS: dict[str, Rule] = {
     "enrol_places": Rule("enrol", "path", changes=True),
     "edit_place": Rule("enrol", "path", changes=True),
     "forget_place": Rule("enrol", "path", changes=True),
+    "forget_places": Rule("enrol", "path", changes=True),
     "list_places": Rule("query", "path"),
     "read_place": Rule("query", "path"),
     "see_thumbnail": Rule("query", "path"),
@@ -157,6 +158,7 @@ OPERATIONS: dict[str, Rule] = {
     "stream_frames": Rule("query", "path"),
     "align_map": Rule("enrol", "path", changes=True),  # it changes of places what an edit of each could change
     # Upkeep: it changes the answers to all robots, or takes long
+    "read_calibration": Rule("query", "path"),
     "calibrate_map": Rule("admin", "path", changes=True),
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too

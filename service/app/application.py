@@ -31,7 +31,7 @@ from service.frames import routes as frames
 from service.http.bodies import BodyLimit, UploadMemory
 from service.http.openapi import document
 from service.jobs import routes as jobs
-from service.maps import calibration, camera_routes, event_routes, transfer_routes
+from service.maps import calibration, calibration_preview, camera_routes, event_routes, transfer_routes
 from service.maps import routes as maps
 from service.maps.schemas import CalibrationOrder
 from service.places import plan_routes
@@ -91,6 +91,7 @@ ROUTERS = (
     camera_routes.router,
     event_routes.router,
     calibration.router,
+    calibration_preview.router,
     loop_closure.router,
     multi_map_routes.router,
     sessions.router,

@@ -81,7 +81,7 @@ class Runtime:
         register(keypoints.KIND, partial(keypoints.fill_keypoints, engine))
         register(storage_jobs.REBUILD, partial(storage_jobs.rebuild, engine))
         register(storage_jobs.VERIFY, partial(storage_jobs.verify, engine))
-        register(calibration.KIND, partial(calibration.run_job, engine))
+        register(calibration.KIND, partial(calibration.run_job, engine, self.statistics))
         register(
             bulk_enrolment.KIND,
             partial(bulk_enrolment.enrol_staged, engine, staging, alignment.align_enrolled),

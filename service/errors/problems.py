@@ -96,6 +96,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownMap: Kind(404, "unknown-map", "The map does not exist"),
     errors.MapExists: Kind(409, "map-exists", "A map of this id already exists"),
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
+    errors.TooManyToForget: Kind(422, "too-many-to-forget", "Too many places would be forgotten at once"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
     faults.PlanTooLarge: Kind(422, "plan-too-large", "The plan would list too many places"),

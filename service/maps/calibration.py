@@ -6,6 +6,8 @@ become the map's own calibration unless an operator has set another one meanwhil
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +15,7 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from core import errors
 from core.errors import RevisionMismatch
+from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import (
@@ -51,7 +54,11 @@ from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.map_events import tell_map
 from service.maps.schemas import CalibrationOrder, CalibrationReport
+from service.queries.answers import StatisticsDep
+from service.queries.statistics import QueryStatistics, map_key
 from service.worker_threads import in_thread
+
+log = logging.getLogger("placerec.calibration")
 
 KIND = "calibrate"
 """The kind of the job."""
@@ -105,7 +112,13 @@ BODY: dict[str, Any] = {
     responses={202: {"model": JobView, "description": "The job that calibrates the map, if `background` is true."}},
 )
 async def calibrate_map(
-    map_id: MapId, request: Request, engine: EngineDep, jobs: JobsDep, deadline: DeadlineDep, if_match: IfMatch = None
+    map_id: MapId,
+    request: Request,
+    engine: EngineDep,
+    jobs: JobsDep,
+    statistics: StatisticsDep,
+    deadline: DeadlineDep,
+    if_match: IfMatch = None,
 ) -> CalibrationReport | Response:
     """Measure when a map's answers can be believed, and store the result as the map's calibration.
 
@@ -138,7 +151,8 @@ async def calibrate_map(
             )
 
     replaces = map_.record.calibration
-    report = await in_thread(measure, map_, encoder, order, encodings, advance)
+    report, trials = await in_thread(measure, map_, encoder, order, encodings, advance)
+    await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
         tell_map(engine, map_, "calibrated")
@@ -204,11 +218,14 @@ async def _read_labelled_frames(
 
 def measure(
     map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
-) -> CalibrationReport:
+) -> tuple[CalibrationReport, Trials]:
     """Ask a map the frames of an order, and report the calibration that follows; nothing is stored.
 
     Args:
         encodings: the frames of the order's labels, in their order; empty for the other methods.
+
+    Returns:
+        The report, and the answers that it rests on.
 
     Raises:
         UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure, and whatever ``advance`` raises.
@@ -217,7 +234,7 @@ def measure(
     queries = _queries(map_, snapshot, order, encodings)
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
     found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance)
-    return CalibrationReport(
+    report = CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
         method=order.method,
@@ -228,6 +245,15 @@ def measure(
         measurement=found.measurement,
         warnings=calibration_warnings(found, order.method),
     )
+    return report, found.trials
+
+
+def remember(statistics: QueryStatistics, map_: Map, report: CalibrationReport, trials: Trials) -> None:
+    """Keep what was measured, for those who ask what another threshold would change; a refusing disk is only logged."""
+    try:
+        statistics.keep_calibration(map_key(map_), report.model_dump_json(), json.dumps(trials.record()))
+    except errors.PlacerecError as error:
+        log.warning("what was measured in calibrating %s is not kept: %s", map_.record.id, error)
 
 
 def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
@@ -276,7 +302,7 @@ def job_arguments(map_: Map, order: CalibrationOrder, expected: int | None) -> d
     }
 
 
-def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
+def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) -> Mapping[str, Any]:
     """Calibrate a map as a job; an attempt after a restart begins again unless the calibration was stored already.
 
     Raises:
@@ -299,7 +325,8 @@ def run_job(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         if done % TOGETHER == 0:
             yield_to_requests(engine, context)
 
-    report = measure(map_, engine.load_encoder(map_), order, [], advance)
+    report, trials = measure(map_, engine.load_encoder(map_), order, [], advance)
+    remember(statistics, map_, report, trials)
     result = report.model_dump(mode="json")
     if not order.dry_run:
         context.remember(report=result)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import Query
 from pydantic import BeforeValidator, Field, model_validator
 
 from core.places import Coordinate, PlaceFields, Pose, Sequence, Timestamp
 from service.errors.faults import InvalidRequest
 from service.http.bodies import json_size
-from service.http.schemas import CameraName, EncoderAssertion, PageParameters, Parameters, validated
+from service.http.schemas import CameraName, EncoderAssertion, Parameters, validated
 from service.http.uploads import parse_metadata
 from service.settings import Settings
 
@@ -139,12 +138,3 @@ class BatchItem(PlaceDescription):
         if (self.file is None) == (self.sha256 is None):
             raise ValueError("give either the name of its part as file, or the digest of its frame as sha256")
         return self
-
-
-class PlacePageParameters(PageParameters):
-    """Which places."""
-
-    sequence: str | None = Field(default=None, max_length=128, description="Only the places of this traverse.")
-
-
-PlacePageQuery = Annotated[PlacePageParameters, Query()]

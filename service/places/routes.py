@@ -13,9 +13,11 @@ from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import (
     BatchOutOfOrder,
+    BodyTooLarge,
     EncoderNotInstalled,
     InvalidRequest,
     JobQueueFull,
+    MalformedBody,
     QueueFull,
     StagingFull,
     TooManyPlaces,
@@ -47,7 +49,8 @@ from service.places import bulk_enrolment
 from service.places.batch_order import BatchOrder, BatchTurn
 from service.places.batches import check_batch, entry_id, frame_problem, read_entry
 from service.places.enrolment import FrameToEnrol, enrol
-from service.places.parameters import BatchParameters, EnrolParameters, PlacePageQuery, check_metadata
+from service.places.filters import MOST_FORGOTTEN, Forgetting, ForgottenPlaces, PlacePageQuery
+from service.places.parameters import BatchParameters, EnrolParameters, check_metadata
 from service.places.place_events import tell_change, tell_deletion, tell_enrolment
 from service.places.schemas import (
     BatchResult,
@@ -240,9 +243,31 @@ async def _enrol_later(
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_places(map_id: MapId, page: PlacePageQuery, engine: EngineDep) -> PlacePage:
-    """List places in the order of their enrolment, all or those of one traverse."""
-    places, next_cursor = engine.atlas.get(map_id).places(page.cursor, page.limit, page.sequence)
+    """List places in the order of their enrolment: all, or those of a traverse, a camera, a time, or some metadata."""
+    places, next_cursor = engine.atlas.get(map_id).places(page.cursor, page.limit, page.wanted())
     return PlacePage(items=[PlaceView.of(place) for place in places], next_cursor=next_cursor)
+
+
+@router.post(
+    ":forget",
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(
+        UnsupportedMediaType, MalformedBody, BodyTooLarge, errors.TooManyToForget, errors.StorageFull
+    ),
+)
+def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: EngineDep) -> ForgottenPlaces:
+    """Delete many places in one commit, by their ids or by conditions; by default, only say which these would be.
+
+    To delete exactly the places that a dry run named, send their ids. At most 10 000 places are deleted at once.
+    """
+    map_, wanted = engine.atlas.get(map_id), order.wanted()
+    choose = map_.ids_of if order.dry_run else map_.forget_all
+    found = choose(wanted, MOST_FORGOTTEN)
+    changed = {} if found and not order.dry_run else {"change": None}
+    request.state.noted = {"map": map_id, "places": len(found), **changed}
+    there = set(found)
+    missing = [place_id for place_id in wanted.ids or () if place_id not in there]
+    return ForgottenPlaces(dry_run=order.dry_run, places=len(found), ids=found, missing=missing)
 
 
 @router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
@@ -16,10 +15,8 @@ from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated
+from service.places.filters import MOST_NAMES, checked_metadata, parsed_json
 from service.places.parameters import PlaceDescription
-
-MOST_NAMES = 100
-"""The most sequences, and the most keys of metadata, that one query may name."""
 
 Kind = Literal["position", "bbox", "heading", "sequences", "time", "where"]
 KINDS: tuple[Kind, ...] = ("position", "bbox", "heading", "sequences", "time", "where")
@@ -155,15 +152,7 @@ class FilterParameters(PlaceDescription):
     def _metadata(self) -> dict[str, Scalar]:
         if self.where is None:
             return {}
-        found = parsed_json(self.where, "where")
-        if not isinstance(found, dict) or not 0 < len(found) <= MOST_NAMES:
-            raise InvalidRequest(f"where: the value is not a JSON object with 1 to {MOST_NAMES} keys.")
-        for key, value in found.items():
-            if isinstance(value, dict | list):
-                raise InvalidRequest(f"where: the value of {key[:80]!r} must be a text, number, true, false or null.")
-            if isinstance(value, str) and len(value) > LONGEST_INDEXED:
-                raise InvalidRequest(f"where: the text under {key[:80]!r} has more than {LONGEST_INDEXED} characters.")
-        return found
+        return checked_metadata(parsed_json(self.where, "where"))
 
     def _soft(self, given: set[str]) -> set[str]:
         if self.soft is None:
@@ -214,24 +203,6 @@ def parse_box(text: str) -> Box:
     if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south <= north <= 90):
         raise InvalidRequest("bbox: west and east must be -180 to 180, and -90 <= south <= north <= 90.")
     return Box(west, south, east, north)
-
-
-def parsed_json(text: str, what: str) -> Any:
-    """The value of JSON text in a parameter.
-
-    Raises:
-        InvalidRequest: the text is not JSON, or has values that cannot be stored (NaN, half a surrogate pair).
-    """
-
-    def refuse(constant: str) -> Any:
-        raise ValueError(constant)
-
-    try:
-        found = json.loads(text, parse_constant=refuse)
-        json.dumps(found, ensure_ascii=False, allow_nan=False).encode()
-        return found
-    except (ValueError, RecursionError):
-        raise InvalidRequest(f"{what}: the value is not JSON.") from None
 
 
 MOST_MAPS = 100

@@ -68,6 +68,8 @@ _LATER: Mapping[int, tuple[str, ...]] = {
         "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour TEXT NOT NULL,"
         " recognized INTEGER NOT NULL, ambiguous INTEGER NOT NULL, unknown INTEGER NOT NULL, PRIMARY KEY (map, hour))"
         " STRICT, WITHOUT ROWID",
+        "CREATE TABLE calibrations (map INTEGER PRIMARY KEY REFERENCES maps (code) ON DELETE CASCADE,"
+        " at TEXT NOT NULL, report TEXT NOT NULL, trials TEXT NOT NULL) STRICT",
     )
 }
 _SCHEMA = Schema(application_id=0, version=2, create=(*_TABLES, *_LATER[1]), migrations=_LATER)
@@ -332,6 +334,38 @@ class QueryStatistics:
             for one, hours in found.items()
         }
 
+    def keep_calibration(self, key: MapKey, report: str, trials: str) -> None:
+        """Keep what was measured in calibrating a map, in place of what was measured before.
+
+        Args:
+            report, trials: JSON.
+
+        Raises:
+            StorageFull, StorageFailure: the disk refuses.
+        """
+        now = datetime.now(UTC).isoformat()
+        with self._file, self._replacing_damage():
+            connection = self._open()
+            with transaction(connection):
+                code = _code(connection, key, now)
+                connection.execute(
+                    "INSERT OR REPLACE INTO calibrations VALUES (?, ?, ?, ?)", (code, now, report, trials)
+                )
+
+    def calibration(self, key: MapKey) -> tuple[datetime, str, str] | None:
+        """When a map was last measured to be calibrated, the report and the trials; None if it was not.
+
+        Raises:
+            StorageFull, StorageFailure: the file cannot be read.
+        """
+        query = (
+            "SELECT at, report, trials FROM calibrations c JOIN maps m ON m.code = c.map WHERE m.id = ? AND m.made = ?"
+        )
+        with self._file, self._replacing_damage():
+            found = self._open().execute(query, key).fetchone()
+            return None if found is None else (datetime.fromisoformat(found[0]), found[1], found[2])
+        return None
+
     @contextmanager
     def _replacing_damage(self) -> Iterator[None]:
         """If the file turns out to be damaged within the context, rename it, so that a new one is made."""
@@ -395,10 +429,7 @@ class QueryStatistics:
                     self._add(connection, key, counted, None if sizes is None else sizes[key])
 
     def _add(self, connection: sqlite3.Connection, key: MapKey, counted: _Counts, places: int | None) -> None:
-        connection.execute(
-            "INSERT INTO maps (id, made, since) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", (*key, counted.since)
-        )
-        (code,) = connection.execute("SELECT code FROM maps WHERE id = ? AND made = ?", key).fetchone()
+        code = _code(connection, key, counted.since)
         connection.executemany(
             "INSERT INTO places VALUES (?1, ?2, ?3, ?4, ?5) ON CONFLICT DO UPDATE SET"
             " best = best + ?3, recognized = recognized + ?4, last = max(last, ?5)",
@@ -429,6 +460,13 @@ class QueryStatistics:
             known = connection.execute("SELECT id FROM places WHERE map = ?", (code,)).fetchall()
             gone = [(code, place) for (place,) in known if place not in there]
             connection.executemany("DELETE FROM places WHERE map = ? AND id = ?", gone)
+
+
+def _code(connection: sqlite3.Connection, key: MapKey, since: str) -> int:
+    """The number of a map in the file, which it gets if it has none."""
+    connection.execute("INSERT INTO maps (id, made, since) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", (*key, since))
+    (code,) = connection.execute("SELECT code FROM maps WHERE id = ? AND made = ?", key).fetchone()
+    return int(code)
 
 
 def _monday(day: date) -> date:

@@ -28,8 +28,9 @@ from core.storage.pagination import decode_name, decode_number, encode_cursor
 from service.errors.faults import Fault
 from service.http.multipart import FormReader
 from service.http.schemas import validated
+from service.places.filters import parsed_json
 from service.places.parameters import EnrolParameters
-from service.queries.parameters import FilterParameters, parse_box, parsed_json
+from service.queries.parameters import FilterParameters, parse_box
 from service.telemetry.requests import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 

@@ -19,6 +19,7 @@ from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
 from core.storage.database import row_checksums
 from core.storage.database.row_checksums import CHECKED
 from core.storage.files.segment_files import Layout
+from core.storage.place_filter import PlaceFilter
 from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 
 DEEPEST_METADATA = 64
@@ -166,11 +167,20 @@ def expect(connection: sqlite3.Connection, place_id: str) -> StoredPlace:
     return stored
 
 
-def places_after(connection: sqlite3.Connection, after: int, limit: int, sequence: str | None) -> list[StoredPlace]:
-    """Up to ``limit`` places in the order of their enrolment, of one sequence or of all."""
-    condition, values = ("AND s.name = ? ", [sequence]) if sequence is not None else ("", [])
-    query = f"{_PLACE}WHERE p.number > ? {condition}ORDER BY p.number LIMIT ?"
-    return [_stored(row) for row in connection.execute(query, (after, *values, limit)).fetchall()]
+def places_after(connection: sqlite3.Connection, after: int, limit: int, wanted: PlaceFilter) -> list[StoredPlace]:
+    """Up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
+    conditions = wanted.conditions()
+    also = "".join(f" AND {condition}" for condition in conditions)
+    query = f"{_PLACE}WHERE p.number > ?{also} ORDER BY p.number LIMIT ?"
+    return [_stored(row) for row in connection.execute(query, (after, *conditions.values(), limit)).fetchall()]
+
+
+def ids_of(connection: sqlite3.Connection, wanted: PlaceFilter, limit: int) -> list[str]:
+    """The ids of up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
+    conditions = wanted.conditions()
+    where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+    query = f"SELECT p.id FROM places p JOIN sequences s ON s.code = p.sequence{where} ORDER BY p.number LIMIT ?"
+    return [place_id for (place_id,) in connection.execute(query, (*conditions.values(), limit)).fetchall()]
 
 
 def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int, Place]:

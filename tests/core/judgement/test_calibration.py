@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from core.judgement.calibration import (
     blocks_of,
     cross_validated,
     curve_points,
+    effect_of,
     fit_encoder_calibration,
     fit_map_calibration,
 )
@@ -235,3 +238,36 @@ def test_the_curve_is_sure_of_second_looks_and_not_of_strangers() -> None:
     strangers = [judged(unknown[i], np.flatnonzero(np.abs(np.arange(N) - i) > 2), made).probability for i in range(N)]
     assert np.median(np.array(looks, float)) > 0.9
     assert np.median(np.array(strangers, float)) < 0.1
+
+
+def test_the_effect_of_a_calibration_is_what_its_verdicts_do() -> None:
+    trials = drawn(300)
+    trials.margin[::7] = 0.001  # a rival is close
+    for threshold in (-1.0, 0.05, 0.12, 9.0):
+        calibration = BASE.model_copy(update={"threshold": threshold, "margin": 0.002, "curve": LAW})
+        effect = effect_of(trials, calibration)
+        believed, apart = trials.decision >= threshold, trials.margin >= 0.002
+        recognized = believed & apart
+        assert effect.verdicts.recognized == recognized.sum() == effect.precision.of
+        assert effect.verdicts.ambiguous == (believed & ~apart).sum()
+        assert effect.verdicts.unknown == (~believed).sum()
+        assert effect.recall.count == (recognized & trials.right).sum() and effect.recall.of == 300
+        assert effect.false_accept_rate.count == (recognized & ~trials.known).sum()
+        assert effect.reliability is not None
+        assert effect.reliability.brier == pytest.approx(
+            np.square(trials.probabilities(calibration) - trials.right).mean()
+        )
+    assert effect_of(trials, BASE).reliability is None, "without a curve there are no probabilities"
+
+
+def test_trials_are_the_same_as_json() -> None:
+    trials = drawn(20)
+    trials.evidence[3] = 7.5
+    again = Trials.of_record(json.loads(json.dumps(trials.record(), allow_nan=False)))
+    for name in ("decision", "margin", "known", "right", "frame", "imagined", "evidence"):
+        before, after = getattr(trials, name), getattr(again, name)
+        assert before.dtype == after.dtype
+        np.testing.assert_array_equal(before, after)
+    for wrong in ({}, trials.record() | {"right": [True]}, trials.record() | {"frame": ["x"]}):
+        with pytest.raises((KeyError, TypeError, ValueError)):
+            Trials.of_record(wrong)  # type: ignore[arg-type]

@@ -24,6 +24,7 @@ from core.frames.images import decode, encode_png
 from core.judgement.verdict import Calibration
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings, SameFrame
+from core.storage.place_filter import PlaceFilter
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)
@@ -238,11 +239,11 @@ def test_places_are_listed_page_by_page_in_the_order_of_enrolment(lab: Map) -> N
         if cursor is None:
             break
     assert pages == [["z", "a"], ["m", "b"], ["y"]]
-    page, cursor = lab.places(None, 2, sequence="s")
+    page, cursor = lab.places(None, 2, PlaceFilter(sequence="s"))
     assert [place.id for place in page] == ["a", "m"]
-    page, last = lab.places(cursor, 2, sequence="s")
+    page, last = lab.places(cursor, 2, PlaceFilter(sequence="s"))
     assert ([place.id for place in page], last) == (["y"], None)
-    assert lab.places(None, 2, sequence="none such") == ([], None)
+    assert lab.places(None, 2, PlaceFilter(sequence="none such")) == ([], None)
     with pytest.raises(InvalidCursor):
         lab.places(cursor, 2)
     with pytest.raises(InvalidCursor):

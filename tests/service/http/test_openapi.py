@@ -28,7 +28,8 @@ OPERATIONS = {
     "list_jobs", "read_job", "follow_job", "cancel_job",
     "encode", "regions", "match", "list_encoders",
     "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "revoke_key", "read_audit", "read_service",
-    "read_plan", "list_answers", "list_place_matches",
+    "read_plan", "list_answers", "list_place_matches", "forget_places",
+    "read_calibration",
 }  # fmt: skip
 FRAME_OPERATIONS = ("enrol_place", "query", "encode", "regions")
 

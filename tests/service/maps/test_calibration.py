@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from core.errors import RevisionMismatch
+from core.judgement.trials import Trials, gathered
 from core.judgement.verdict import Calibration
 from core.storage import Map
 from service.maps import calibration
@@ -232,12 +233,13 @@ def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: py
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
         found = manual.model_copy(update={"source": "map", "threshold": 0.25})
 
-        def measure(map_: Map, *_: object) -> CalibrationReport:
+        def measure(map_: Map, *_: object) -> tuple[CalibrationReport, Trials]:
             if happens is not None:
                 map_.edit({"calibration": happens})
-            return CalibrationReport.model_construct(
+            report = CalibrationReport.model_construct(
                 map="lab", encoder=ENCODER, method="map", stored=True, calibration=found, previous=manual, warnings=[]
             )
+            return report, gathered([])
 
         monkeypatch.setattr(calibration, "measure", measure)
         monkeypatch.setattr(runtime.engine, "load_encoder", lambda _: None)

@@ -1,0 +1,103 @@
+"""The route that reads a map's calibration, what was measured for it, and what another threshold would change."""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import datetime
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Query, Response
+from pydantic import BaseModel, Field
+
+from core import errors
+from core.judgement.calibration import Effect, effect_of
+from core.judgement.trials import Trials
+from core.judgement.verdict import Calibration
+from core.places import Timestamp
+from service.errors.problems import problem_documentation
+from service.http.headers import entity_tag
+from service.http.routing import EngineDep, MapId, single_values
+from service.http.schemas import Parameters
+from service.maps.schemas import CalibrationReport
+from service.queries.answers import StatisticsDep
+from service.queries.statistics import map_key
+
+log = logging.getLogger("placerec.calibration")
+
+router = APIRouter(prefix="/v1/maps/{map}/calibration", tags=["calibration"], dependencies=[Depends(single_values)])
+
+
+class PreviewParameters(Parameters):
+    """The calibration to compare with the one in force."""
+
+    threshold: float | None = Field(
+        default=None, allow_inf_nan=False, description="Another threshold on the decision value.", examples=[0.12]
+    )
+    margin: float | None = Field(default=None, ge=0, allow_inf_nan=False, description="Another margin.")
+
+
+class LatestMeasurement(BaseModel):
+    """The latest calibrate of a map, a dry run or not."""
+
+    at: Timestamp
+    report: CalibrationReport
+
+
+class CalibrationState(BaseModel):
+    """A map's calibration, and what it does with the frames that the map was last asked to be calibrated."""
+
+    map: str
+    revision: int = Field(description="Of the map's settings; the ETag contains it.")
+    calibration: Calibration | None = Field(description="The one in force; null if the encoder is not installed.")
+    measured: LatestMeasurement | None = Field(description="Null if nothing was measured, or it is not known any more.")
+    now: Effect | None = Field(description="What the calibration in force does with the frames that were measured.")
+    then: Effect | None = Field(description="What it would do with the threshold and the margin that were given.")
+
+
+@router.get("", responses=problem_documentation(errors.StorageFull))
+def read_calibration(
+    map_id: MapId,
+    options: Annotated[PreviewParameters, Query()],
+    engine: EngineDep,
+    statistics: StatisticsDep,
+    response: Response,
+) -> CalibrationState:
+    """Read a map's calibration, the reliability and the curves that were measured for it, and preview a threshold.
+
+    The frames are those of the latest calibrate, which are not asked again. To apply a threshold, send it by PATCH to
+    the map with this answer's ETag as `If-Match`.
+    """
+    map_ = engine.atlas.get(map_id)
+    record = map_.record
+    in_force = record.calibration or engine.default_calibration(record.encoder)
+    response.headers["ETag"] = entity_tag(record.revision)
+    found = _measured(statistics.calibration(map_key(map_)))
+    now = then = None
+    if in_force is not None and found is not None:
+        trials, changes = found[1], options.model_dump(exclude_none=True)
+        now = effect_of(trials, in_force)
+        then = effect_of(trials, in_force.model_copy(update=changes)) if changes else None
+    return CalibrationState(
+        map=map_id,
+        revision=record.revision,
+        calibration=in_force,
+        measured=None if found is None else found[0],
+        now=now,
+        then=then,
+    )
+
+
+def _measured(stored: tuple[datetime, str, str] | None) -> tuple[LatestMeasurement, Trials] | None:
+    """What was measured, and its trials; None if there is nothing that this version can read."""
+    if stored is None:
+        return None
+    at, report, trials = stored
+    try:
+        return (
+            LatestMeasurement(at=at, report=CalibrationReport.model_validate_json(report)),
+            Trials.of_record(json.loads(trials)),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        log.warning("what was measured in calibrating a map cannot be read: %s", error)
+        return None
