@@ -37,7 +37,8 @@ def listener(client: httpx.Client, map_id: str, pictures: bool) -> Iterator[None
     stop = threading.Event()
 
     def read() -> None:
-        with httpx.stream("GET", f"{client.base_url}v1/maps/{map_id}/events", params={"pictures": pictures}) as stream:
+        url = f"{str(client.base_url).rstrip('/')}/v1/maps/{map_id}/events"
+        with httpx.stream("GET", url, params={"pictures": pictures}, timeout=60) as stream:
             for _ in stream.iter_raw():
                 listening.set()
                 if stop.is_set():

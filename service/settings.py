@@ -206,6 +206,12 @@ class Settings(BaseSettings):
     job_watchers: int = Field(
         default=64, ge=1, le=10_000, description="Most clients that follow jobs at the same time."
     )
+    max_similarity_pairs: int = Field(
+        default=4_000_000,
+        ge=100,
+        le=100_000_000,
+        description="Most pairs of frames of two traverses that are compared; then 422.",
+    )
     event_listeners: int = Field(
         default=64, ge=1, le=10_000, description="Most clients that listen to the events of maps at the same time."
     )

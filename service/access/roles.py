@@ -160,6 +160,7 @@ OPERATIONS: dict[str, Rule] = {
     # Upkeep: it changes the answers to all robots, or takes long
     "read_calibration": Rule("query", "path"),
     "calibrate_map": Rule("admin", "path", changes=True),
+    "compare_traverses": Rule("query", "path"),
     "check_health": Rule("enrol", "path"),
     "reencode_map": Rule("admin", "named", changes=True),  # it names the new map, too
     "prune_map": Rule("admin", "path", changes=True),

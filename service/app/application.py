@@ -45,6 +45,7 @@ from service.settings import Settings, read_settings
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
 from service.upkeep import routes as upkeep
+from service.upkeep import similarity
 
 SUMMARY = "Visual place recognition: a camera frame goes in, the place comes out, or an honest 'unknown'."
 DESCRIPTION = """\
@@ -72,7 +73,10 @@ TAGS = [
     },
     {"name": "sessions", "description": "A session is a robot's run: a belief over places that every frame updates."},
     {"name": "frames", "description": "The encoder applied to frames, without a map."},
-    {"name": "upkeep", "description": "Re-encoding, rebuilding, health reports, pruning and merging of maps."},
+    {
+        "name": "upkeep",
+        "description": "Re-encoding, rebuilding, health, similarity, pruning, merging of maps.",
+    },
     {"name": "transfer", "description": "Maps as files, to back them up, restore them or move them."},
     {"name": "jobs", "description": "A job is long work in the background; it reports its progress."},
     {"name": "encoders", "description": "The models and vocabularies that are installed."},
@@ -100,6 +104,7 @@ ROUTERS = (
     answer_routes.router,
     frames.router,
     upkeep.router,
+    similarity.router,
     transfer_routes.router,
     jobs.router,
     key_routes.own,

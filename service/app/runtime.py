@@ -28,6 +28,7 @@ from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
 from service.upkeep import alignment, keypoints, merging, pruning, reencoding
+from service.upkeep.similarity import Matrices
 from service.worker_threads import in_thread
 
 DISK_CHECK_SECONDS = 1.0
@@ -66,6 +67,7 @@ class Runtime:
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
         self.health_examinations = CapacityLimiter(1)  # each is a long search
+        self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
         self._disk_state, self._disk_checked = "ok", 0.0
@@ -95,6 +97,7 @@ class Runtime:
         state.staging, state.batch_order, state.plans = self.staging, self.batch_order, self.plans
         state.statistics, state.explanation_pictures = self.statistics, self.explanation_pictures
         state.health_examinations = self.health_examinations
+        state.similarity_matrices = self.similarity_matrices
         state.exports, state.imports = self.exports, self.imports
 
     def start(self) -> None:

@@ -122,6 +122,10 @@ class TooFewFrames(Fault):
     """The traverse is too short for sequence matching."""
 
 
+class TooManyPairs(Fault):
+    """The traverses have too many frames to be compared frame by frame."""
+
+
 class TooManyWatchers(Fault):
     """Too many clients follow jobs."""
 

@@ -108,6 +108,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.ImagesMissing: Kind(409, "images-missing", "The map does not keep all its images"),
     faults.MergeConflict: Kind(409, "merge-conflict", "The maps cannot be merged as they are"),
     faults.NothingToMeasure: Kind(422, "nothing-to-measure", "The map has no frames to measure the recall with"),
+    faults.TooManyPairs: Kind(422, "too-many-pairs", "The traverses have too many frames to be compared"),
     faults.TooFewFrames: Kind(422, "too-few-frames", "The sequence is too short to be aligned"),
     faults.UnknownJob: Kind(404, "unknown-job", "The job does not exist"),
     faults.JobEnded: Kind(409, "job-ended", "The job has already ended"),

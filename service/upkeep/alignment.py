@@ -148,13 +148,22 @@ class Traverses:
             UnknownSequence: there is none.
             TooFewFrames: it has too few frames for sequence matching.
         """
+        frames = self.frames(name)
+        if len(frames) < LEAST_FRAMES:
+            raise TooFewFrames(
+                f"The sequence {name[:128]!r} has {len(frames)} frames; to align it takes at least {LEAST_FRAMES}."
+            )
+        return frames
+
+    def frames(self, name: str) -> Rows:
+        """The same of a traverse of any length.
+
+        Raises:
+            UnknownSequence: there is none.
+        """
         members = self._members.get(name, [])
         if not members:
             raise UnknownSequence(f"The map has no sequence {name[:128]!r}.")
-        if len(members) < LEAST_FRAMES:
-            raise TooFewFrames(
-                f"The sequence {name[:128]!r} has {len(members)} frames; to align it takes at least {LEAST_FRAMES}."
-            )
         return np.array([place.row for place in sorted(members, key=lambda one: one.ordinal)], np.int64)
 
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from core.places import Sequence, Timestamp
 from core.upkeep.coverage import Measure
 from core.upkeep.revisits import Reason
+from service.http.schemas import Milliseconds
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False)]
 
@@ -277,3 +278,50 @@ class MapHealth(BaseModel):
     gaps: list[GapView] = Field(description="The most severe gaps come first.")
     gap_count: int
     retraverse: list[StretchView] = Field(description="Stretches that should be recorded again, the most urgent first.")
+
+
+class ComparedTraverse(BaseModel):
+    """A traverse of a comparison."""
+
+    sequence: str
+    places: list[str] = Field(description="Ids of its places, in the order of the traverse.")
+
+
+class SimilarityScale(BaseModel):
+    """What the 8-bit values of the matrix mean: a score is `low` + value / 255 · (`high` - `low`)."""
+
+    low: float
+    high: float
+
+
+class SharedPath(BaseModel):
+    """A stretch that two traverses share, as sequence matching finds it."""
+
+    gain: float = Field(description="The mean gain of its pairs, in standard deviations; longer and higher is surer.")
+    query: list[int] = Field(description="Rows of the matrix, rising by one at a time.")
+    reference: list[int] = Field(description="The column that each of them shows.")
+
+
+class SimilarityView(BaseModel):
+    """How alike two traverses of a map are: about the matrix of their scores."""
+
+    map: str
+    encoder: str
+    query: ComparedTraverse = Field(description="The traverse of the rows.")
+    reference: ComparedTraverse = Field(description="The traverse of the columns.")
+    rows: int
+    columns: int
+    scale: SimilarityScale
+    stretches: list[SharedPath] = Field(
+        description="What they share, the surest first; empty if they share nothing, or one has fewer than ten frames."
+    )
+    truth: list[int | None] | None = Field(
+        description="For each row the column that is nearest by the poses, null if none is within `radius`; null as a "
+        "whole if the traverses have no poses to compare."
+    )
+    radius: float = Field(description="Metres: the map's `same_place_radius`.")
+    aligned: bool = Field(description="Whether an alignment has stored which of their frames correspond.")
+    counterparts: list[int | None] | None = Field(
+        description="For each row the column at the same station, as alignment stored it; null if it has stored none."
+    )
+    milliseconds: Milliseconds

@@ -22,7 +22,7 @@ OPERATIONS = {
     "put_camera", "list_cameras", "read_camera", "forget_camera",
     "query", "query_batch", "query_maps", "query_or_enrol", "see_explanation",
     "create_session", "list_sessions", "read_session", "delete_session", "send_frame",
-    "calibrate_map", "reencode_map", "check_health", "align_map", "prune_map", "merge_map",
+    "compare_traverses", "calibrate_map", "reencode_map", "check_health", "align_map", "prune_map", "merge_map",
     "rebuild_map", "fill_keypoints",
     "export_map", "import_map",
     "list_jobs", "read_job", "follow_job", "cancel_job",
