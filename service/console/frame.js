@@ -1,5 +1,5 @@
 // The frame around every view: where one can go, who one is, whether the service is there, and what is being said.
-import { caller, epoch, everyMap, get, identify, key, keyNeeded, may, online, useKey } from "./shared/api.js";
+import { caller, checkConnection, epoch, everyMap, get, identify, key, keyNeeded, may, online, useKey } from "./shared/api.js";
 import { Dialog, Field, Loading, messages, Trouble, unsay } from "./shared/elements.js";
 import { href, go, route } from "./shared/router.js";
 import { html, signal, useEffect, useState } from "./shared/view.js";
@@ -68,9 +68,12 @@ function View() {
     if (!entry) return;
     entry[1]().then(
       (module) => setLoaded({ name, component: module.default }),
-      (error) => setLoaded({ name, error }),
+      (error) => {
+        setLoaded({ name, error });
+        checkConnection();
+      },
     );
-  }, [name]);
+  }, [name, epoch.value]);
   useEffect(() => {
     menuOpen.value = false;
     scrollTo(0, 0);

@@ -96,6 +96,11 @@ function lost() {
   probing ??= probe();
 }
 
+/** Find out whether the service is there, after something else could not be fetched. */
+export function checkConnection() {
+  fetch(new URL("livez", ROOT), { cache: "no-store" }).catch(lost);
+}
+
 async function probe() {
   for (let wait = 500; ; wait = Math.min(wait * 1.6, 5000)) {
     await sleep(wait);

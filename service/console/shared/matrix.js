@@ -14,6 +14,7 @@ export function Matrix({ data, layers, chosen, choose }) {
   useEffect(() => onTheme(() => setTheme(isDark())), []);
   useEffect(() => {
     const fit = () => {
+      if (!box.current) return;
       const width = box.current.parentElement.clientWidth;
       const high = Math.min(MOST_HIGH * innerHeight, (width * rows) / columns);
       setSize([Math.round(Math.min(width, (high * columns) / rows)), Math.round(high)]);
@@ -75,8 +76,6 @@ function drawLines(canvas, data, layers, [row, column]) {
   const at = (one, two) => [(two + 0.5) * wide, (one + 0.5) * high];
   context.clearRect(0, 0, canvas.width, canvas.height);
   context.lineWidth = 2 * devicePixelRatio;
-  if (layers.includes("truth") && data.truth) drawColumns(context, data.truth, at, colour("recognized"));
-  if (layers.includes("counterparts") && data.counterparts) drawColumns(context, data.counterparts, at, colour("accent"));
   if (layers.includes("path")) {
     context.strokeStyle = colour("danger");
     for (const { query, reference } of data.stretches) {
@@ -85,6 +84,8 @@ function drawLines(canvas, data, layers, [row, column]) {
       context.stroke();
     }
   }
+  if (layers.includes("truth") && data.truth) drawColumns(context, data.truth, at, colour("recognized"));
+  if (layers.includes("counterparts") && data.counterparts) drawColumns(context, data.counterparts, at, colour("accent"));
   const [x, y] = at(row, column);
   context.strokeStyle = colour("text");
   context.lineWidth = devicePixelRatio;
@@ -101,7 +102,7 @@ function drawLines(canvas, data, layers, [row, column]) {
 
 function drawColumns(context, columns, at, tint) {
   context.fillStyle = tint;
-  const half = 1.5 * devicePixelRatio;
+  const half = (columns.length > 300 ? 1 : 2.5) * devicePixelRatio;
   columns.forEach((column, row) => {
     if (column === null) return;
     const [x, y] = at(row, column);

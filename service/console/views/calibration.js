@@ -107,6 +107,10 @@ function Threshold({ map, data, tag, changed }) {
       setError(problem);
     }
   };
+  const readAgain = () => {
+    setError(null);
+    changed();
+  };
   return html`
     <section class="panel" aria-label="Threshold">
       <h2>Another threshold</h2>
@@ -122,7 +126,7 @@ function Threshold({ map, data, tag, changed }) {
             <button type="button" disabled=${same} onClick=${() => { setThreshold(calibration.threshold); setMargin(calibration.margin); }}>As it is in force</button>
             ${may("admin") && html`<button type="button" class="primary" disabled=${same} onClick=${apply}>Apply</button>`}
           </div>
-          ${error && html`<${Trouble} error=${error} again=${error.slug === "revision-mismatch" ? changed : undefined} />`}
+          ${error && html`<${Trouble} error=${error} again=${error.slug === "revision-mismatch" ? readAgain : undefined} />`}
         </div>
         ${effect.error && html`<${Trouble} error=${effect.error} />`}
         ${effect.data?.now && html`<${Effect} now=${effect.data.now} then=${effect.data.then || effect.data.now} />`}

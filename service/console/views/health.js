@@ -204,7 +204,7 @@ function Prune({ map }) {
         ]} />
         ${removed > 0 && order.dry_run && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Remove ${integer(removed)} places</button></div>`}
       `}
-      ${dialog && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Remove the places" close=${() => setDialog(null)} send=${apply}>
+      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Remove the places" close=${() => setDialog(null)} send=${apply}>
         <p>${integer(removed)} places go, with their pictures. This cannot be undone; export the map first if they may be wanted again.</p>
       <//>`}
     </section>
@@ -248,7 +248,7 @@ function Merge({ map }) {
         ]} />
         ${report.coming > 0 && order.dry_run && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Copy ${integer(report.coming)} places</button></div>`}
       `}
-      ${dialog && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
+      ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
         <p>${integer(report.coming)} places of ${order.from} come into ${map}.</p>
       <//>`}
     </section>
