@@ -26,9 +26,9 @@ _NAMES = (
 )
 _COLUMNS = (
     "SELECT json_group_array(id), json_group_array(position), json_group_array(flags),"
-    f" {', '.join(f'count({value}), json_group_array({value})' for value in _OPTIONAL.values())}"
-    f" FROM (SELECT p.*, coalesce(n.position, -1) AS position, (p.pose_of IS NOT NULL) * {HANDED_OVER}"
-    f" + (p.picture != 'none') * {HAS_PICTURE} AS flags"
+    f" {', '.join(f'count({name}), json_group_array({value})' for name, value in _OPTIONAL.items())}"
+    f" FROM (SELECT p.id, {', '.join(f'p.{name}' for name in _OPTIONAL)}, coalesce(n.position, -1) AS position,"
+    f" (p.pose_of IS NOT NULL) * {HANDED_OVER} + (p.picture != 'none') * {HAS_PICTURE} AS flags"
     f" FROM places p LEFT JOIN ({_NAMES}) n ON n.code = p.sequence"
     " WHERE (p.number - 1) % ? = 0 ORDER BY p.number)"
 )

@@ -21,7 +21,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
@@ -46,6 +46,8 @@ ID = re.compile(r"[0-9a-f]{12}")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 RESERVED = frozenset({"anonymous", "owner"})
 SECRET_BYTES = 32
+
+KeyState = Literal["in force", "revoked", "expired"]
 
 MOST_KEYS = 10_000
 """Keys that a data directory may have, revoked ones included: a running service holds all of them in memory."""
@@ -318,9 +320,16 @@ class KeyStore:
                     temporary.unlink()
 
 
+def state_of(key: Key, now: datetime) -> KeyState:
+    """Whether a key is in force, revoked or expired at a moment."""
+    if key.revoked_at is not None:
+        return "revoked"
+    return "expired" if key.expires_at is not None and key.expires_at <= now else "in force"
+
+
 def in_force(key: Key, now: datetime) -> bool:
     """Whether a key is neither revoked nor expired at a moment."""
-    return key.revoked_at is None and (key.expires_at is None or now < key.expires_at)
+    return state_of(key, now) == "in force"
 
 
 def is_admin(key: Key) -> bool:

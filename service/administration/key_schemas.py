@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from core.places import Timestamp
-from service.access.keys import Key
+from service.access.keys import Key, KeyState, state_of
 from service.access.roles import Role
 from service.http.schemas import Cursor
 
@@ -16,7 +16,6 @@ MOST_MAPS = 1000
 """Maps that one key may be limited to."""
 
 KeyRole = Literal["query", "enrol", "admin"]
-KeyState = Literal["in force", "revoked", "expired"]
 MapIds = Annotated[list[str], Field(min_length=1, max_length=MOST_MAPS)]
 
 NEW_KEY_EXAMPLE: dict[str, Any] = {
@@ -82,13 +81,6 @@ def _fields(key: Key, asking: str | None) -> dict[str, Any]:
     maps = None if key.maps is None else sorted(key.maps)
     shown = {name: getattr(key, name) for name in names}
     return {**shown, "maps": maps, "state": state_of(key, datetime.now(UTC)), "own": key.id == asking}
-
-
-def state_of(key: Key, now: datetime) -> KeyState:
-    """Whether a key is in force, revoked or expired at a moment."""
-    if key.revoked_at is not None:
-        return "revoked"
-    return "expired" if key.expires_at is not None and key.expires_at <= now else "in force"
 
 
 class KeyPage(BaseModel):

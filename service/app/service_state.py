@@ -131,6 +131,7 @@ STATE_EXAMPLE: dict[str, Any] = {
     },
     "jobs": {"queued": 0, "running": 1, "watchers": 2},
     "sessions": 3,
+    "listeners": 1,
     "maps": 4,
     "limits": {"max_image_bytes": 16777216, "queue_length": 32},
     "memory": {"resident": 812646400, "uploads": 0, "upload_limit": 536870912},
@@ -157,6 +158,7 @@ class ServiceState(BaseModel):
     requests: RequestsState
     jobs: JobsState
     sessions: int
+    listeners: int = Field(description="Clients that listen to the events of maps.")
     maps: int = Field(description="Maps in service that the key may use.")
     limits: dict[str, int | float] = Field(description="What callers have to keep to, by the names of the settings.")
     memory: MemoryState | None = Field(
@@ -196,6 +198,7 @@ async def read_service(
         requests=_requests(runtime),
         jobs=JobsState(queued=states["queued"], running=states["running"], watchers=runtime.jobs.watchers),
         sessions=runtime.sessions.count(),
+        listeners=engine.events.listeners,
         maps=_maps(principal, [record.id for record in records]),
         limits=_limits(settings),
         memory=_memory(uploads) if manages else None,

@@ -12,7 +12,7 @@ from service.commands.connection.client import AsJson, DataDir, read_settings
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
 if TYPE_CHECKING:
-    from service.access.keys import Key, KeyStore
+    from service.access.keys import Key, KeyState, KeyStore
 
 keys = typer.Typer(cls=Commands, help="Create, list and revoke the keys of a data directory.", no_args_is_help=True)
 
@@ -64,7 +64,7 @@ def list_keys(data_dir: DataDir = None, as_json: AsJson = False) -> None:
     for key in found:
         maps = "all" if key.maps is None else ",".join(sorted(key.maps))
         moments = (_shown(moment) for moment in (key.created_at, key.expires_at, key.last_used_at))
-        shown.add_row(key.id, key.name, key.role, maps, state_of(key), *moments)
+        shown.add_row(key.id, key.name, key.role, maps, _state_of(key), *moments)
     show(shown)
     if not found:
         remark("No key was ever created, so the service needs none.")
@@ -79,7 +79,7 @@ def revoke(
     store = _store(data_dir)
     revoked = store.revoke(wanted)
     remark(f"The key {revoked.name} ({revoked.id}) is revoked.")
-    if not any(state_of(other) == "in force" for other in store.all()):
+    if not any(_state_of(other) == "in force" for other in store.all()):
         remark("No key is in force now: the service refuses every request that needs one.")
 
 
@@ -101,17 +101,17 @@ def moment(text: str) -> datetime:
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
-def state_of(key: Key) -> str:
-    """Whether a key is in force, revoked or expired by this machine's clock."""
-    if key.revoked_at is not None:
-        return "revoked"
-    return "expired" if key.expires_at is not None and key.expires_at <= datetime.now(UTC) else "in force"
-
-
 def _store(data_dir: Any) -> KeyStore:
     from service.access.keys import KeyStore  # with it comes numpy
 
     return KeyStore(read_settings(data_dir).data_dir)
+
+
+def _state_of(key: Key) -> KeyState:
+    """Whether a key is in force by this machine's clock."""
+    from service.access.keys import state_of
+
+    return state_of(key, datetime.now(UTC))
 
 
 def _described(key: Key) -> str:
@@ -130,6 +130,6 @@ def _view(key: Key) -> dict[str, Any]:
         "name": key.name,
         "role": key.role,
         "maps": None if key.maps is None else sorted(key.maps),
-        "state": state_of(key),
+        "state": _state_of(key),
         **{name: None if at is None else at.isoformat() for name, at in moments.items()},
     }

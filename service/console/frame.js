@@ -11,7 +11,7 @@ const OF_MAPS = {
   live: ["Live", () => import("./views/live.js"), "query"],
   traverses: ["Traverses", () => import("./views/traverses.js"), "query"],
   calibration: ["Calibration", () => import("./views/calibration.js"), "query"],
-  review: ["Review", () => import("./views/review.js"), "query"],
+  review: ["Review", () => import("./views/review.js"), "enrol"],
   health: ["Health", () => import("./views/health.js"), "enrol"],
 };
 const OF_SERVICE = {

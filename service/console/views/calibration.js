@@ -221,30 +221,36 @@ function Reliability({ reliability }) {
   `;
 }
 
-const METHODS = { map: "all frames of the map", sequence: "one traverse against the others", labels: "frames that were reviewed" };
+const METHODS = { map: "all frames of the map", sequence: "one traverse against the others", labels: "frames that were labelled in the review" };
+const HINTS = {
+  map: "The least reliable method: each frame is compared with its neighbours.",
+  labels: "Beside all frames of the map, where nothing else is said.",
+};
 
 function Order({ map, tag, started, close }) {
   const sequences = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
-  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true });
+  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true, alone: false });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const names = (sequences.data?.items || []).map((one) => one.name);
   const order = async () => {
-    const { method, sequence, rule, value, dry } = fields;
+    const { method, sequence, rule, value, dry, alone } = fields;
     const target = rule === "mean_of_negatives" ? { rule } : { rule, value };
     const body = { method, target, dry_run: dry, background: true };
     if (method === "sequence") body.sequence = sequence || names[0];
+    if (method === "labels") body.beside = alone ? "none" : "map";
     started(await post(mapPath(map, "calibrate"), body, { headers: tag && !dry ? { "If-Match": tag } : {} }));
   };
   return html`
     <${FormDialog} title=${`Calibrate ${map}`} action=${fields.dry ? "Try it" : "Calibrate"} close=${close} send=${order} ready=${fields.method !== "sequence" || names.length > 1}>
-      <${Field} label="Ask" hint=${fields.method === "map" && "The least reliable method: each frame is compared with its neighbours."}>
+      <${Field} label="Ask" hint=${HINTS[fields.method]}>
         <select value=${fields.method} onChange=${(event) => change({ method: event.target.value })}>
-          ${Object.entries(METHODS).filter(([id]) => id !== "labels").map(([id, text]) => html`<option value=${id}>${text}</option>`)}
+          ${Object.entries(METHODS).map(([id, text]) => html`<option value=${id}>${text}</option>`)}
         </select>
       <//>
       ${fields.method === "sequence" && html`
         <${Field} label="Traverse"><select value=${fields.sequence} onChange=${(event) => change({ sequence: event.target.value })}>${names.map((one) => html`<option value=${one}>${one}</option>`)}</select><//>
       `}
+      ${fields.method === "labels" && html`<label class="field check"><input type="checkbox" checked=${fields.alone} onChange=${() => change({ alone: !fields.alone })} /><span>Only the labelled frames</span></label>`}
       <div class="fields">
         <${Field} label="Target">
           <select value=${fields.rule} onChange=${(event) => change({ rule: event.target.value, value: event.target.value === "precision" ? 0.95 : 0.01 })}>

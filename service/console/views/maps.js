@@ -180,7 +180,7 @@ function getTaggedMap(map) {
   return getTagged(`/maps/${encodeURIComponent(map)}`);
 }
 
-const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification", "review"];
+const EDITED = ["description", "keep", "same_place_radius", "same_place_frames", "verification"];
 
 function EditForm({ map, read, close, changed }) {
   const [fields, setFields] = useState({

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -21,7 +22,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, str
     server.create_map("lab")
     for number in range(15):
         while server.enrol("lab", f"p{number}", frame(number % 2), sequence="walk").status_code == 429:
-            pass
+            time.sleep(0.1)
     yield server, key
     assert server.stop() == 0
 
@@ -67,7 +68,7 @@ def test_live_answers_go_on_after_the_connection_was_lost(visit: Visit, slow: tu
     page.context.set_offline(False)
     page.get_by_text("listening").wait_for()
     while server.client.post("/v1/maps/lab/query", content=frame(0), headers={"Content-Type": "image/jpeg"}).status_code != 200:
-        pass
+        time.sleep(0.1)
     page.get_by_role("list", name="Answers").get_by_role("listitem").first.wait_for()
 
 

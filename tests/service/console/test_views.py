@@ -19,7 +19,7 @@ OF_MAP = {
     "live": ("Live", "query"),
     "traverses": ("Traverses", "query"),
     "calibration": ("Calibration", "query"),
-    "review": ("Review", "query"),
+    "review": ("Review", "enrol"),
     "health": ("Health", "enrol"),
 }
 OF_SERVICE = {
