@@ -124,6 +124,10 @@ class UnknownCamera(PlacerecError):
     """The map has no camera with this name."""
 
 
+class UnknownFrame(PlacerecError):
+    """The map keeps no such frame for review."""
+
+
 class NoThumbnail(PlacerecError):
     """The map keeps no picture of this place."""
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
 from core.judgement.background import GUARD_FACTOR
 from core.judgement.calibration import FittedCalibration, Target, fit_map_calibration
-from core.judgement.trials import Trial, Trials, gathered
+from core.judgement.trials import Trial, Trials, gathered, joined
 from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
@@ -44,6 +44,13 @@ FROM_ITSELF = (
     "high; calibrate from a second traverse or from labelled frames as soon as there are any."
 )
 """The warning of a calibration from the map's own frames."""
+
+
+FROM_DOUBT = (
+    "The labelled frames are those that were kept for review; unless recognized ones are kept as well, they are harder "
+    "than the frames that come."
+)
+"""The warning of a calibration from the frames of review."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +86,18 @@ class LabelledQueries:
 
 
 def queries_from_labels(
-    map_: Map, snapshot: Snapshot, encodings: Sequence[Encoding], places: Sequence[str | None]
+    map_: Map,
+    snapshot: Snapshot,
+    encodings: Sequence[Encoding],
+    places: Sequence[str | None],
+    enrolled: Sequence[bool] | None = None,
 ) -> LabelledQueries:
     """The queries of a calibration from labelled frames.
 
     Args:
         encodings: the frames, encoded by the map's encoder.
         places: for each frame the id of the place that it shows; None if the map lacks the place.
+        enrolled: for each frame whether it is itself the frame of that place, which is then left out; None: none is.
 
     Raises:
         UnknownPlace: the map has no place of one of the ids.
@@ -95,12 +107,16 @@ def queries_from_labels(
     nothing = np.zeros(snapshot.rows, np.bool_)
 
     def made() -> Iterator[LabelledQuery]:
-        for encoding, place in zip(encodings, places, strict=True):
+        for encoding, place, own in zip(encodings, places, enrolled or [False] * len(places), strict=True):
             if place is None:
                 yield LabelledQuery(encoding.descriptor, encoding.local, nothing, nothing, nothing)
-            else:
-                row = rows[place]
-                yield LabelledQuery(encoding.descriptor, encoding.local, near(row), nothing, near(row, GUARD_FACTOR))
+                continue
+            row, absent = rows[place], nothing
+            if own:
+                absent = nothing.copy()
+                absent[row] = True
+            same, around = near(row) & ~absent, near(row, GUARD_FACTOR)
+            yield LabelledQuery(encoding.descriptor, encoding.local, same, absent, around)
 
     return LabelledQueries(len(encodings), made())
 
@@ -221,10 +237,12 @@ def calibrate_map(
     target: Target,
     source: str,
     advance: ProgressCallback = lambda _done, _total: None,
+    beside: LabelledQueries | None = None,
 ) -> FittedCalibration:
     """A calibration of a map from its answers to queries; nothing is stored.
 
     Args:
+        beside: further queries, whose answers count as much; None: none.
         target: what the calibration has to reach, such as a precision.
         source: is noted in the calibration.
 
@@ -234,12 +252,23 @@ def calibrate_map(
         Others: what ``advance`` raises.
     """
     base = encoder.calibration.model_copy(update={"decision": "leading"})
-    return fit_map_calibration(run_trials(map_, encoder, snapshot, queries, base, advance), base, target, source)
+    sets = [queries] if beside is None else [beside, queries]
+    done, total = 0, sum(one.count for one in sets)
+    trials = []
+    for one in sets:
+        before = done
+
+        def advanced(count: int, _of: int, before: int = before) -> None:
+            advance(before + count, total)
+
+        trials.append(run_trials(map_, encoder, snapshot, one, base, advanced))
+        done += one.count
+    return fit_map_calibration(joined(trials), base, target, source)
 
 
 def calibration_warnings(found: FittedCalibration, method: str) -> list[str]:
     """Sentences that the owner of a map should read about its calibration."""
-    warnings = [FROM_ITSELF] if method == "map" else []
+    warnings = [{"map": FROM_ITSELF, "labels": FROM_DOUBT}[method]] if method in ("map", "labels") else []
     if found.measurement.frames < FEW_FRAMES:
         warnings.append(f"It rests on {found.measurement.frames} frames; {FEW_FRAMES} or more make it steadier.")
     held = found.measurement.cross_validated

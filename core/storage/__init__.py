@@ -11,10 +11,12 @@ from core.storage.records import (
     KeptFrame,
     MapRecord,
     MapSettings,
+    ReviewSetting,
     SameFrame,
     SequenceSummary,
     VerifyReport,
 )
+from core.storage.review import ReviewFrame
 from core.storage.search.snapshot import Ranking, Snapshot
 from core.storage.search.tiers import IndexStatus, Recall, StorageStatus, TierSetting
 
@@ -32,6 +34,8 @@ __all__ = [
     "Precision",
     "Ranking",
     "Recall",
+    "ReviewFrame",
+    "ReviewSetting",
     "SameFrame",
     "SequenceSummary",
     "Snapshot",

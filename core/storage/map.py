@@ -48,6 +48,8 @@ from core.storage.records import (
     patched_fields,
     patched_record,
 )
+from core.storage.review import FILE as REVIEW_FILE
+from core.storage.review import ReviewFrames
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.snapshot import Snapshot
 from core.storage.search.tiers import IndexStatus, KeypointsStatus, StorageStatus, storage_of, unopened
@@ -122,6 +124,7 @@ class Map:
         self.counterparts = Counterparts(self._reading, self._writing)
         self.plan = Plan(self._reading)
         self.transfer = Transfer(self._reading, self._writing, self._lock)
+        self.review = ReviewFrames(folder / REVIEW_FILE, self._expect_open)
         self.exporter = Exporter(folder, self._reading, lambda: self._opened, self._guarded)
 
     # Opening and closing
@@ -165,6 +168,7 @@ class Map:
                 )
         if (indexer := self.indexer) is not None:
             indexer.stop()
+        self.review.close()
         with self._lock:
             opened, last, self._opened, self._snapshot = self._opened, self._snapshot, None, None
             if opened is None:

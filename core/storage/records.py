@@ -13,13 +13,31 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
-from core.judgement.verdict import Calibration
+from core.judgement.verdict import Calibration, Verdict
 from core.places import PlaceFields, Timestamp
 from core.storage.files.row_formats import Precision
 from core.storage.search.tiers import COMPACT_FROM, TierSetting
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
+
+
+class ReviewSetting(BaseModel):
+    """Which frames a map keeps so that people can say later what they show, and how many at most."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    verdicts: Annotated[tuple[Verdict, ...], Field(min_length=1, max_length=3)] = Field(
+        default=("ambiguous", "unknown"), description="Frames that are answered with one of these are kept."
+    )
+    most_frames: int = Field(strict=True, default=500, ge=1, le=10_000, description="Most frames; the oldest go first.")
+    most_bytes: int = Field(
+        strict=True,
+        default=256 << 20,
+        ge=1 << 16,
+        le=1 << 36,
+        description="Most bytes of their files together; the oldest go first.",
+    )
 
 
 class MapSettings(BaseModel):
@@ -52,6 +70,9 @@ class MapSettings(BaseModel):
         default="auto",
         description="How the map is searched: every place compared (exact), by codes (compact; inverted, a former "
         f"tier, is another name of it), or by what suits its size (auto): compact from {COMPACT_FROM} places.",
+    )
+    review: ReviewSetting | None = Field(
+        default=None, description="Which frames are kept to be reviewed by people; null: none."
     )
 
 

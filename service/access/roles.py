@@ -149,6 +149,11 @@ OPERATIONS: dict[str, Rule] = {
     "list_answers": Rule("query", "path"),
     "list_place_matches": Rule("query", "path"),
     "see_explanation": Rule("query", "path"),
+    # Review: its frames are what robots saw, and labels change how the map is calibrated
+    "list_review": Rule("enrol", "path"),
+    "see_review_picture": Rule("enrol", "path"),
+    "export_labels": Rule("enrol", "path"),
+    "label_frame": Rule("enrol", "path", changes=True),
     # Sessions: they change nothing in their map, so a key that may query it may use them
     "create_session": Rule("query", "path"),
     "list_sessions": Rule("query", "path"),

@@ -39,6 +39,7 @@ from service.places import routes as places
 from service.places.parameters import BatchItem
 from service.queries import answer_routes, loop_closure, multi_map_routes
 from service.queries import routes as queries
+from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
 from service.settings import Settings, read_settings
@@ -72,6 +73,10 @@ TAGS = [
         "description": "A calibration decides when a map's answers are believed; it is measured on the map itself.",
     },
     {"name": "sessions", "description": "A session is a robot's run: a belief over places that every frame updates."},
+    {
+        "name": "review",
+        "description": "Frames that a map has kept because its answers were doubtful, with labels.",
+    },
     {"name": "frames", "description": "The encoder applied to frames, without a map."},
     {
         "name": "upkeep",
@@ -102,6 +107,7 @@ ROUTERS = (
     stream_routes.router,
     queries.explanations,
     answer_routes.router,
+    review.router,
     frames.router,
     upkeep.router,
     similarity.router,

@@ -23,6 +23,7 @@ from core.recognition.verification import Verify
 from core.storage import Atlas, Map, MapRecord
 from service.engine.encoder_threads import AfterEncoding, Encoded
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
+from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Recognized, Searches, search_ahead
 from service.errors.faults import EncoderNotInstalled
 from service.events.events import Events
@@ -92,6 +93,7 @@ class Engine:
         self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
         self.searches = Searches()
         self.events = Events(settings.event_listeners)
+        self.review_keeper = ReviewKeeper()
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
         self._locks = MapLocks()
@@ -109,6 +111,7 @@ class Engine:
         self.events.stop_soon()
         self.metrics.registry.unregister(self._map_collector)
         self.queue.close()
+        self.review_keeper.close()
         self.atlas.close()
 
     def stop_loading(self) -> None:

@@ -98,6 +98,7 @@ KINDS: dict[type[Exception], Kind] = {
     errors.UnknownPlace: Kind(404, "unknown-place", "The place does not exist"),
     errors.TooManyToForget: Kind(422, "too-many-to-forget", "Too many places would be forgotten at once"),
     errors.UnknownSequence: Kind(404, "unknown-sequence", "The sequence does not exist"),
+    errors.UnknownFrame: Kind(404, "unknown-frame", "The frame is not kept for review"),
     errors.UnknownCamera: Kind(404, "unknown-camera", "The camera does not exist"),
     faults.PlanTooLarge: Kind(422, "plan-too-large", "The plan would list too many places"),
     faults.PlaceTaken: Kind(409, "place-taken", "The place has another frame"),

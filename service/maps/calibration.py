@@ -49,13 +49,14 @@ from service.http.openapi import NAMED
 from service.http.routing import DeadlineDep, EngineDep, IfMatch, MapId, single_values
 from service.http.schemas import validated
 from service.http.uploads import FORM, check_part, is_file, json_part, media_type, read_many
-from service.jobs.context import JobContext, creation_time, yield_to_requests
+from service.jobs.context import JobContext, creation_time, encode_after_requests, yield_to_requests
 from service.jobs.routes import JobsDep, accepted
 from service.jobs.schemas import JobView
 from service.maps.map_events import tell_map
-from service.maps.schemas import CalibrationOrder, CalibrationReport
+from service.maps.schemas import MOST_FRAMES, CalibrationOrder, CalibrationReport
 from service.queries.answers import StatisticsDep
 from service.queries.statistics import QueryStatistics, map_key
+from service.review.labels import KnownFrame, known_frames, parts, with_regions
 from service.worker_threads import in_thread
 
 log = logging.getLogger("placerec.calibration")
@@ -123,10 +124,10 @@ async def calibrate_map(
     """Measure when a map's answers can be believed, and store the result as the map's calibration.
 
     With a JSON body, the frames that are asked are the map's own: those of one traverse, compared with the others, or
-    all of them. With a form, they are new frames: each is a file part, and a part `calibration` holds the same JSON
-    with a label for each frame. The threshold, the margin and the probability curve follow from the answers; the
-    reported quality is cross-validated. If the answers are too few or too poor to calibrate the map, the request is
-    refused and the map keeps its calibration.
+    all of them, or those that were kept for review and labelled. With a form, they are new frames: each is a file part,
+    and a part `calibration` holds the same JSON with a label for each frame. The threshold, the margin and the
+    probability curve follow from the answers; the reported quality is cross-validated. If the answers are too few or
+    too poor to calibrate the map, the request is refused and the map keeps its calibration.
     """
     map_ = await engine.map(map_id)
     expected = expected_revision(if_match, map_.record.revision)
@@ -134,6 +135,9 @@ async def calibrate_map(
         order, encodings = await _read_labelled_frames(engine, map_, request, deadline)
     else:
         order, encodings = await _read_order(request), []
+    known: list[KnownFrame] = []
+    if order.method == "labels" and not order.background:
+        known, encodings = await _encode_known(engine, map_, deadline)
     try:
         encoder = await in_thread(engine.catalogue.get, map_.record.encoder)
     except errors.UnknownEncoder as error:
@@ -151,7 +155,7 @@ async def calibrate_map(
             )
 
     replaces = map_.record.calibration
-    report, trials = await in_thread(measure, map_, encoder, order, encodings, advance)
+    report, trials = await in_thread(measure, map_, encoder, order, encodings, advance, known)
     await in_thread(remember, statistics, map_, report, trials)
     if not order.dry_run:
         await in_thread(store, map_, report.calibration, replaces, expected)
@@ -213,16 +217,39 @@ async def _read_labelled_frames(
     return order, encodings
 
 
+async def _encode_known(
+    engine: Engine, map_: Map, deadline: RequestDeadline
+) -> tuple[list[KnownFrame], list[Encoding]]:
+    """The labelled frames of the map's review, those that can be encoded, and their encodings.
+
+    Raises:
+        StorageFailure, EncoderNotInstalled.
+    """
+    frames, _ = await in_thread(known_frames, map_, MOST_FRAMES)
+    found: list[tuple[KnownFrame, Encoding]] = []
+    some = parts(map_, frames)
+    while (part := await in_thread(next, some, None)) is not None:
+        chosen, files, masks = part
+        found += with_regions(chosen, await engine.encode_all(map_.record.encoder, files, deadline, masks))
+    return [frame for frame, _ in found], [encoding for _, encoding in found]
+
+
 # Measuring and storing
 
 
 def measure(
-    map_: Map, encoder: Encoder, order: CalibrationOrder, encodings: Sequence[Encoding], advance: ProgressCallback
+    map_: Map,
+    encoder: Encoder,
+    order: CalibrationOrder,
+    encodings: Sequence[Encoding],
+    advance: ProgressCallback,
+    known: Sequence[KnownFrame] = (),
 ) -> tuple[CalibrationReport, Trials]:
     """Ask a map the frames of an order, and report the calibration that follows; nothing is stored.
 
     Args:
-        encodings: the frames of the order's labels, in their order; empty for the other methods.
+        encodings: the frames of the order's labels, or of ``known``, in their order; empty for the other methods.
+        known: the labelled frames of the map's review, for the method ``labels``.
 
     Returns:
         The report, and the answers that it rests on.
@@ -231,9 +258,10 @@ def measure(
         UnknownPlace, UnknownSequence, CalibrationImpossible, StorageFailure, and whatever ``advance`` raises.
     """
     snapshot = map_.snapshot()
-    queries = _queries(map_, snapshot, order, encodings)
+    queries = _queries(map_, snapshot, order, encodings, known)
+    beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance)
+    found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
     report = CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -256,7 +284,18 @@ def remember(statistics: QueryStatistics, map_: Map, report: CalibrationReport, 
         log.warning("what was measured in calibrating %s is not kept: %s", map_.record.id, error)
 
 
-def _queries(map_: Map, snapshot: Snapshot, order: CalibrationOrder, encodings: Sequence[Encoding]) -> LabelledQueries:
+def _queries(
+    map_: Map,
+    snapshot: Snapshot,
+    order: CalibrationOrder,
+    encodings: Sequence[Encoding],
+    known: Sequence[KnownFrame],
+) -> LabelledQueries:
+    if order.method == "labels":
+        if not known:
+            raise errors.CalibrationImpossible("No frame of the map's review is labelled with a place that it has.")
+        places = [frame.place for frame in known]
+        return queries_from_labels(map_, snapshot, encodings, places, [frame.enrolled for frame in known])
     if order.method == "frames":
         assert order.labels is not None
         return queries_from_labels(map_, snapshot, encodings, [label.place for label in order.labels])
@@ -325,7 +364,12 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
         if done % TOGETHER == 0:
             yield_to_requests(engine, context)
 
-    report, trials = measure(map_, engine.load_encoder(map_), order, [], advance)
+    encoder = engine.load_encoder(map_)
+    known: list[KnownFrame] = []
+    encodings: list[Encoding] = []
+    if order.method == "labels":
+        known, encodings = _encode_known_after_requests(engine, context, map_)
+    report, trials = measure(map_, encoder, order, encodings, advance, known)
     remember(statistics, map_, report, trials)
     result = report.model_dump(mode="json")
     if not order.dry_run:
@@ -333,3 +377,13 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
         store(map_, report.calibration, None if replaces is None else Calibration.model_validate(replaces), expected)
         tell_map(engine, map_, "calibrated")
     return result
+
+
+def _encode_known_after_requests(
+    engine: Engine, context: JobContext, map_: Map
+) -> tuple[list[KnownFrame], list[Encoding]]:
+    """What :func:`_encode_known` gives, in a job, which lets requests go first."""
+    found: list[tuple[KnownFrame, Encoding]] = []
+    for chosen, files, masks in parts(map_, known_frames(map_, MOST_FRAMES)[0]):
+        found += with_regions(chosen, encode_after_requests(engine, context, map_.record.encoder, files, masks))
+    return [frame for frame, _ in found], [encoding for _, encoding in found]

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from core import errors
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
-from core.storage import Map, MapRecord, MapSettings, VerifyReport
+from core.storage import Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
 from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
@@ -33,6 +33,7 @@ from service.maps.schemas import (
     MapView,
     NewMap,
     QuarantinedMap,
+    ReviewChanges,
 )
 from service.queries.answers import StatisticsDep
 from service.queries.recent_answers import MapKey
@@ -63,7 +64,8 @@ def show_map(engine: Engine, map_: Map, last_day: Mapping[MapKey, VerdictCounts]
     record = map_.record
     calibration = record.calibration or engine.default_calibration(record.encoder)
     return MapView(
-        **record.model_dump(exclude={"calibration", "index", "precision"}),
+        **record.model_dump(exclude={"calibration", "index", "precision", "review"}),
+        review=record.review,
         calibration=calibration,
         index=map_.index_status(),
         storage=map_.storage_status(),
@@ -183,6 +185,8 @@ def edit_map(
     settings = _settings_changes(engine, map_, changes)
     edited = map_.edit(settings, expected)
     tell_map(engine, map_, "edited", sorted(settings))
+    if edited.review is not None and "review" in settings:
+        map_.review.shrink(edited.review)
     response.headers["ETag"] = entity_tag(edited.revision)
     return show_map(engine, map_, _last_day(statistics, map_))
 
@@ -191,11 +195,24 @@ def _settings_changes(engine: Engine, map_: Map, changes: MapChanges) -> dict[st
     """The values that a merge patch sets; null stands for the default of its field."""
     defaults = MapSettings()
     given = {name: getattr(changes, name) for name in changes.model_fields_set}
-    calibration = given.pop("calibration", None)
+    calibration, review = given.pop("calibration", None), given.pop("review", None)
     values = {name: getattr(defaults, name) if value is None else value for name, value in given.items()}
     if "calibration" in changes.model_fields_set:
         values["calibration"] = _own_calibration(engine, map_, calibration)
+    if "review" in changes.model_fields_set:
+        values["review"] = _own_review(map_, review)
     return values
+
+
+def _own_review(map_: Map, changes: ReviewChanges | None) -> ReviewSetting | None:
+    if changes is None:
+        return None
+    defaults = ReviewSetting()
+    values = (map_.record.review or defaults).model_dump()
+    for name in changes.model_fields_set:
+        given = getattr(changes, name)
+        values[name] = getattr(defaults, name) if given is None else given
+    return ReviewSetting(**values)
 
 
 def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | None) -> Calibration | None:

@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
-from core.judgement.verdict import Calibration
+from core.judgement.verdict import Calibration, Verdict
 from core.places import Timestamp
-from core.storage import IndexStatus, Keep, MapSettings, Precision, StorageStatus, TierSetting
+from core.storage import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, StorageStatus, TierSetting
 from core.storage.search.tiers import COMPACT_FROM
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 from service.queries.statistics import VerdictCounts
@@ -25,6 +25,7 @@ MAP_EXAMPLE: dict[str, Any] = {
     "same_place_radius": 5.0,
     "same_place_frames": 3,
     "verification": True,
+    "review": None,
     "calibration": {
         "source": "encoder-default",
         "threshold": 0.09,
@@ -76,6 +77,7 @@ class MapView(BaseModel):
         description="The same for places without poses: their distance in frames of one sequence."
     )
     verification: bool = Field(description="Whether keypoints are kept of each frame, by which answers are verified.")
+    review: ReviewSetting | None = Field(description="Which frames are kept to be reviewed by people; null: none.")
     calibration: Calibration | None = Field(
         description="When a match is believed. The source is encoder-default until the map has its own calibration; "
         "null if the encoder is not installed."
@@ -135,6 +137,16 @@ class CalibrationChanges(BaseModel):
     margin: float | None = Field(strict=True, default=None, ge=0, allow_inf_nan=False)
 
 
+class ReviewChanges(BaseModel):
+    """Which frames to keep for review; null restores a default."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    verdicts: list[Verdict] | None = Field(default=None, min_length=1, max_length=3)
+    most_frames: int | None = Field(strict=True, default=None, ge=1, le=10_000)
+    most_bytes: int | None = Field(strict=True, default=None, ge=1 << 16, le=1 << 36)
+
+
 class MapChanges(BaseModel):
     """A merge patch (RFC 7396) of a map: null restores the default, and what is left out stays as it is."""
 
@@ -152,6 +164,7 @@ class MapChanges(BaseModel):
         default=None,
         description=f"auto, exact or compact (auto from {COMPACT_FROM} places on); inverted is compact.",
     )
+    review: ReviewChanges | None = Field(default=None, description="null: no frames are kept from now on.")
     calibration: CalibrationChanges | None = None
 
 
@@ -204,7 +217,7 @@ class CameraList(BaseModel):
     next_cursor: None = None
 
 
-Method = Literal["frames", "sequence", "map"]
+Method = Literal["frames", "sequence", "map", "labels"]
 
 MOST_FRAMES = 2000
 
@@ -236,7 +249,7 @@ class CalibrationOrder(BaseModel):
     method: Method = Field(
         description="Which frames the map is asked. `frames`: the labelled frames of this form. `sequence`: one "
         "traverse of the map, compared with the others. `map`: all frames of the map, each compared with its "
-        "neighbours, which is the least reliable method."
+        "neighbours, which is the least reliable method. `labels`: the frames that were kept for review and labelled."
     )
     target: Target = Field(
         default=Target(rule="precision", value=0.95), description="What the threshold is chosen to reach."
@@ -257,6 +270,11 @@ class CalibrationOrder(BaseModel):
         ge=20,
         le=MOST_FRAMES,
         description="How many frames are asked at most; they are chosen evenly.",
+    )
+    beside: Literal["map", "none"] = Field(
+        default="map",
+        description="With the method labels: whether the map's own frames are asked as well (`map`), since few frames "
+        "are labelled and these are the doubtful ones, or the labelled frames alone (`none`).",
     )
     labels: list[Label] | None = Field(
         default=None, min_length=1, max_length=MOST_FRAMES, description="One label for each frame of the form."

@@ -32,8 +32,8 @@ from service.http.routing import (
 from service.http.uploads import FORM, check_part, media_type, read_frame, read_many, split_form
 from service.places.batches import frame_problem
 from service.places.schemas import PlaceView
-from service.queries.answer_events import tell_answer
 from service.queries.answers import StatisticsDep, answer_of, blank_answer, count_for_map, estimated_pose
+from service.queries.following import follow_answer
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
@@ -211,7 +211,7 @@ def _tell(engine: Engine, report: MapReport, frames: Sequence[RigFrame], millise
     """Tell the listeners of a map how it answered; of a rig the first frame is shown."""
     if engine.events.heard(report.map_id) and (found := _whole_answer(report)) is not None:
         map_, answer = found
-        tell_answer(engine, map_, answer, frames[0].data, frames[0].camera, milliseconds=milliseconds)
+        follow_answer(engine, map_, answer, frames[0].data, frames[0].camera, milliseconds=milliseconds)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

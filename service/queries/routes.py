@@ -33,9 +33,9 @@ from service.http.routing import (
 )
 from service.http.uploads import check_part, read_many, split_form
 from service.places.batches import frame_problem
-from service.queries.answer_events import tell_answer
 from service.queries.answers import StatisticsDep, counted_answer
 from service.queries.explanations import explain_match, scaled_for_drawing
+from service.queries.following import follow_answer
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
@@ -86,7 +86,7 @@ async def query(
         answer.explanation = await explain_match(engine, pictures, map_, encoded, recognized.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
-    tell_answer(engine, map_, answer, data, options.camera)
+    follow_answer(engine, map_, answer, data, options.camera)
     return answer
 
 
@@ -140,7 +140,7 @@ async def query_batch(
     )
     for index, one in zip(encoded, recognized, strict=True):
         answer = items[index].answer = counted_answer(engine, statistics, map_, one)
-        tell_answer(engine, map_, answer, files[index].data, options.camera, file=files[index].name)
+        follow_answer(engine, map_, answer, files[index].data, options.camera, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)

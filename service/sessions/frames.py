@@ -16,8 +16,8 @@ from service.errors.faults import FrameOutOfOrder, InvalidRequest
 from service.events.schemas import SessionEvent
 from service.http.routing import rounded
 from service.places.schemas import PlaceView
-from service.queries.answer_events import tell_answer
 from service.queries.answers import counted_answer
+from service.queries.following import follow_answer
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -83,7 +83,7 @@ async def process_frame(
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
     total = {"total": answer.milliseconds["total"]}
-    tell_answer(engine, map_, single, data, session.options.camera, session.id, options.frame, milliseconds=total)
+    follow_answer(engine, map_, single, data, session.options.camera, session.id, options.frame, milliseconds=total)
     tell_belief(engine, map_, session, answer)
     return answer
 

@@ -105,8 +105,12 @@ def group_names(number: int, version: int = VERSION) -> list[str]:
 
 
 def written(manifest: Manifest) -> bytes:
-    """The manifest as bytes; equal manifests are always the same bytes."""
-    return (json.dumps(manifest.model_dump(mode="json"), indent=1, ensure_ascii=False) + "\n").encode()
+    """The manifest as bytes; equal manifests are always the same bytes.
+
+    Which frames are kept for review is left out, as these frames are.
+    """
+    content = manifest.model_dump(mode="json", exclude={"map": {"review"}})
+    return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
 
 
 def tag_of(text: bytes) -> str:

@@ -457,8 +457,9 @@ def update_record(connection: sqlite3.Connection, record: MapRecord) -> None:
 
 
 def _record_columns(record: MapRecord) -> dict[str, Any]:
-    columns = record.model_dump(exclude={"calibration"})
+    columns = record.model_dump(exclude={"calibration", "review"})
     columns["calibration"] = None if record.calibration is None else record.calibration.model_dump_json()
+    columns["review"] = None if record.review is None else record.review.model_dump_json()
     columns["created_at"] = moment_text(record.created_at)
     columns["updated_at"] = moment_text(record.updated_at)
     return columns
@@ -482,6 +483,7 @@ def read_record(connection: sqlite3.Connection) -> tuple[MapRecord, int]:
         raise ValueError("it does not say how many rows a segment has")
     del columns["only"]
     columns["verification"] = bool(columns["verification"])
-    if columns["calibration"] is not None:
-        columns["calibration"] = json.loads(columns["calibration"])
+    for name in ("calibration", "review"):
+        if columns[name] is not None:
+            columns[name] = json.loads(columns[name])
     return MapRecord.model_validate(columns), rows_per_segment

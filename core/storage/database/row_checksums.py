@@ -27,6 +27,7 @@ _FIRST: Mapping[str, Sequence[str]] = {
 
 ADDED: Sequence[Mapping[str, Sequence[str]]] = (
     {"map": ("verification",), "places": ("track", "station", "pose_of"), "cameras": ("intrinsics",)},
+    {"map": ("review",)},
 )
 """The columns that each migration of the tables added to those of the first release."""
 

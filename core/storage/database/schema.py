@@ -150,6 +150,8 @@ MIGRATIONS: Sequence[Migration] = (
         ) STRICT""",
         *row_checksums.sealing(0),
     ),
+    # Which frames are kept for review, as JSON; NULL: none.
+    ("ALTER TABLE map ADD COLUMN review TEXT", *row_checksums.sealing(1)),
 )
 """The steps from ``FIRST_VERSION`` to the newest version; new files get them, too."""
 

@@ -1,4 +1,4 @@
-"""Events of queries: what the listeners of a map are told of an answer."""
+"""What follows an answer: the listeners of the map are told of it, and a doubtful frame is kept for review."""
 
 from __future__ import annotations
 
@@ -10,8 +10,17 @@ from service.engine.engine import Engine
 from service.events.schemas import QueryEvent
 from service.queries.schemas import QueryAnswer
 
+REVIEWED = {
+    "request_id", "key", "operation", "verdict", "probability", "best", "score", "decision", "threshold", "reason",
+    "camera", "session", "frame", "file", "revision",
+}  # fmt: skip
+"""What is kept of an answer with a frame for review …"""
 
-def tell_answer(
+MOST_MATCHES = 5
+"""… beside so many of its best matches."""
+
+
+def follow_answer(
     engine: Engine,
     map_: Map,
     answer: QueryAnswer,
@@ -22,20 +31,24 @@ def tell_answer(
     file: str | None = None,
     milliseconds: Mapping[str, float] | None = None,
 ) -> None:
-    """Tell the listeners of a map, if it has any, how a frame was answered.
+    """Tell the listeners of a map, if it has any, how a frame was answered, and keep the frame if the map says so.
+
+    Neither is waited for.
 
     Args:
-        frame: the bytes of the frame's file; a picture of it is shown only if the map keeps pictures.
+        frame: the bytes of the frame's file; listeners see a picture of it only if the map keeps pictures.
         camera: the name of the camera that took the frame; None: not known.
         session, number: the session that the frame belongs to, and the robot's number of it.
         file: the name of the file part that the frame was.
         milliseconds: of the whole request, where the answer does not say it.
     """
-    if not engine.events.heard(map_.record.id):
+    record = map_.record
+    is_kept = record.review is not None and answer.verdict in record.review.verdicts
+    if not is_kept and not engine.events.heard(record.id):
         return
     explanation = answer.explanation
     event = QueryEvent.now(
-        map_.record.id,
+        record.id,
         operation=ASKER.get().operation,
         verdict=answer.verdict,
         probability=answer.probability,
@@ -54,4 +67,8 @@ def tell_answer(
         revision=answer.revision,
         explanation=None if explanation is None else explanation.picture,
     )
-    engine.events.publish(event, frame if map_.record.keep != "none" else None)
+    engine.events.publish(event, frame if record.keep != "none" else None)
+    if is_kept:
+        told = event.model_dump(mode="json", include=REVIEWED)
+        matches = [{"place": match.place.id, "score": match.score} for match in answer.matches[:MOST_MATCHES]]
+        engine.review_keeper.offer(map_, frame, told | {"matches": matches})

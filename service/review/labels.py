@@ -1,0 +1,87 @@
+"""The labelled frames of a map as queries with known truth, for its calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+from core.errors import PlacerecError, StorageFailure, UnknownCamera
+from core.frames.masks import Mask
+from core.method.encoder import Encoding
+from core.storage import Map
+from service.engine.encoder_threads import Encoded
+
+TOGETHER = 32
+"""So many frames are read and encoded at a time."""
+
+
+@dataclass(frozen=True)
+class KnownFrame:
+    """A kept frame of which it is known what it shows.
+
+    number: of the frame.
+    camera: the camera that took it, as it was asked.
+    place: the id of the place that it shows; None if the map has none.
+    enrolled: whether the frame was enrolled as this place.
+    """
+
+    number: int
+    camera: str | None
+    place: str | None
+    enrolled: bool
+
+
+def known_frames(map_: Map, most: int) -> tuple[list[KnownFrame], int]:
+    """The latest labelled frames of a map, at most ``most``, and how many were left out as their places are gone.
+
+    Raises:
+        StorageFull, StorageFailure.
+    """
+    found = []
+    for frame in map_.review.labelled():
+        label = (frame.label or {})["label"]
+        camera, place = frame.answer.get("camera"), label.get("place") or label.get("new")
+        found.append(KnownFrame(frame.number, camera, place, "new" in label))
+    found = found[-most:]
+    named = [frame.place for frame in found if frame.place is not None]
+    there = {place for place, row in zip(named, map_.rows_of(named), strict=True) if row is not None}
+    kept = [frame for frame in found if frame.place is None or frame.place in there]
+    return kept, len(found) - len(kept)
+
+
+Part = tuple[list[KnownFrame], list[bytes], list[Mask | None]]
+"""Some frames, their files, and the masks of their cameras."""
+
+
+def parts(map_: Map, frames: Sequence[KnownFrame]) -> Iterator[Part]:
+    """The frames some at a time, without those that are gone or damaged.
+
+    Reading blocks, so take each part in a thread.
+    """
+    for start in range(0, len(frames), TOGETHER):
+        some, files, masks = [], [], []
+        for frame in frames[start : start + TOGETHER]:
+            with suppress(PlacerecError):
+                files.append(map_.review.picture(frame.number))
+                some.append(frame)
+                masks.append(_mask(map_, frame.camera))
+        yield some, files, masks
+
+
+def _mask(map_: Map, camera: str | None) -> Mask | None:
+    try:
+        return map_.cameras.mask(camera)
+    except (UnknownCamera, StorageFailure):
+        return None
+
+
+def with_regions(
+    frames: Sequence[KnownFrame], outcomes: Sequence[Encoded | Exception]
+) -> list[tuple[KnownFrame, Encoding]]:
+    """The frames that were encoded and have regions; others cannot be searched for."""
+    return [
+        (frame, outcome.encoding)
+        for frame, outcome in zip(frames, outcomes, strict=True)
+        if not isinstance(outcome, Exception) and len(outcome.encoding.regions)
+    ]

@@ -1,0 +1,157 @@
+"""Routes of review: list kept frames, see them, say what they show, export what was said."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Query
+from pydantic import Field
+from starlette.responses import Response
+
+from core import errors
+from core.frames.containers import read_header
+from core.places import check_place_id
+from core.storage import Map
+from core.storage.pagination import Listing, decode_number, encode_cursor
+from service.access.audit import ASKER
+from service.engine.engine import Engine, camera_mask
+from service.engine.queue import RequestDeadline
+from service.errors.faults import EncoderNotInstalled, PlaceTaken, QueueFull, TooManyPlaces, UnsupportedMediaType
+from service.errors.problems import problem_documentation
+from service.http.openapi import BINARY
+from service.http.routing import DeadlineDep, EngineDep, MapId, StrictRoute, json_body, single_values
+from service.http.schemas import PageParameters
+from service.http.uploads import FORMATS
+from service.places.enrolment import FrameToEnrol, digest_of, enrol
+from service.places.schemas import PlaceView
+from service.review.schemas import ExportedLabel, Labelled, LabelList, LabelOrder, NewPlace, ReviewFrameView, ReviewPage
+from service.worker_threads import in_thread
+
+router = APIRouter(
+    prefix="/v1/maps/{map}/review",
+    tags=["review"],
+    route_class=StrictRoute,
+    dependencies=[Depends(single_values)],
+)
+FrameNumber = Annotated[int, Path(alias="frame", ge=1, le=2**53, description="Id of the kept frame.", examples=[17])]
+
+
+class ReviewPageParameters(PageParameters):
+    """Which kept frames."""
+
+    labelled: bool | None = Field(default=None, description="Only frames with a label, or only those without one.")
+
+
+@router.get("", responses=problem_documentation(errors.InvalidCursor))
+def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], engine: EngineDep) -> ReviewPage:
+    """List the frames that a map has kept for review, the newest first.
+
+    A map keeps frames whose answers have the verdicts that its setting `review` names, from a moment after the answer
+    on; by default it keeps none.
+    """
+    review = engine.atlas.get(map_id).review
+    listing: Listing = ["review-of", map_id, str(page.labelled)]
+    before = decode_number(listing, page.cursor)
+    found = review.page(None if before < 0 else before, page.limit + 1, page.labelled)
+    shown = found[: page.limit]
+    more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
+    count, size = review.size()
+    return ReviewPage(items=[ReviewFrameView.of(one) for one in shown], next_cursor=more, frames=count, bytes=size)
+
+
+@router.get("/labels")
+def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
+    """Export what was said of the kept frames: for each the place that it shows, or null if the map has none."""
+    return LabelList(
+        items=[
+            ExportedLabel(
+                id=view.id,
+                at=view.at,
+                sha256=view.sha256,
+                camera=view.answer["camera"],
+                verdict=view.answer["verdict"],
+                place=view.label.place or view.label.new,
+                enrolled=view.label.new is not None,
+                labelled_at=view.labelled_at,
+                labelled_by=view.labelled_by,
+            )
+            for view in map(ReviewFrameView.of, engine.atlas.get(map_id).review.labelled())
+            if view.label is not None and view.labelled_at is not None
+        ]
+    )
+
+
+@router.get(
+    "/{frame}/picture",
+    response_class=Response,
+    responses={
+        200: {"description": "The file as it was sent.", "content": {kind: {"schema": BINARY} for kind in FORMATS}},
+        **problem_documentation(errors.UnknownFrame),
+    },
+)
+def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) -> Response:
+    """See a kept frame."""
+    data = engine.atlas.get(map_id).review.picture(number)
+    kinds = {found: kind for kind, found in FORMATS.items()}
+    return Response(data, media_type=kinds[read_header(data).format], headers={"Cache-Control": "private, no-cache"})
+
+
+@router.post(
+    "/{frame}",
+    dependencies=[Depends(json_body)],
+    responses=problem_documentation(
+        errors.UnknownFrame,
+        errors.UnknownPlace,
+        errors.UnknownCamera,
+        errors.InvalidField,
+        errors.NoRegions,
+        errors.StorageFull,
+        PlaceTaken,
+        TooManyPlaces,
+        QueueFull,
+        UnsupportedMediaType,
+        EncoderNotInstalled,
+    ),
+)
+async def label_frame(
+    map_id: MapId, number: FrameNumber, order: LabelOrder, engine: EngineDep, deadline: DeadlineDep
+) -> Labelled:
+    """Say what a kept frame shows: a place of the map, a new place as which it is enrolled, or no place of the map.
+
+    Or throw it away. A label that is given again replaces the one before; what was enrolled stays. Labels serve to
+    calibrate the map, with the method `labels`.
+    """
+    map_ = await engine.map(map_id)
+    if order.discard:
+        await in_thread(map_.review.discard, number)
+        return Labelled(id=number, discarded=True, frame=None, enrolled=None)
+    enrolled: PlaceView | None = None
+    label: dict[str, Any] = {"stranger": True}
+    if order.place is not None:
+        check_place_id(order.place)
+        await in_thread(map_.place, order.place)
+        label = {"place": order.place}
+    elif order.new is not None:
+        enrolled = await _enrol(engine, map_, number, order.new, deadline)
+        label = {"new": order.new.id}
+    asker = ASKER.get()
+    said = {"label": label, "at": datetime.now(UTC).isoformat(), "by": asker.principal if asker.key else None}
+    frame = await in_thread(map_.review.label, number, said)
+    return Labelled(id=number, discarded=False, frame=ReviewFrameView.of(frame), enrolled=enrolled)
+
+
+async def _enrol(engine: Engine, map_: Map, number: int, new: NewPlace, deadline: RequestDeadline) -> PlaceView:
+    """Enrol a kept frame; that again with the same id changes nothing but the fields.
+
+    Raises:
+        UnknownFrame, PlaceTaken, and what ``enrol`` raises.
+    """
+    check_place_id(new.id)
+    fields = new.fields(new.metadata, engine.settings)
+    data = await in_thread(map_.review.picture, number)
+    frame = FrameToEnrol(new.id, fields, data, await camera_mask(map_, fields.camera))
+    known = await in_thread(map_.digest, new.id)
+    if known is not None and known != await in_thread(digest_of, frame):
+        raise PlaceTaken(f"The place {new.id!r} has another frame; choose another id.")
+    return PlaceView.of((await enrol(engine, map_, [frame], deadline))[0].place)

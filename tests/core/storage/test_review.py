@@ -1,0 +1,149 @@
+"""Frames kept for review: bounded, durable, checked, and gone with their map."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from core.errors import StorageFailure, UnknownFrame, UnknownMap
+from core.storage import Atlas, MapSettings, ReviewSetting
+from core.storage.review import FILE, ReviewFrames
+
+ENCODER = "some@" + "0" * 64
+SETTING = ReviewSetting(most_frames=5, most_bytes=1 << 16)
+ANSWER = {"verdict": "unknown", "score": 0.25, "camera": None, "text": "naïve\u2028 <b>"}
+
+
+def frames_at(folder: Path) -> ReviewFrames:
+    return ReviewFrames(folder / FILE, lambda: None)
+
+
+def test_a_frame_is_kept_with_its_answer_and_survives_a_restart(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    assert review.page(None, 10) == [] and review.size() == (0, 0) and not (tmp_path / FILE).exists()
+    assert review.keep(b"one", ANSWER, SETTING) and review.keep(b"two", {"verdict": "ambiguous"}, SETTING)
+    assert not review.keep(b"one", ANSWER, SETTING), "the same file is kept once"
+    review.label(1, {"label": {"place": "p7"}})
+    review.close()
+    again = frames_at(tmp_path)
+    second, first = again.page(None, 10)
+    assert (first.number, second.number) == (1, 2) and first.answer == ANSWER and first.size == 3
+    assert first.label == {"label": {"place": "p7"}} and second.label is None
+    assert [again.picture(one.number) for one in (first, second)] == [b"one", b"two"]
+    assert again.page(2, 10) == [first] and again.page(None, 1) == [second]
+    assert again.page(None, 10, labelled=True) == again.labelled() == [first]
+    assert again.page(None, 10, labelled=False) == [second]
+    again.close()
+
+
+def test_a_frame_that_is_not_kept_is_named(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    for action in (review.find, review.picture, review.discard, lambda number: review.label(number, {})):
+        with pytest.raises(UnknownFrame):
+            action(1)
+    review.keep(b"one", ANSWER, SETTING)
+    review.discard(1)
+    with pytest.raises(UnknownFrame):
+        review.picture(1)
+    assert review.keep(b"one", ANSWER, SETTING) and review.find(2).size == 3, "a number is never used again"
+    review.close()
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.lists(st.tuples(st.integers(1, 30_000), st.booleans()), max_size=14))
+def test_the_oldest_go_first_and_those_with_a_label_last(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[int, bool]]
+) -> None:
+    review = frames_at(tmp_path_factory.mktemp("review"))
+    expected: list[tuple[int, int, bool]] = []  # number, size, label
+    for number, (size, labelled) in enumerate(frames, start=1):
+        assert review.keep(number.to_bytes(2, "big") * size, ANSWER, SETTING) == (2 * size <= SETTING.most_bytes)
+        expected.append((number, 2 * size, False))
+        while len(expected) > SETTING.most_frames or sum(size for _, size, _ in expected) > SETTING.most_bytes:
+            expected.remove(min(expected, key=lambda one: (one[2], one[0])))
+        if labelled and expected and expected[-1][0] == number:
+            review.label(number, {"label": {"stranger": True}})
+            expected[-1] = (number, 2 * size, True)
+    kept = [(one.number, one.size, one.label is not None) for one in reversed(review.page(None, 100))]
+    assert kept == expected and review.size() == (len(expected), sum(size for _, size, _ in expected))
+    review.close()
+
+
+def test_a_frame_larger_than_all_may_be_is_not_kept(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    review.keep(b"one", ANSWER, SETTING)
+    assert not review.keep(bytes(SETTING.most_bytes + 1), ANSWER, SETTING)
+    assert review.size() == (1, 3)
+    review.close()
+
+
+def test_lower_limits_give_back_the_room(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    wide = ReviewSetting(most_frames=100, most_bytes=1 << 24)
+    for number in range(20):
+        review.keep(bytes([number]) * 100_000, ANSWER, wide)
+    review.shrink(ReviewSetting(most_frames=2, most_bytes=1 << 24))
+    assert [one.number for one in review.page(None, 10)] == [20, 19]
+    review.close()
+    assert (tmp_path / FILE).stat().st_size < 500_000
+
+
+def edit(path: Path, statement: str, *values: object) -> None:
+    connection = sqlite3.connect(path)
+    with connection:
+        connection.execute(statement, values)
+    connection.close()
+
+
+def test_what_does_not_match_its_checksum_is_not_shown(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    for number in range(3):
+        review.keep(bytes([number]), ANSWER, SETTING)
+    review.close()
+    edit(tmp_path / FILE, "UPDATE frames SET answer = replace(answer, 'unknown', 'unknowm') WHERE number = 1")
+    edit(tmp_path / FILE, "UPDATE pictures SET bytes = x'FF' WHERE frame = 2")
+    review = frames_at(tmp_path)
+    assert [one.number for one in review.page(None, 10)] == [3, 2]
+    with pytest.raises(StorageFailure, match="damaged"):
+        review.picture(2)
+    assert review.picture(3) == b"\x02"
+    review.close()
+
+
+def test_a_damaged_file_is_put_aside_and_the_map_goes_on(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(b"no database at all" * 100)
+    review = frames_at(tmp_path)
+    assert review.page(None, 10) == [] and review.keep(b"one", ANSWER, SETTING)
+    assert len(list(tmp_path.glob(f"{FILE}.damaged-*"))) == 1
+    review.close()
+
+
+def test_kept_frames_go_with_their_map(tmp_path: Path) -> None:
+    atlas = Atlas(tmp_path / "data")
+    map_ = atlas.create("lab", ENCODER, 8, MapSettings(review=SETTING))
+    assert map_.review.keep(b"one", ANSWER, SETTING)
+    folder = tmp_path / "data" / "maps" / "lab"
+    assert (folder / FILE).is_file() and atlas.verify("lab").ok
+    atlas.delete("lab")
+    assert not folder.exists()
+    with pytest.raises(UnknownMap):
+        map_.review.keep(b"two", ANSWER, SETTING)
+    made = atlas.create("lab", ENCODER, 8)
+    assert made.review.page(None, 10) == [] and made.record.review is None
+    atlas.close()
+
+
+def test_the_setting_survives_a_restart(tmp_path: Path) -> None:
+    atlas = Atlas(tmp_path / "data")
+    atlas.create("lab", ENCODER, 8)
+    setting = ReviewSetting(verdicts=("recognized",), most_frames=7)
+    assert atlas.get("lab").edit({"review": setting}).revision == 2
+    atlas.close()
+    atlas = Atlas(tmp_path / "data")
+    assert atlas.get("lab").record.review == setting
+    assert atlas.get("lab").edit({"review": None}).review is None
+    atlas.close()
