@@ -59,6 +59,7 @@ function drawMarks(chart, marks) {
   const { ctx: context, bbox } = chart;
   context.save();
   context.font = `${12 * devicePixelRatio}px system-ui`;
+  context.textAlign = "left";
   for (const { x, tint, label } of marks) {
     const at = Math.round(chart.valToPos(x, "x", true));
     if (at < bbox.left || at > bbox.left + bbox.width) continue;
