@@ -64,7 +64,11 @@ def fill_traverses(folder: Path, frames: int) -> None:
         rows /= np.linalg.norm(rows, axis=1, keepdims=True)
         items = [
             Enrolment(
-                f"{name}-{number}", PlaceFields(pose=Pose(x=float(number), y=0.0), sequence=name), row, 600, random.bytes(32)
+                f"{name}-{number}",
+                PlaceFields(pose=Pose(x=float(number), y=0.0), sequence=name),
+                row,
+                600,
+                random.bytes(32),
             )
             for number, row in enumerate(rows)
         ]

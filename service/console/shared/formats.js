@@ -12,7 +12,7 @@ export function decimal(value, digits = 3) {
 }
 
 export function percent(share, digits = 0) {
-  return share === null || share === undefined ? NOTHING : `${(100 * share).toFixed(digits)} %`;
+  return share === null || share === undefined ? NOTHING : `${(100 * share).toFixed(digits)}\u00a0%`;
 }
 
 export function bytes(count) {
@@ -24,7 +24,7 @@ export function bytes(count) {
     value /= 1024;
     unit += 1;
   }
-  return `${value.toFixed(value < 10 && unit > 0 ? 1 : 0)} ${units[unit]}`;
+  return `${value.toFixed(value < 10 && unit > 0 ? 1 : 0)}\u00a0${units[unit]}`;
 }
 
 export function milliseconds(value) {
@@ -65,6 +65,11 @@ export function relative(moment, now = Date.now()) {
 /** A moment exactly, in UTC. */
 export function exact(moment) {
   return new Date(moment).toISOString().replace("T", " ").replace(/\.\d+Z$/, " UTC");
+}
+
+/** So many of something: counted(1, "frame"), counted(2, "frame"). */
+export function counted(count, what, several = `${what}s`) {
+  return `${integer(count)} ${count === 1 ? what : several}`;
 }
 
 /** The name of an encoder without its digest. */

@@ -291,6 +291,10 @@ export class PlanCanvas {
     context.closePath();
     context.fill();
     context.font = "600 12px system-ui, sans-serif";
+    context.strokeStyle = tints.surface;
+    context.lineWidth = 4;
+    context.lineJoin = "round";
+    context.strokeText(robot.label, px + 12, py - 8);
     context.fillStyle = tints.text;
     context.fillText(robot.label, px + 12, py - 8);
   }

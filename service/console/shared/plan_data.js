@@ -15,31 +15,41 @@ export async function readPlan(map, signal) {
   return plan;
 }
 
-/** Add to the columns: positions in metres, headings in radians from +x, successors, gaps, and numbers by id. */
+/** Add to the columns: positions in metres, headings in radians from +x, traverses, gaps, and numbers by id. */
 function prepared(columns) {
-  const count = columns.ids.length;
-  const index = new Map(columns.ids.map((id, number) => [id, number]));
+  const { ids } = columns;
+  const count = ids.length;
+  const index = new Map();
+  for (let one = 0; one < count; one += 1) index.set(ids[one], one);
   const projection = projectionOf(columns);
-  const x = new Float64Array(count).fill(NaN);
-  const y = new Float64Array(count).fill(NaN);
-  const heading = new Float64Array(count).fill(NaN);
-  for (let one = 0; one < count; one += 1) {
-    const point = projection?.(poseAt(columns, one));
-    if (!point) continue;
-    x[one] = point.x;
-    y[one] = point.y;
-    if (point.heading !== null) heading[one] = point.heading;
-  }
-  const traverses = traversesOf(columns);
-  const plan = { ...columns, count, index, projection, px: x, py: y, angle: heading, traverses };
-  plan.posed = x.reduce((sum, value) => sum + (Number.isNaN(value) ? 0 : 1), 0);
+  const { px, py, angle } = placed(columns, count, projection);
+  let posed = 0;
+  for (let one = 0; one < count; one += 1) posed += px[one] === px[one] ? 1 : 0; // NaN is not itself
+  const plan = { ...columns, count, index, projection, px, py, angle, posed, traverses: traversesOf(columns) };
   plan.gaps = gapsOf(plan);
   return plan;
 }
 
-function poseAt(columns, one) {
-  const value = (name) => (columns[name] ? columns[name][one] : null);
-  return { x: value("x"), y: value("y"), latitude: value("latitude"), longitude: value("longitude"), heading: value("heading") };
+/** Positions and headings of all places; NaN where there is none. */
+function placed(columns, count, projection) {
+  const [px, py, angle] = [0, 1, 2].map(() => new Float64Array(count).fill(NaN));
+  if (projection) {
+    const { x, y, latitude, longitude, heading } = columns;
+    const pose = { x: null, y: null, latitude: null, longitude: null, heading: null };
+    for (let one = 0; one < count; one += 1) {
+      pose.x = x ? x[one] : null;
+      pose.y = y ? y[one] : null;
+      pose.latitude = latitude ? latitude[one] : null;
+      pose.longitude = longitude ? longitude[one] : null;
+      pose.heading = heading ? heading[one] : null;
+      const point = projection(pose);
+      if (point === null) continue;
+      px[one] = point.x;
+      py[one] = point.y;
+      if (point.heading !== null) angle[one] = point.heading;
+    }
+  }
+  return { px, py, angle };
 }
 
 /** A function from a pose to a point in metres; null where no place has a pose.
@@ -47,13 +57,13 @@ function poseAt(columns, one) {
  * A map has either metric or geographic poses as a rule; where it has both, those of the other kind are left out.
  */
 function projectionOf(columns) {
-  const first = columns.latitude?.findIndex((value) => value !== null) ?? -1;
-  const metric = columns.x?.filter((value) => value !== null).length ?? 0;
-  const geographic = columns.latitude?.filter((value) => value !== null).length ?? 0;
+  const counted = (column) => (column ? column.reduce((sum, value) => sum + (value === null ? 0 : 1), 0) : 0);
+  const [metric, geographic] = [counted(columns.x), counted(columns.latitude)];
   if (metric === 0 && geographic === 0) return null;
   if (metric >= geographic) {
     return (pose) => (isNumber(pose.x) ? { x: pose.x, y: pose.y, heading: radians(pose.heading) } : null);
   }
+  const first = columns.latitude.findIndex((value) => value !== null);
   const [latitude, longitude] = [columns.latitude[first], columns.longitude[first]];
   const [north, east] = [EARTH * (Math.PI / 180), EARTH * (Math.PI / 180) * Math.cos((latitude * Math.PI) / 180)];
   return (pose) => {
@@ -84,18 +94,22 @@ function traversesOf({ ids, sequence, sequences }) {
 const GAP = 4;
 const MOST_GAPS = 500;
 
-/** Steps of a traverse that are several times longer than its usual one. */
+/** Steps of a traverse that are several times longer than its usual one: {from, to, length}. */
 function gapsOf({ traverses, px, py }) {
   const found = [];
   for (const { name, places } of traverses) {
     if (name === null || places.length < 5) continue;
-    const steps = [];
-    for (let one = 1; one < places.length; one += 1) {
-      const length = Math.hypot(px[places[one]] - px[places[one - 1]], py[places[one]] - py[places[one - 1]]);
-      if (!Number.isNaN(length)) steps.push({ from: places[one - 1], to: places[one], length });
+    const lengths = new Float64Array(places.length - 1);
+    for (let one = 0; one < lengths.length; one += 1) {
+      const [from, to] = [places[one], places[one + 1]];
+      lengths[one] = Math.hypot(px[to] - px[from], py[to] - py[from]);
     }
-    const median = steps.map((step) => step.length).sort((a, b) => a - b)[Math.floor(steps.length / 2)];
-    if (median > 0) found.push(...steps.filter((step) => step.length > GAP * median));
+    const known = lengths.filter((length) => !Number.isNaN(length)).sort();
+    const median = known[Math.floor(known.length / 2)];
+    if (!(median > 0)) continue;
+    lengths.forEach((length, one) => {
+      if (length > GAP * median) found.push({ from: places[one], to: places[one + 1], length });
+    });
   }
   return found.sort((a, b) => b.length - a.length).slice(0, MOST_GAPS);
 }

@@ -1,7 +1,7 @@
 // All maps: how large, how searched, how they answer; made, edited, deleted, saved as files and read from them.
 import { all, caller, download, everyMap, get, getTagged, may, patch, post, remove, upload } from "../shared/api.js";
 import { ByName, complain, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, Progress, say, Trouble, VerdictMix } from "../shared/elements.js";
-import { bytes, encoderName, integer } from "../shared/formats.js";
+import { bytes, counted, encoderName, integer } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { MapSettings } from "../shared/map_settings.js";
 import { Shown, useResource } from "../shared/resource.js";
@@ -40,8 +40,7 @@ async function readMaps(signal) {
 
 function summary(items) {
   const places = items.reduce((sum, map) => sum + map.places, 0);
-  const maps = items.length === 1 ? "1 map" : `${integer(items.length)} maps`;
-  return `${maps}, ${integer(places)} places`;
+  return `${counted(items.length, "map")}, ${counted(places, "place")}`;
 }
 
 function Empty() {
@@ -207,7 +206,7 @@ function Delete({ map, places, close, changed }) {
   };
   return html`
     <${ByName} title=${`Delete ${map}`} name=${map} action="Delete the map" close=${close} send=${destroy}>
-      <p>The map is deleted with ${places === undefined ? "everything in it" : `its ${integer(places)} places`}, its pictures and its calibration. This cannot be undone; export it first if it may be wanted again.</p>
+      <p>The map is deleted with ${places === undefined ? "everything in it" : `its ${counted(places, "place")}`}, its pictures and its calibration. This cannot be undone; export it first if it may be wanted again.</p>
     <//>
   `;
 }

@@ -1,7 +1,7 @@
 // The places of a map as thumbnails, page by page and filtered; one place, where the address names it.
 import { get, may, post } from "../shared/api.js";
 import { ByName, complain, Field, Head, Moment, Nothing, Pill } from "../shared/elements.js";
-import { integer, poseText } from "../shared/formats.js";
+import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { Place } from "../shared/place.js";
@@ -42,7 +42,7 @@ function List({ map, query }) {
     setDialog(html`<${Forget} map=${map} order=${order} close=${close} done=${done} />`);
   };
   return html`
-    <${Head} title="Places" note=${about.data && `${integer(about.data.places)} places in ${map}`}>
+    <${Head} title="Places" note=${about.data && `${counted(about.data.places, "place")} in ${map}`}>
       ${may("enrol") && chosen.size > 0 && html`
         <button type="button" onClick=${() => setChosen(new Set())}>Choose none</button>
         <button type="button" class="danger" onClick=${() => forget({ ids: [...chosen] })}>Forget ${integer(chosen.size)} chosen</button>

@@ -3,7 +3,7 @@
 import { epoch, follow, get, may } from "../shared/api.js";
 import { complain, Facts, Head, Loading, Nothing } from "../shared/elements.js";
 import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
-import { integer, metres, poseText, exact } from "../shared/formats.js";
+import { counted, exact, integer, metres, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
 import { PlanCanvas } from "../shared/plan_canvas.js";
@@ -26,11 +26,11 @@ export default function Plan({ map, query }) {
 }
 
 function planNote({ places, posed, count, gaps }) {
-  const parts = [`${integer(places)} places`];
+  const parts = [counted(places, "place")];
   if (count < places) parts.push(`${integer(count)} of them drawn`);
   if (posed === 0) parts.push("no poses: each traverse is a strip");
   else if (posed < count) parts.push(`${integer(count - posed)} without a pose`);
-  if (gaps.length) parts.push(`${integer(gaps.length)} ${gaps.length === 1 ? "gap" : "gaps"}`);
+  if (gaps.length) parts.push(counted(gaps.length, "gap"));
   return parts.join(" · ");
 }
 
@@ -65,7 +65,7 @@ function Drawing({ map, plan, query }) {
   const shape = `${strips} ${map}`;
   const fitted = useRef(null);
   useEffect(() => {
-    const tints = Object.fromEntries(["text", "accent", "danger", "ambiguous", "recognized", "unknown"].map((name) => [name, colour(name)]));
+    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown"].map((name) => [name, colour(name)]));
     drawing.current.mark({ tints });
     drawing.current.show(content, fitted.current !== shape);
     if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);

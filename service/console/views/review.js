@@ -1,7 +1,7 @@
 // Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
 import { get, getTagged, may, patch, post, save } from "../shared/api.js";
 import { complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Verdict } from "../shared/elements.js";
-import { bytes, decimal, integer, percent } from "../shared/formats.js";
+import { bytes, counted, decimal, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
 import { Shown, useResource } from "../shared/resource.js";
@@ -66,7 +66,7 @@ function Frames({ map, labelled, keeps }) {
   return html`
     <${Shown} resource=${page}>
       ${({ frames, bytes: size, next_cursor: next }) => html`
-        <p class="faint">${integer(frames)} frames are kept, ${bytes(size)}.</p>
+        <p class="faint">${counted(frames, "frame")}, ${bytes(size)}.</p>
         ${items.length === 0
           ? html`<${Nothing} title=${labelled ? "No labels yet" : "Nothing to be looked at"}>${!labelled && keeps && "Frames appear here as they are answered with the verdicts that are kept."}<//>`
           : html`

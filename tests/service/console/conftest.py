@@ -106,6 +106,11 @@ def keyed(folder: Path, keys: dict[str, str]) -> Iterator[Server]:
     assert server.stop() == 0
 
 
+def given_key(key: str) -> str:
+    """A script by which a new tab has a key, as if it had been typed; one that is forgotten stays so."""
+    return f"sessionStorage.getItem('placerec.key') ?? sessionStorage.setItem('placerec.key', '{key}')"
+
+
 Visit = Callable[..., Operator]
 Theme = Literal["light", "dark"]
 
@@ -127,9 +132,7 @@ def visit(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Vis
         contexts.append(context)
         page = context.new_page()
         if role is not None:
-            page.add_init_script(
-                f"if (sessionStorage.getItem('placerec.key') === null) sessionStorage.setItem('placerec.key', '{keys[role]}')"
-            )
+            page.add_init_script(given_key(keys[role]))
         operator = Operator(page, f"http://127.0.0.1:{server.port}")
         operator.watch()
         made.append(operator)

@@ -176,9 +176,13 @@ def test_the_state_of_the_service_is_shown(admin: Operator, visit: Visit) -> Non
     assert other.get_by_role("button", name="Settings").count() == 0
 
 
-def test_no_key_and_no_secret_is_in_the_logs(admin: Operator, keyed: Server, keys: dict[str, str], folder: Path) -> None:
+def test_no_key_and_no_secret_is_in_the_logs(
+    admin: Operator, keyed: Server, keys: dict[str, str], folder: Path
+) -> None:
     admin.go(f"maps/{LAB}/places")
     written = keyed.log_file.read_text() + (folder / "audit.jsonl").read_text()
     assert not [role for role, key in keys.items() if key in written]
-    paths = {json.loads(line).get("path", "") for line in keyed.log_file.read_text().splitlines() if line.startswith("{")}
+    paths = {
+        json.loads(line).get("path", "") for line in keyed.log_file.read_text().splitlines() if line.startswith("{")
+    }
     assert not [path for path in paths if "placerec_" in path]

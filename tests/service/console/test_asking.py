@@ -45,7 +45,9 @@ def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Pat
     assert "total" in page.locator(".stages").inner_text()
 
 
-def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alone(admin: Operator, pictures: Path) -> None:
+def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alone(
+    admin: Operator, pictures: Path
+) -> None:
     page = admin.go(f"maps/{LAB}/try")
     names = ["known.jpg", "foreign.jpg", "known.bmp", "text.jpg"]
     page.get_by_label("Pictures").set_input_files([pictures / name for name in names])
@@ -65,7 +67,9 @@ def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str]
     if not Path("/usr/bin/curl").exists():
         pytest.skip("no curl is installed")
     environment = {"PLACEREC_KEY": keys["admin"], "PATH": "/usr/bin:/bin"}
-    done = subprocess.run(["bash", "-c", text], cwd=pictures, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["bash", "-c", text], cwd=pictures, env=environment, capture_output=True, text=True, check=True
+    )
     assert '"verdict":"recognized"' in done.stdout
     assert shlex.split(text.replace("\\\n", ""))[0] == "curl"
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from service.access.keys import KeyStore
-from tests.service.console.conftest import Visit
+from tests.service.console.conftest import Visit, given_key
 from tests.service.console.world import frame
 from tests.service.server import Server
 
@@ -30,7 +30,7 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, str
 def test_the_console_stays_within_the_rate(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
     operator = visit(None, server=server)
-    operator.page.add_init_script(f"sessionStorage.setItem('placerec.key', '{key}')")
+    operator.page.add_init_script(given_key(key))
     operator.foresee("429")
     page = operator.go("maps/lab/places")
     pictures = page.locator(".thumbs img")
@@ -41,7 +41,7 @@ def test_the_console_stays_within_the_rate(visit: Visit, slow: tuple[Server, str
 def test_a_lost_connection_is_said_and_mended_without_reloading(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
     operator = visit(None, server=server)
-    operator.page.add_init_script(f"sessionStorage.setItem('placerec.key', '{key}')")
+    operator.page.add_init_script(given_key(key))
     operator.foresee("ERR_", "429", "Failed to fetch dynamically imported module")
     page = operator.go("jobs")
     page.evaluate("window.notReloaded = true")
@@ -57,7 +57,7 @@ def test_a_lost_connection_is_said_and_mended_without_reloading(visit: Visit, sl
 def test_live_answers_go_on_after_the_connection_was_lost(visit: Visit, slow: tuple[Server, str]) -> None:
     server, key = slow
     operator = visit(None, server=server)
-    operator.page.add_init_script(f"sessionStorage.setItem('placerec.key', '{key}')")
+    operator.page.add_init_script(given_key(key))
     operator.foresee("ERR_", "429", "Failed to fetch dynamically imported module")
     page = operator.go("maps/lab/live")
     page.get_by_text("listening").wait_for()
@@ -67,7 +67,10 @@ def test_live_answers_go_on_after_the_connection_was_lost(visit: Visit, slow: tu
     page.get_by_role("link", name="Live").click()
     page.context.set_offline(False)
     page.get_by_text("listening").wait_for()
-    while server.client.post("/v1/maps/lab/query", content=frame(0), headers={"Content-Type": "image/jpeg"}).status_code != 200:
+    while (
+        server.client.post("/v1/maps/lab/query", content=frame(0), headers={"Content-Type": "image/jpeg"}).status_code
+        != 200
+    ):
         time.sleep(0.1)
     page.get_by_role("list", name="Answers").get_by_role("listitem").first.wait_for()
 

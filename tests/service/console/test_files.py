@@ -76,7 +76,9 @@ def test_a_file_is_compressed_for_those_who_take_it(server: Server, client: http
     assert packed.headers["vary"] == "Accept-Encoding"
 
 
-@pytest.mark.parametrize("name", ["absent.js", "files.py", "..%2Ffiles.py", "%2Fetc%2Fpasswd", "page.html", "vendor/lock.json"])
+@pytest.mark.parametrize(
+    "name", ["absent.js", "files.py", "..%2Ffiles.py", "%2Fetc%2Fpasswd", "page.html", "vendor/lock.json"]
+)
 def test_no_other_file_is_served(client: httpx.Client, name: str) -> None:
     assert_problem(client.get(f"/console/{console_files().build}/{name}"), 404, "unknown-path")
 
@@ -106,7 +108,9 @@ def test_the_name_of_the_folder_changes_with_any_file(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.relative_to(FOLDER).as_posix())
 def test_our_own_modules_make_no_markup_of_text_and_ask_nobody_else(path: Path) -> None:
     text = path.read_text()
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|dangerously", text)
+    assert not re.search(
+        r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|dangerously", text
+    )
     assert not re.search(r"https?://(?!www\.w3\.org/)", re.sub(r"//.*", "", text)), "an address of another site"
     assert not re.search(r"document\.cookie|EventSource", text)
 

@@ -21,7 +21,9 @@ def spare(keyed: Server) -> str:
     name = f"spare-{next(_numbers)}"
     keyed.create_map(name)
     for number in range(4):
-        keyed.enrol(name, f"p{number}", frame(number), **pose_of(number), sequence="walk", metadata={"floor": number % 2})
+        keyed.enrol(
+            name, f"p{number}", frame(number), **pose_of(number), sequence="walk", metadata={"floor": number % 2}
+        )
     return name
 
 
@@ -29,7 +31,9 @@ def test_the_list_tells_how_large_a_map_is_and_how_it_answers(admin: Operator) -
     page = admin.go("maps")
     row = page.get_by_role("row").filter(has=page.get_by_role("link", name=LAB, exact=True))
     assert str(2 * PLACES) in row.inner_text() and "m-region-vlad" in row.inner_text()
-    assert re.search(r"\d+ recognized, \d+ ambiguous, \d+ unknown", row.locator(".mix").get_attribute("aria-label") or "")
+    assert re.search(
+        r"\d+ recognized, \d+ ambiguous, \d+ unknown", row.locator(".mix").get_attribute("aria-label") or ""
+    )
     assert row.locator("time").get_attribute("title", timeout=1000).endswith("UTC")  # type: ignore[union-attr]
 
 

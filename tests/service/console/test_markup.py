@@ -29,7 +29,13 @@ def hostile(keyed: Server) -> Iterator[str]:
     for number in range(2):
         name = MARKUP.replace("/", "|") + str(number)
         answer = keyed.enrol(
-            "hostile", f"p{number}", frame(number), sequence=name, x=number, y=0, metadata={MARKUP: MARKUP, "n": [MARKUP]}
+            "hostile",
+            f"p{number}",
+            frame(number),
+            sequence=name,
+            x=number,
+            y=0,
+            metadata={MARKUP: MARKUP, "n": [MARKUP]},
         )
         assert answer.status_code == 201, answer.text
     yield "hostile"
@@ -82,7 +88,13 @@ def test_texts_of_problems_and_of_addresses(admin: Operator) -> None:
 
 
 def test_reasons_that_the_service_gives(admin: Operator, keyed: Server) -> None:
-    problem = {"type": "urn:placerec:problem:x", "title": MARKUP, "detail": MARKUP, "request_id": MARKUP, "errors": [MARKUP]}
+    problem = {
+        "type": "urn:placerec:problem:x",
+        "title": MARKUP,
+        "detail": MARKUP,
+        "request_id": MARKUP,
+        "errors": [MARKUP],
+    }
     admin.foresee("418")
     admin.page.route("**/v1/jobs*", lambda route: route.fulfill(status=418, json=problem))
     admin.page.goto(f"{admin.root}/console#/jobs")

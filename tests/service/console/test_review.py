@@ -59,7 +59,9 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
     assert queue.count() == 3
     panel = page.get_by_role("region", name="Frame to be labelled")
-    assert panel.get_by_role("img", name="The frame").evaluate("one => one.decode().then(() => one.naturalWidth)") == 320
+    assert (
+        panel.get_by_role("img", name="The frame").evaluate("one => one.decode().then(() => one.naturalWidth)") == 320
+    )
 
     panel.get_by_role("button", name="Enrol it").click()  # the newest first: the frame of no place
     dialog = page.get_by_role("dialog")
@@ -89,7 +91,9 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     assert sum(one["place"] is None for one in again) == 1
 
 
-def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(admin: Operator, keyed: Server, doubtful: str) -> None:
+def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
+    admin: Operator, keyed: Server, doubtful: str
+) -> None:
     page = admin.go(f"maps/{doubtful}/review")
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
     page.get_by_role("button", name="Throw away").click()

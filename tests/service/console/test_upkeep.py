@@ -70,7 +70,12 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
 
 
 def test_a_threshold_is_not_applied_over_somebody_elses(admin: Operator, keyed: Server, yard: str) -> None:
-    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.8}, "dry_run": True}
+    order = {
+        "method": "sequence",
+        "sequence": "tuesday",
+        "target": {"rule": "precision", "value": 0.8},
+        "dry_run": True,
+    }
     assert keyed.client.post(f"/v1/maps/{yard}/calibrate", json=order).status_code == 200
     page = admin.go(f"maps/{yard}/calibration")
     keyed.client.patch(f"/v1/maps/{yard}", json={"description": "changed meanwhile"})
