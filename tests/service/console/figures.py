@@ -39,7 +39,10 @@ def corridor(seed: int) -> Pixels:
     picture = np.empty((HEIGHT, WIDTH, 3), np.uint8)
     sides = {
         "ceiling": ([(0, 0), (WIDTH, 0), (right, top), (left, top)], tone + 35),
-        "floor": ([(0, HEIGHT), (WIDTH, HEIGHT), (right, bottom), (left, bottom)], tone // 2 + random.integers(0, 40, 3)),
+        "floor": (
+            [(0, HEIGHT), (WIDTH, HEIGHT), (right, bottom), (left, bottom)],
+            tone // 2 + random.integers(0, 40, 3),
+        ),
         "west": ([(0, 0), (left, top), (left, bottom), (0, HEIGHT)], tone),
         "east": ([(WIDTH, 0), (right, top), (right, bottom), (WIDTH, HEIGHT)], tone - 14),
         "end": ([(left, top), (right, top), (right, bottom), (left, bottom)], random.integers(90, 240, 3)),
@@ -87,10 +90,9 @@ def _furnish(picture: Pixels, random: np.random.Generator, side: int, end: tuple
     cv2.circle(picture, (x, y - size - 10), size // 2, (40, int(random.integers(90, 170)), 50), -1, cv2.LINE_AA)
 
 
-def in_the_dark(pixels: Pixels, seed: int) -> Pixels:
-    """The same with the lamps out."""
-    random = np.random.default_rng(seed)
-    return np.asarray(np.clip(pixels * 0.16 + random.normal(8, 14, pixels.shape), 0, 255), np.uint8)
+def through_glass(pixels: Pixels, reflected: Pixels) -> Pixels:
+    """A frame in which one sees two places, as through a glass door."""
+    return np.asarray(pixels * 0.5 + reflected * 0.5, np.uint8)
 
 
 def spot(number: int, aside: float = 0.0) -> dict[str, float]:
@@ -130,8 +132,8 @@ def fill(server: Server) -> None:
     server.client.patch(f"/v1/maps/{MAP}", json={"review": review}).raise_for_status()
     for number in range(0, PLACES, 2):
         server.query(MAP, encoded(seen_again(corridor(number), seed=300 + number)))
-    for number in range(1, PLACES, 8):
-        server.query(MAP, encoded(in_the_dark(corridor(number), number)))
+    for number in range(1, PLACES - 5, 6):
+        server.query(MAP, encoded(through_glass(corridor(number), corridor(number + 5))))
     order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.9}}
     server.client.post(f"/v1/maps/{MAP}/calibrate", json=order).raise_for_status()
 
