@@ -178,6 +178,21 @@ class ArchiveTooNew(PlacerecError):
     """An export was written by a later version of placerec."""
 
 
+# Recordings
+
+
+class InvalidRecording(PlacerecError):
+    """A bag, a video or a folder cannot be read, or holds no frame."""
+
+
+class UnknownTopic(PlacerecError):
+    """A bag has no such topic, the topic has another type, or several topics could be meant."""
+
+
+class InvalidTrajectory(PlacerecError):
+    """A trajectory file cannot be read, a line of it is malformed, or it does not fit the frames."""
+
+
 # Evaluation
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import cv2.utils.logging
 import numpy as np
+from numpy.typing import NDArray
 
 from core.errors import (
     EmptyImage,
@@ -137,11 +139,11 @@ def encode_thumbnail(pixels: Pixels, longest_side: int = 320, quality: int = 80)
     return _encode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
-def encode_png(pixels: Pixels) -> bytes:
+def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     """Encode a picture as PNG, without loss.
 
     Args:
-        pixels: uint8 [H, W, 3], BGR.
+        pixels: uint8 or uint16, [H, W, 3] in BGR or [H, W].
 
     Raises:
         InvalidImage: the picture cannot be encoded (a side is zero).
@@ -149,7 +151,7 @@ def encode_png(pixels: Pixels) -> bytes:
     return _encode(".png", pixels, [])
 
 
-def _encode(extension: str, pixels: Pixels, options: list[int]) -> bytes:
+def _encode(extension: str, pixels: NDArray[Any], options: list[int]) -> bytes:
     try:
         done, encoded = cv2.imencode(extension, pixels, options)
     except cv2.error:

@@ -16,8 +16,14 @@ Truth = list[NDArray[np.int64]]
 """For each query the indices of its true references, ascending; there may be none."""
 
 SUPPORTED_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp"})
-# Images that cannot be decoded are listed, too: if they were skipped, every index after them would shift.
-OTHER_SUFFIXES = frozenset({".avif", ".bmp", ".gif", ".heic", ".jp2", ".pbm", ".pgm", ".ppm", ".tif", ".tiff"})
+OTHER_SUFFIXES = frozenset(
+    {".avif", ".bmp", ".dib", ".exr", ".gif", ".hdr", ".heic", ".jp2", ".jpe", ".pam", ".pbm", ".pfm", ".pgm", ".pic"}
+    | {".pnm", ".ppm", ".ras", ".sr", ".tif", ".tiff"}
+)
+"""Formats that become PNG on the way.
+
+Images that cannot be decoded are listed, too: if they were skipped, every index after them would shift.
+"""
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:

@@ -12,6 +12,7 @@ influences its own judgement.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from core.errors import CalibrationImpossible
 from core.judgement.curves import auc_pr, auc_roc, falling
 from core.judgement.geometry import TERMS
-from core.judgement.probability import Curve, fit_curve
+from core.judgement.probability import Curve, fit_curve, moved_curve
 from core.judgement.reliability import Reliability, Share, reliability, wilson
 from core.judgement.trials import Flags, Trial, Trials, Values, gathered, joined
 from core.judgement.verdict import Calibration, Judgement, judge
@@ -251,6 +252,44 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
     """
     _check(trials, target)
     calibration = _fitted(trials, base, target)
+    return _measured(trials, calibration, source, lambda some: _fitted(some, base, target))
+
+
+def adjust_calibration(trials: Trials, base: Calibration, source: str) -> FittedCalibration:
+    """Adjust a calibration to few trials on one map, which may be the doubtful ones.
+
+    The curve is moved only as far as the trials demand (:func:`core.judgement.probability.moved_curve`).  It tells how
+    probable an answer is given its decision value; so it does not matter that frames were chosen by their answers.  The
+    threshold goes to the decision value that is as probable as the old one was, and the margin stays.
+
+    Args:
+        trials: judged with ``base``, each frame once, in the map as it is.
+        source: recorded in the calibration.
+
+    Raises:
+        CalibrationImpossible: there are too few trials, or the calibration has no curve.
+    """
+    if len(trials) < FEWEST_OUTCOMES or base.curve is None:
+        raise CalibrationImpossible(
+            f"A calibration is adjusted to at least {FEWEST_OUTCOMES} labelled frames; here are {len(trials)}."
+            if base.curve is not None
+            else "The encoder's calibration has no curve that could be adjusted."
+        )
+    return _measured(trials, _adjusted(trials, base), source, lambda some: _adjusted(some, base))
+
+
+def _adjusted(trials: Trials, base: Calibration) -> Calibration:
+    assert base.curve is not None
+    clear = np.minimum(1.0, trials.margin / base.margin) if base.margin else (trials.margin > 0).astype(np.float64)
+    curve = moved_curve(base.curve, trials.decision, trials.imagined, trials.right, (1 + clear) / 2)
+    threshold = curve.decision(base.curve.probability(base.threshold))
+    return base.model_copy(update={"curve": curve, "threshold": threshold})
+
+
+def _measured(
+    trials: Trials, calibration: Calibration, source: str, fit: Callable[[Trials], Calibration]
+) -> FittedCalibration:
+    """A calibration with what was measured of it; ``fit`` makes one of a part of the trials."""
     frames = len(np.unique(trials.frame))
     known, right = trials.known, trials.right
     points = curve_points(trials.decision, known, right)
@@ -263,7 +302,7 @@ def fit_map_calibration(trials: Trials, base: Calibration, target: Target, sourc
         auc_pr=auc_pr(trials.decision, right),
         auc_roc=auc_roc(trials.decision, known),
         auc_roc_right=auc_roc(trials.decision, right) or 0.0,
-        cross_validated=cross_validated(trials, base, target),
+        cross_validated=_cross_validated(trials, fit),
         points=_thinned(points),
     )
     return FittedCalibration(calibration.model_copy(update={"source": source, "frames": frames}), measurement, trials)
@@ -282,9 +321,13 @@ def cross_validated(trials: Trials, base: Calibration, target: Target) -> Held:
     Raises:
         CalibrationImpossible: the blocks besides one do not suffice for a calibration.
     """
+    return _cross_validated(trials, lambda some: _fitted(some, base, target))
+
+
+def _cross_validated(trials: Trials, fit: Callable[[Trials], Calibration]) -> Held:
     recognized, probabilities = np.zeros(len(trials), np.bool_), np.zeros(len(trials))
     for block in blocks_of(trials.frame):
-        calibration = _fitted(trials.take(~block), base, target)
+        calibration = fit(trials.take(~block))
         held = trials.take(block)
         recognized[block], probabilities[block] = held.recognized(calibration), held.probabilities(calibration)
     return held_figures(trials, recognized, probabilities)

@@ -19,6 +19,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 FARTHEST = 35.0
 """Log odds are limited to this: beyond it 1 - P would be lost in rounding, and no measurement is as certain."""
 
+STRETCH, SHIFT = 0.5, 2.0
+"""How much the curve of a new environment may differ from a known one: the deviations of the logarithm of the factor of
+its log odds, and of what is added to them."""
+
 NEWTON_STEPS = 100
 """At most this many iterations fit a curve."""
 
@@ -123,3 +127,35 @@ def _loss(
     """The negative log-likelihood."""
     odds = design @ weights
     return float((counted * (np.logaddexp(0, odds) - targets * odds)).sum())
+
+
+def moved_curve(curve: Curve, decisions: ArrayLike, imagined: ArrayLike, right: ArrayLike, factors: ArrayLike) -> Curve:
+    """A curve whose log odds are stretched and shifted as far as outcomes demand it, but no farther.
+
+    The most probable stretch a and shift b of the log odds, a · odds + b, given the outcomes, where before them log a
+    and b are normal about 0 with the deviations ``STRETCH`` and ``SHIFT``.  So few outcomes move it little, and even
+    outcomes of one kind only give a curve.
+
+    Args:
+        decisions: [n], decision values; imagined: [n], shares of imagined places.
+        right: bool [n], whether the best match was right.
+        factors: [n], in (0, 1], by which the probability of the curve is multiplied to be that of the answer.
+    """
+    from scipy.optimize import minimize  # here, because it takes long to import
+
+    odds, y = curve.log_odds(decisions, imagined), np.asarray(right, np.bool_)
+    share = np.asarray(factors, np.float64)
+
+    def loss(moved: NDArray[np.float64]) -> float:
+        stated = share * sigmoid(np.exp(moved[0]) * odds + moved[1])
+        likelihood = np.where(y, np.log(stated), np.log1p(-stated)).sum()
+        return float((moved[0] / STRETCH) ** 2 / 2 + (moved[1] / SHIFT) ** 2 / 2 - likelihood)
+
+    found = minimize(loss, np.zeros(2), method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9, "maxiter": 2000})
+    stretch, shift = float(np.exp(found.x[0])), float(found.x[1])
+    return Curve(
+        slope=stretch * curve.slope,
+        intercept=stretch * curve.intercept + shift,
+        imagined_slope=stretch * curve.imagined_slope,
+        imagined_intercept=stretch * curve.imagined_intercept,
+    )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from core.errors import CalibrationImpossible, UnknownPlace, UnknownSequence
 from core.judgement.background import GUARD_FACTOR
-from core.judgement.calibration import FittedCalibration, Target, fit_map_calibration
+from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered, joined
 from core.judgement.verdict import Calibration, judge
 from core.method.agreement import Cells
@@ -199,11 +199,13 @@ def run_trials(
     queries: LabelledQueries,
     base: Calibration,
     advance: ProgressCallback,
+    without_place: bool = True,
 ) -> Trials:
     """The answers to all queries, each with its place in the map and without it.
 
     Args:
         base: the calibration by which the answers are judged.
+        without_place: whether queries are also asked of the map without their place.
 
     Raises:
         StorageFailure: the map's files cannot be read.
@@ -217,7 +219,9 @@ def run_trials(
         places = int(np.count_nonzero(living))
         for query, ranking in zip(batch, snapshot.search_batch(descriptors, queries.allowed), strict=True):
             there = query.true & snapshot.alive & ~query.absent
-            cases = [query.absent] if not there.any() else [query.absent, query.absent | query.around]
+            cases = [query.absent]
+            if without_place and there.any():
+                cases.append(query.absent | query.around)
             for left_out in cases:
                 if len(ranking[0]) < places and left_out[ranking[0]].any():  # a shortlist, others take their places
                     ranking = snapshot.search(query.descriptor, living & ~left_out)
@@ -264,6 +268,26 @@ def calibrate_map(
         trials.append(run_trials(map_, encoder, snapshot, one, base, advanced))
         done += one.count
     return fit_map_calibration(joined(trials), base, target, source)
+
+
+def adjust_to_labels(
+    map_: Map,
+    encoder: Encoder,
+    snapshot: Snapshot,
+    queries: LabelledQueries,
+    source: str,
+    advance: ProgressCallback = lambda _done, _total: None,
+) -> FittedCalibration:
+    """The encoder's calibration, adjusted to a map's answers to labelled queries; nothing is stored.
+
+    Raises:
+        CalibrationImpossible: there are too few.
+        StorageFailure: the map's files cannot be read.
+        Others: what ``advance`` raises.
+    """
+    base = encoder.calibration
+    trials = run_trials(map_, encoder, snapshot, queries, base, advance, without_place=False)
+    return adjust_calibration(trials, base, source)
 
 
 def calibration_warnings(found: FittedCalibration, method: str) -> list[str]:

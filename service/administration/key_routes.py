@@ -15,9 +15,11 @@ from core import errors
 from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.access.gate import Gate
 from service.access.keys import Key, KeyStore
+from service.access.roles import ANONYMOUS
 from service.administration.key_schemas import CreatedKey, KeyChanges, KeyPage, KeyView, NewKey, OwnKey
 from service.errors.faults import (
     BodyTooLarge,
+    FirstKeyLocal,
     InvalidRequest,
     KeyEnded,
     KeyExists,
@@ -90,7 +92,7 @@ def _position(key: Key) -> str:
     "",
     status_code=201,
     dependencies=[Depends(json_body)],
-    responses=problem_documentation(*BODY_PROBLEMS, KeyExists, TooManyKeys, LastAdminKey),
+    responses=problem_documentation(*BODY_PROBLEMS, FirstKeyLocal, KeyExists, TooManyKeys, LastAdminKey),
 )
 def create_key(
     new: NewKey,
@@ -99,13 +101,20 @@ def create_key(
     gate: GateDep,
     store: StoreDep,
     engine: EngineDep,
+    principal: PrincipalDep,
     lock_out: LockOut = False,
 ) -> CreatedKey:
     """Create a key, which is shown only in this answer.
 
     The first key of a service turns keys on: from this answer on every request needs one, also once all keys are
-    revoked or have expired. It has to be of the role admin for all maps, or `lock_out` has to be true.
+    revoked or have expired. It has to be of the role admin for all maps, or `lock_out` has to be true. Where other
+    machines can reach a service without keys, `placerec keys create` on its own machine creates the first one.
     """
+    if principal is ANONYMOUS and not gate.loopback:
+        raise FirstKeyLocal(
+            "Other machines can reach this service, which has no keys. Create the first one on the service's own "
+            "machine, with 'placerec keys create'."
+        )
     request.state.noted = _noted(new.model_dump(include={"name", "role", "maps"}))
     key, token = store.create(new.name, new.role, new.maps, new.expires_at, keep_admin=not lock_out)
     _take_effect(gate)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of, read_bytes
+from core.errors import InvalidImage, InvalidRecording
+from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of
 from service.commands.console import Failure, number, output, remark, show, show_json, table
 from service.commands.jobs import submit
+from service.commands.recordings import RecordingOptions, Topic
 
 SHOWN_POINTS = 9
 
@@ -24,6 +27,13 @@ def calibrate(
             help="CSV with the columns file,place of labelled frames beside it; leave place empty if the map lacks it."
         ),
     ] = None,
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --frames: a bag or a video. The column file then has ids of its frames, as query --json tells."
+        ),
+    ] = None,
+    topic: Topic = None,
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the labelled frames; its mask is applied.")
     ] = None,
@@ -60,8 +70,11 @@ def calibrate(
         raise typer.BadParameter("give exactly one of --frames, --sequence and --itself")
     if pairs is not None and sequence is None:
         raise typer.BadParameter("--pairs needs --sequence")
-    if camera is not None and frames is None:
-        raise typer.BadParameter("--camera needs --frames")
+    for option, value in (("--camera", camera), ("--recording", recording)):
+        if value is not None and frames is None:
+            raise typer.BadParameter(f"{option} needs --frames")
+    if topic is not None and recording is None:
+        raise typer.BadParameter("--topic needs --recording")
     order: dict[str, Any] = {"target": _target(precision, false_accept_rate, mean_of_negatives), "dry_run": dry_run}
     order |= {} if most is None else {"most": most}
     target, path = Target(url, data_dir), path_of("maps", map_id, "calibrate")
@@ -76,8 +89,9 @@ def calibrate(
             ],
         }
         parts: list[tuple[str, Any]] = [("calibration", (None, json.dumps(order), "application/json"))]
-        for name, (file, _) in zip(names, rows, strict=True):
-            data = read_bytes(frames.parent / file)
+        files = [file for file, _ in rows]
+        labelled = _pictures(frames.parent, files) if recording is None else _of_recording(recording, topic, files)
+        for name, file, data in zip(names, files, labelled, strict=True):
             parts.append((name, (file, data, media_type(data))))
         report = ask(target, "POST", path, files=parts).json()
     else:
@@ -91,6 +105,32 @@ def calibrate(
             raise Failure(job["problem"]["detail"] if job["problem"] else f"The job {job['id']} was cancelled.")
         report = job["result"]
     show_json(report) if as_json else _show(report)
+
+
+def _pictures(folder: Path, files: list[str]) -> Iterator[bytes]:
+    """The bytes of picture files, in their order."""
+    from core.recordings.folder import read_picture
+
+    for file in files:
+        try:
+            yield read_picture(folder / file)
+        except OSError as error:
+            raise Failure(f"{folder / file} cannot be read: {error.strerror}.") from error
+        except InvalidImage as error:
+            raise Failure(f"{file}: {error}") from error
+
+
+def _of_recording(path: Path, topic: str | None, ids: list[str]) -> Iterator[bytes]:
+    """The bytes of some frames of a recording, in their order."""
+    with RecordingOptions(topic).open(path) as recording:
+        frames = {frame.id: frame for frame in recording.frames}
+        for name in ids:
+            if name not in frames:
+                raise Failure(f"{path} has no frame {name!r}; placerec query --json tells the ids of its frames.")
+            try:
+                yield frames[name].load()
+            except (InvalidImage, InvalidRecording) as error:
+                raise Failure(f"{name}: {error}") from error
 
 
 def _target(precision: float | None, false_accept_rate: float | None, mean_of_negatives: bool) -> dict[str, Any]:

@@ -1,22 +1,36 @@
-"""``placerec enroll``: enrol the images of a directory as places of a map."""
+"""``placerec enroll``: enrol the frames of a recording as places of a map."""
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from pydantic import BaseModel, ValidationError
 from rich.markup import escape
 
-from service.commands.connection.batches import Outcome, enrol_frames
+from core.places import Sequence as SequenceName
+from service.commands.connection.batches import Frame, Outcome, enrol_frames
 from service.commands.connection.client import DataDir, Refused, Service, Target, Url, open_service, path_of, run
-from service.commands.console import Failure, complain, output, progress, remark
+from service.commands.console import Failure, complain, output, progress
 from service.commands.jobs import show_outcome, submit
-from service.commands.traverse import Frame, read_traverse, unlisted
+from service.commands.recordings import (
+    EveryChange,
+    EveryDegrees,
+    EveryMetres,
+    EverySeconds,
+    LargestGap,
+    PoseTopic,
+    RecordingOptions,
+    Topic,
+    TrajectoryFile,
+    TrajectoryTimes,
+)
 
 
 @dataclass
@@ -26,20 +40,27 @@ class Report:
     changes: Counter[str] = field(default_factory=Counter)
     posed: int = 0
     uploaded: int = 0
-    failures: list[tuple[Path, str]] = field(default_factory=list)
+    failures: list[tuple[str, str]] = field(default_factory=list)
 
     def add(self, outcome: Outcome) -> None:
         """Count one frame."""
         self.uploaded += outcome.uploaded
         if outcome.change is None:
-            self.failures.append((outcome.frame.path, str(outcome.refusal)))
+            self.failures.append((outcome.frame.name, str(outcome.refusal)))
         else:
             self.changes[outcome.change] += 1
             self.posed += outcome.posed
 
 
 def enroll(
-    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Images of one traverse.", show_default=False)],
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDING",
+            help="One traverse: a directory of images, a bag (rosbag2, ROS 1) or a video.",
+            show_default=False,
+        ),
+    ],
     map_id: Annotated[str, typer.Option("--map", "-m", help="The map to enrol into.", show_default=False)],
     create: Annotated[bool, typer.Option("--create", help="Create the map if there is none.")] = False,
     encoder: Annotated[
@@ -51,36 +72,77 @@ def enroll(
         typer.Option(help="What a map that is created keeps of each frame."),
     ] = None,
     sequence: Annotated[
-        str | None, typer.Option(help="Name of the traverse; default: the name of DIR.", show_default=False)
+        str | None, typer.Option(help="Name of the traverse; default: the name of RECORDING.", show_default=False)
     ] = None,
-    id_prefix: Annotated[str, typer.Option(help="Prefix of the ids that are made from file names.")] = "",
+    id_prefix: Annotated[str, typer.Option(help="Prefix of the ids that are made from names of files or topics.")] = "",
     camera: Annotated[
         str | None, typer.Option(help="Camera of the map that took the images; its mask is applied.")
     ] = None,
     align: Annotated[
         bool, typer.Option("--align", help="Then find which frames show places that the map had already.")
     ] = False,
+    topic: Topic = None,
+    pose_topic: PoseTopic = None,
+    trajectory: TrajectoryFile = None,
+    trajectory_times: TrajectoryTimes = None,
+    largest_gap: LargestGap = None,
+    every_metres: EveryMetres = None,
+    every_degrees: EveryDegrees = None,
+    every_seconds: EverySeconds = None,
+    every_change: EveryChange = None,
     url: Url = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Enrol the images of DIR, in natural order, as places of a map.
+    """Enrol the frames of a recording, in their order, as places of a map.
 
-    Poses come from places.csv in DIR (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or
-    else from the EXIF data of the images. Ids are the file names without their extension. The command can be
-    interrupted and run again: a frame that is already enrolled is not encoded again.
+    A directory of images is taken in natural order. Poses come from places.csv in it
+    (file,id,x,y,z,heading,latitude,longitude,timestamp; only file is required), or else from the EXIF data of the
+    images; ids are the file names without their extension. The frames of a bag are taken in the order of their header
+    stamps, of which their ids are made; those of a video are numbered. What is neither JPEG nor PNG nor WebP is sent
+    as PNG.
+    The command can be interrupted and run again: a frame that is already enrolled is not sent again.
     """
-    frames = [replace(frame, camera=camera) for frame in read_traverse(directory, sequence, id_prefix)]
-    left_out = unlisted(directory, frames)
-    if left_out:
-        remark(f"{left_out} images of {directory} are not listed in places.csv and are left out.")
+    options = RecordingOptions(
+        topic,
+        pose_topic,
+        trajectory,
+        trajectory_times,
+        largest_gap,
+        every_metres,
+        every_degrees,
+        every_seconds,
+        every_change,
+    )
+    target = Target(url, data_dir)
     began = time.monotonic()
-    report = run(_enroll(Target(url, data_dir), map_id, frames, create, {"encoder": encoder, "keep": keep}))
-    _show(report, map_id, frames, time.monotonic() - began)
+    with options.open(recording, id_prefix) as opened:
+        name = _checked_sequence(opened.name if sequence is None else sequence)
+
+        def choose(used: str | None) -> list[Frame]:
+            return [Frame(taken, name, camera) for taken in options.choose(opened, used)]
+
+        report, frames = run(_enroll(target, map_id, choose, camera, create, {"encoder": encoder, "keep": keep}))
+    _show(report, map_id, name, frames, time.monotonic() - began)
     if align:
-        body = {"sequence": frames[0].sequence}
-        _show_aligned(submit(Target(url, data_dir), path_of("maps", map_id, "align"), body, wait=True))
+        _show_aligned(submit(target, path_of("maps", map_id, "align"), {"sequence": name}, wait=True))
     if report.failures:
         raise typer.Exit(1)
+
+
+class _Sequence(BaseModel):
+    name: SequenceName
+
+
+def _checked_sequence(name: str) -> str:
+    """Return ``name`` if a traverse may have it.
+
+    Raises:
+        Failure: a traverse may not have this name.
+    """
+    try:
+        return _Sequence(name=name).name
+    except ValidationError as error:
+        raise Failure(f"A sequence cannot have the name {name!r}; give another one with --sequence.") from error
 
 
 def _show_aligned(job: dict[str, Any]) -> None:
@@ -104,13 +166,21 @@ def _show_aligned(job: dict[str, Any]) -> None:
 
 
 async def _enroll(
-    target: Target, map_id: str, frames: Sequence[Frame], create: bool, wanted: dict[str, str | None]
-) -> Report:
+    target: Target,
+    map_id: str,
+    choose: Callable[[str | None], list[Frame]],
+    camera: str | None,
+    create: bool,
+    wanted: dict[str, str | None],
+) -> tuple[Report, int]:
+    """Enrol the frames that ``choose`` gives for the map's encoder; what became of them, and how many they are."""
     report = Report()
     async with open_service(target) as service:
-        await _ready_map(service, map_id, create, {key: value for key, value in wanted.items() if value is not None})
-        if (camera := frames[0].camera) is not None:
+        given = {key: value for key, value in wanted.items() if value is not None}
+        used = await _ready_map(service, map_id, create, given)
+        if camera is not None:
             await service.get(path_of("maps", map_id, "cameras", camera))  # otherwise each frame would be refused
+        frames = await asyncio.to_thread(choose, used)
         known = await _check_ids(service, map_id, frames)
         with progress() as bar:
             task = bar.add_task(f"Enrolling into {escape(map_id)}", total=len(frames))
@@ -126,19 +196,21 @@ async def _enroll(
                 raise Failure(
                     f"{failure} {done} of {len(frames)} frames are enrolled; run the command again to continue."
                 ) from failure
-    return report
+    return report, len(frames)
 
 
-async def _ready_map(service: Service, map_id: str, create: bool, settings: dict[str, str]) -> None:
-    """Check that the map exists, or create it."""
+async def _ready_map(service: Service, map_id: str, create: bool, settings: dict[str, str]) -> str | None:
+    """Check that the map exists, or create it; the identity of its encoder."""
     try:
-        await service.get(path_of("maps", map_id))
+        found = await service.get(path_of("maps", map_id))
     except Refused as refused:
         if refused.slug != "unknown-map":
             raise
         if not create:
             raise Failure(f"There is no map {map_id!r}. Give --create to create it.") from refused
-        await service.request("POST", path_of("maps"), json={"id": map_id, **settings})
+        found = (await service.request("POST", path_of("maps"), json={"id": map_id, **settings})).json()
+    encoder = found.get("encoder")
+    return None if encoder is None else str(encoder)
 
 
 async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> frozenset[str]:
@@ -158,16 +230,16 @@ async def _check_ids(service: Service, map_id: str, frames: Sequence[Frame]) -> 
     return frozenset(known)
 
 
-def _show(report: Report, map_id: str, frames: Sequence[Frame], seconds: float) -> None:
+def _show(report: Report, map_id: str, sequence: str, frames: int, seconds: float) -> None:
     done = sum(report.changes.values())
     counts = ", ".join(f"{count} {change}" for change, count in sorted(report.changes.items()))
     output.print(
-        f"{done} of {len(frames)} frames are places of {map_id}, sequence {frames[0].sequence}"
+        f"{done} of {frames} frames are places of {map_id}, sequence {sequence}"
         f"{f': {counts}' if counts else ''}; {report.posed} with a pose; "
         f"{report.uploaded} sent in {seconds:.1f} s.",
         soft_wrap=True,
         markup=False,
         highlight=False,
     )
-    for path, reason in sorted(report.failures):
-        complain(f"{path.name}: {reason}")
+    for frame, reason in sorted(report.failures):
+        complain(f"{frame}: {reason}")

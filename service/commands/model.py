@@ -110,15 +110,16 @@ def name_of(identity: str) -> str:
 
 
 def load_image(path: Path) -> Pixels:
-    """The pixels of an image file.
+    """The pixels of an image file of any format that OpenCV reads.
 
     Raises:
         Failure: it cannot be read or decoded; the text names the file.
     """
     from core.frames.images import decode
+    from core.recordings.pictures import sendable
 
     try:
-        return decode(read_bytes(path))
+        return decode(sendable(read_bytes(path)))
     except InvalidImage as error:
         raise Failure(f"{path}: {error}") from error
 

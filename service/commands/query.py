@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from core.errors import InvalidImage, InvalidRecording
 from service.commands.connection.client import (
     DataDir,
     Refused,
@@ -17,17 +20,41 @@ from service.commands.connection.client import (
     media_type,
     open_service,
     path_of,
-    read_bytes,
     run,
 )
 from service.commands.console import Failure, complain, number, show, table
+from service.commands.recordings import (
+    EveryChange,
+    EveryDegrees,
+    EveryMetres,
+    EverySeconds,
+    LargestGap,
+    PoseTopic,
+    RecordingOptions,
+    Topic,
+    TrajectoryFile,
+    TrajectoryTimes,
+)
+
+if TYPE_CHECKING:
+    from core.recordings import Frame
+
+Asked = tuple[str, "Frame", bool]
+"""The file of a frame as it was given, the frame, and whether it is one of a recording."""
 
 PATIENCE = 30.0
 """Seconds for which a frame is repeated while the service is overloaded."""
 
 
 def query(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE…", help="Frames to localize.", show_default=False)],
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGE…",
+            help="Frames to localize: images, and directories of images, bags or videos.",
+            show_default=False,
+        ),
+    ],
     map_id: Annotated[str, typer.Option("--map", "-m", help="The map to search.", show_default=False)],
     k: Annotated[int, typer.Option("-k", min=1, max=100, help="How many matches to return.")] = 5,
     near: Annotated[
@@ -56,11 +83,22 @@ def query(
         Literal["auto", "always", "never"],
         typer.Option(help="Compare keypoints with the best candidates; auto: where the scores leave doubt."),
     ] = "auto",
+    topic: Topic = None,
+    pose_topic: PoseTopic = None,
+    trajectory: TrajectoryFile = None,
+    trajectory_times: TrajectoryTimes = None,
+    largest_gap: LargestGap = None,
+    every_metres: EveryMetres = None,
+    every_degrees: EveryDegrees = None,
+    every_seconds: EverySeconds = None,
+    every_change: EveryChange = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: Annotated[bool, typer.Option("--json", help="Write one JSON object a line for each frame.")] = False,
 ) -> None:
-    """Recognize the place of a map that each image shows, if any.
+    """Recognize the place of a map that each frame shows, if any.
+
+    Of a recording the poses serve only to choose keyframes; they are not sent.
 
     An unknown place is an answer, not an error: the exit status is 1 only if an image cannot be used.
     """
@@ -75,7 +113,22 @@ def query(
     }
     known |= {"radius": radius, **_position(near, geographic)}
     parameters = {"k": k, "verify": verify, **{name: value for name, value in known.items() if value is not None}}
-    failures = run(_query(Target(url, data_dir), map_id, images, parameters, as_json))
+    options = RecordingOptions(
+        topic,
+        pose_topic,
+        trajectory,
+        trajectory_times,
+        largest_gap,
+        every_metres,
+        every_degrees,
+        every_seconds,
+        every_change,
+    )
+
+    def asked(encoder: str | None) -> Iterator[Asked]:
+        return _frames(images, options, encoder)
+
+    failures = run(_query(Target(url, data_dir), map_id, asked, options.every_change is not None, parameters, as_json))
     if failures:
         raise typer.Exit(1)
 
@@ -89,29 +142,59 @@ def _position(near: str | None, geographic: bool) -> dict[str, Any]:
     return dict(zip(("latitude", "longitude") if geographic else ("x", "y"), parts, strict=True))
 
 
-async def _query(target: Target, map_id: str, images: list[Path], parameters: dict[str, Any], as_json: bool) -> int:
+def _frames(images: list[Path], options: RecordingOptions, encoder: str | None) -> Iterator[Asked]:
+    """The frames of all that was given, in its order."""
+    from core.recordings.folder import picture_frame
+    from core.recordings.recording import is_recording
+
+    for path in images:
+        if is_recording(path):
+            with options.open(path) as recording:
+                for frame in options.choose(recording, encoder):
+                    yield str(path), frame, True
+        else:
+            yield str(path), picture_frame(path), False
+
+
+async def _query(
+    target: Target,
+    map_id: str,
+    asked: Callable[[str | None], Iterator[Asked]],
+    by_change: bool,
+    parameters: dict[str, Any],
+    as_json: bool,
+) -> int:
     failures = 0
     rows = table(
         "image", "verdict", "place", "#probability", "#score", "#margin", "best match", "#ms", title=f"Map {map_id}"
     )
     async with open_service(target) as service:
-        for image in images:
-            data = read_bytes(image)
+        encoder = (await service.get(path_of("maps", map_id)))["encoder"] if by_change else None
+        for file, frame, of_recording in asked(encoder):
             try:
+                data = await asyncio.to_thread(_load, file, frame)
                 answer = await _ask(service, map_id, data, parameters)
-            except Refused as refused:
-                if refused.status not in (400, 413, 415, 422):
+            except (Refused, InvalidImage, InvalidRecording) as error:
+                if isinstance(error, Refused) and error.status not in (400, 413, 415, 422):
                     raise
                 failures += 1
-                complain(f"{image}: {refused}")
+                complain(f"{frame.name}: {error}")
                 continue
             if as_json:
-                typer.echo(json.dumps({"file": str(image), **answer}, ensure_ascii=False))
+                told = {"file": file, **({"frame": frame.id} if of_recording else {}), **answer}
+                typer.echo(json.dumps(told, ensure_ascii=False))
             else:
-                rows.add_row(str(image), *_cells(answer))
+                rows.add_row(frame.name, *_cells(answer))
     if rows.row_count:
         show(rows)
     return failures
+
+
+def _load(file: str, frame: Frame) -> bytes:
+    try:
+        return frame.load()
+    except OSError as error:
+        raise Failure(f"{file} cannot be read: {error.strerror}.") from error
 
 
 async def _ask(service: Service, map_id: str, data: bytes, parameters: dict[str, Any]) -> dict[str, Any]:

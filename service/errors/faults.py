@@ -186,6 +186,10 @@ class KeyExists(InvalidRequest):
     """Another key in force has the name."""
 
 
+class FirstKeyLocal(Fault):
+    """The service has no keys and other machines can reach it, so none of them may create the first one."""
+
+
 class KeyEnded(Fault):
     """The key is revoked or has expired, so it cannot be changed."""
 

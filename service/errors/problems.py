@@ -136,6 +136,9 @@ KINDS: dict[type[Exception], Kind] = {
     faults.TooManyExports: Kind(503, "too-many-exports", "Too many maps are being exported"),
     faults.TooManyImports: Kind(503, "too-many-imports", "Too many maps are being imported"),
     # Traverses on disk, which only the command line reads
+    errors.InvalidRecording: Kind(422, "invalid-recording", "The recording cannot be used"),
+    errors.UnknownTopic: Kind(404, "unknown-topic", "The bag has no such topic"),
+    errors.InvalidTrajectory: Kind(422, "invalid-trajectory", "The trajectory cannot be used"),
     errors.MissingExtra: Kind(503, "missing-extra", "A package is not installed"),
     errors.InvalidTraverse: Kind(422, "invalid-traverse", "The directory is not a traverse"),
     errors.InvalidGroundTruth: Kind(422, "invalid-ground-truth", "The ground truth cannot be used"),
@@ -177,6 +180,7 @@ KINDS: dict[type[Exception], Kind] = {
     faults.RateExceeded: Kind(429, "rate-exceeded", "Too many requests a second"),
     faults.UnknownKey: Kind(404, "unknown-key", "The key does not exist"),
     faults.KeyExists: Kind(409, "key-exists", "Another key has this name"),
+    faults.FirstKeyLocal: Kind(403, "first-key-local", "The first key is created on the service's own machine"),
     faults.KeyEnded: Kind(409, "key-ended", "The key is revoked or has expired"),
     faults.KeyWidened: Kind(409, "key-widened", "A key can only be narrowed"),
     faults.LastAdminKey: Kind(409, "last-admin-key", "No key could manage the service any more"),

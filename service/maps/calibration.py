@@ -22,6 +22,7 @@ from core.recognition.calibration import (
     TOGETHER,
     LabelledQueries,
     ProgressCallback,
+    adjust_to_labels,
     calibration_warnings,
     queries_from_labels,
     queries_from_map,
@@ -261,7 +262,11 @@ def measure(
     queries = _queries(map_, snapshot, order, encodings, known)
     beside = queries_from_map(map_, snapshot, order.most) if (order.method, order.beside) == ("labels", "map") else None
     source = f"sequence:{order.sequence}" if order.method == "sequence" else order.method
-    found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
+    adjusted = (order.method, order.beside) == ("labels", "encoder")
+    if adjusted:
+        found = adjust_to_labels(map_, encoder, snapshot, queries, source, advance)
+    else:
+        found = fit_calibration(map_, encoder, snapshot, queries, order.target, source, advance, beside)
     report = CalibrationReport(
         map=map_.record.id,
         encoder=encoder.identity,
@@ -271,7 +276,7 @@ def measure(
         calibration=found.calibration,
         previous=calibration_of(map_, encoder),
         measurement=found.measurement,
-        warnings=calibration_warnings(found, order.method),
+        warnings=calibration_warnings(found, "adjusted" if adjusted else order.method),
     )
     return report, found.trials
 

@@ -271,10 +271,11 @@ class CalibrationOrder(BaseModel):
         le=MOST_FRAMES,
         description="How many frames are asked at most; they are chosen evenly.",
     )
-    beside: Literal["map", "none"] = Field(
-        default="map",
-        description="With the method labels: whether the map's own frames are asked as well (`map`), since few frames "
-        "are labelled and these are the doubtful ones, or the labelled frames alone (`none`).",
+    beside: Literal["encoder", "map", "none"] = Field(
+        default="encoder",
+        description="With the method labels, what the labels join, since they are few and of the doubtful frames. "
+        "`encoder`: the encoder's calibration, whose curve is moved as far as the labels demand; the target is not "
+        "used then. `map`: the map's own frames, which are asked as well. `none`: nothing.",
     )
     labels: list[Label] | None = Field(
         default=None, min_length=1, max_length=MOST_FRAMES, description="One label for each frame of the form."

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import NamedTuple
 
 from core.judgement.verdict import Verdict
 from service.access.audit import ASKER, Asker
@@ -25,8 +25,7 @@ MapKey = tuple[str, str]
 """The id of a map and the time of its creation: a new map of the same id has answers of its own."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecentAnswer:
+class RecentAnswer(NamedTuple):
     """What is kept of an answer: no frame and no metadata, whose size nobody bounds.
 
     matches: ids and scores of the best matches, best first.

@@ -65,7 +65,7 @@ _TABLES = (
 )
 _LATER: Mapping[int, tuple[str, ...]] = {
     1: (
-        "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour TEXT NOT NULL,"
+        "CREATE TABLE hours (map INTEGER NOT NULL REFERENCES maps (code) ON DELETE CASCADE, hour INTEGER NOT NULL,"
         " recognized INTEGER NOT NULL, ambiguous INTEGER NOT NULL, unknown INTEGER NOT NULL, PRIMARY KEY (map, hour))"
         " STRICT, WITHOUT ROWID",
         "CREATE TABLE calibrations (map INTEGER PRIMARY KEY REFERENCES maps (code) ON DELETE CASCADE,"
@@ -145,7 +145,7 @@ class _Counts:
     since: str
     places: dict[str, PlaceCount] = field(default_factory=dict)
     weeks: dict[date, Week] = field(default_factory=dict)
-    hours: dict[str, Counter[Verdict]] = field(default_factory=dict)
+    hours: dict[int, Counter[Verdict]] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         for place, count in other.places.items():
@@ -295,7 +295,10 @@ class QueryStatistics:
             StorageFull, StorageFailure: the file cannot be read.
         """
         found = self._last_hours(key).get(key, {})
-        return [HourCount(hour=datetime.fromisoformat(hour), **counts.model_dump()) for hour, counts in found.items()]
+        return [
+            HourCount(hour=datetime.fromtimestamp(3600 * hour, UTC), **counts.model_dump())
+            for hour, counts in found.items()
+        ]
 
     def last_day(self, key: MapKey | None = None) -> dict[MapKey, VerdictCounts]:
         """The answers of the last ``HOURS`` hours, of the maps that had any.
@@ -309,7 +312,7 @@ class QueryStatistics:
         found = self._last_hours(key)
         return {one: sum(hours.values(), VerdictCounts()) for one, hours in found.items()}
 
-    def _last_hours(self, key: MapKey | None) -> dict[MapKey, dict[str, VerdictCounts]]:
+    def _last_hours(self, key: MapKey | None) -> dict[MapKey, dict[int, VerdictCounts]]:
         """The counts of the last hours by map and hour, in order."""
         oldest = _hour(datetime.now(UTC) - timedelta(hours=HOURS - 1))
         query = (
@@ -317,7 +320,7 @@ class QueryStatistics:
             " ON m.code = h.map WHERE h.hour >= ?"
         )
         only, values = ("", ()) if key is None else (" AND m.id = ? AND m.made = ?", key)
-        found: dict[MapKey, dict[str, VerdictCounts]] = {}
+        found: dict[MapKey, dict[int, VerdictCounts]] = {}
         with self._file:  # so that no counts are on their way from memory to the file
             with self._replacing_damage():
                 for map_id, made, hour, *counts in self._open().execute(query + only, (oldest, *values)).fetchall():
@@ -473,9 +476,9 @@ def _monday(day: date) -> date:
     return day - timedelta(days=day.weekday())
 
 
-def _hour(moment: datetime) -> str:
-    """The hour of a moment as text, which sorts by time."""
-    return moment.replace(minute=0, second=0, microsecond=0).isoformat()
+def _hour(moment: datetime) -> int:
+    """The hour of a moment, counted since 1970 in UTC."""
+    return int(moment.timestamp()) // 3600
 
 
 def _columns(week: Week) -> tuple[object, ...]:

@@ -1,4 +1,5 @@
-"""The generated pages of ``docs/reference``: settings, command line, HTTP operations and problems.
+"""The generated pages of ``docs/reference``: settings, command line, HTTP operations and problems,
+the Python client.
 
     python -m tests.documents.reference     # writes them; so does scripts/reference
 
@@ -17,6 +18,7 @@ import typer.main
 from service.commands.application import application
 from service.errors.problems import BY_STATUS, KINDS, TYPE_PREFIX
 from service.settings import PREFIX, Settings
+from tests.documents import client_reference
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "reference"
@@ -167,7 +169,17 @@ def paragraphs(text: str) -> list[str]:
     ]
 
 
-PAGES = {"settings.md": settings, "command-line.md": command_line, "http-operations.md": operations}
+def client() -> str:
+    """The page of the Python client."""
+    return REMARK + "\n" + client_reference.page()
+
+
+PAGES = {
+    "settings.md": settings,
+    "command-line.md": command_line,
+    "http-operations.md": operations,
+    "client.md": client,
+}
 
 
 def main() -> None:

@@ -47,6 +47,19 @@ def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
     assert run([sys.executable, "-c", program], tmp_path, environment).startswith("recognized corridor ")
 
 
+OF_THE_CLIENT = ROOT / "docs" / "how-to" / "use-the-python-client.md"
+
+
+def test_the_python_of_the_client_runs_as_it_is_written(shared: Server, tmp_path: Path) -> None:
+    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
+    programs = PYTHON.findall(OF_THE_CLIENT.read_text())
+    assert len(programs) > 6
+    for program in programs:
+        run([sys.executable, "-c", f"url = '{shared.client.base_url}'\n{program}"], tmp_path, dict(os.environ))
+    for item in shared.client.get("/v1/maps").json()["items"]:
+        shared.client.delete(f"/v1/maps/{item['id']}")
+
+
 def run(command: Sequence[str | Path], folder: Path, environment: Mapping[str, str]) -> str:
     """What a command that has to succeed writes to standard output."""
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=110)

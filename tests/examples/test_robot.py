@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import pytest
 
 from tests.service.server import ROOT, Server, free_port
-
-sys.path.insert(0, str(ROOT / "examples"))  # examples are run from their folder
-
-import robot
 
 
 def run(*words: object) -> subprocess.CompletedProcess[str]:
@@ -81,51 +74,3 @@ def test_it_goes_on_without_a_service(pictures: Path) -> None:
     done = run("examples/robot.py", *words, "--frames", pictures / "places")
     assert done.returncode == 0, done.stderr
     assert [line.partition(": ")[2][:21] for line in done.stdout.splitlines()] == ["no answer in time: go"] * 3
-
-
-def localize(answers: list[httpx.Response | Exception], deadline: float) -> tuple[object, list[httpx.Request]]:
-    """What ``localize`` makes of these answers, and what it sent."""
-    sent: list[httpx.Request] = []
-
-    def handle(request: httpx.Request) -> httpx.Response:
-        sent.append(request)
-        answer = answers[min(len(sent), len(answers)) - 1]
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    with httpx.Client(transport=httpx.MockTransport(handle), base_url="http://service") as client:
-        return robot.localize(client, "lab", b"frame", "image/jpeg", deadline), sent
-
-
-def test_a_frame_is_sent_again_under_the_same_id_within_the_deadline() -> None:
-    busy = httpx.Response(503, headers={"Retry-After": "0"})
-    answers: list[httpx.Response | Exception] = [
-        busy,
-        httpx.ReadTimeout("late"),
-        httpx.Response(200, json={"verdict": "unknown"}),
-    ]
-    answer, sent = localize(answers, 10)
-    assert answer == {"verdict": "unknown"}
-    assert len({request.headers["X-Request-Id"] for request in sent}) == 1
-    left = [float(request.headers["X-Request-Timeout"]) for request in sent]
-    assert left == sorted(left, reverse=True)
-    assert left[0] <= 10
-
-
-def test_the_deadline_is_kept() -> None:
-    began = time.monotonic()
-    answer, sent = localize([httpx.Response(503, headers={"Retry-After": "30"})], 0.5)
-    assert answer is None
-    assert len(sent) == 1
-    assert time.monotonic() - began < 20, "half a second was given, and thirty asked for"
-
-
-@pytest.mark.parametrize(
-    ("status", "error"), [(422, robot.FrameRefused), (404, robot.QueriesRefused), (500, robot.QueriesRefused)]
-)
-def test_what_would_be_the_same_again_is_not_sent_again(status: int, error: type[Exception]) -> None:
-    content = json.dumps({"detail": "It is so."})
-    answer = httpx.Response(status, headers={"Content-Type": "application/problem+json"}, content=content)
-    with pytest.raises(error, match=r"It is so\."):
-        localize([answer], 10)

@@ -7,8 +7,16 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = ("core", "service", "training", "benchmarks", "examples", "scripts", "tests")
+CLIENT = ROOT / "clients" / "python"
+OF_CLIENT = "clients/python/placerec_client"
+FOLDERS = ("core", "service", "training", "benchmarks", OF_CLIENT, "examples", "scripts", "tests")
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+
+
+def module_of(path: Path) -> str:
+    """The dotted name of a file's module (a package's for its ``__init__.py``)."""
+    root = CLIENT if path.is_relative_to(CLIENT) else ROOT
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 
 @cache

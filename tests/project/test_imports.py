@@ -18,7 +18,7 @@ from packaging.utils import canonicalize_name
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tests.project.sources import FILES, FOLDERS, ROOT, forbidden_imports, imports_of
+from tests.project.sources import CLIENT, FILES, FOLDERS, ROOT, forbidden_imports, imports_of, module_of
 from tests.project.test_lock import locked
 
 MOST_MODULES = 16
@@ -26,7 +26,7 @@ MOST_MODULES = 16
 
 def import_graph(files: Iterable[Path]) -> dict[str, set[str]]:
     """Each file's dotted name (a package's for its ``__init__.py``) and the other files that it imports from."""
-    paths = {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+    paths = {module_of(path): path for path in files}
     graph = {}
     for name, path in paths.items():
         imported = {f"{module}.{one}" if f"{module}.{one}" in paths else module for module, one in imports_of(path)}
@@ -73,13 +73,31 @@ def test_examples_know_nothing_of_the_project() -> None:
     assert forbidden_imports("examples", {"benchmarks", "core", "service", "tests", "training"}) == []
 
 
+def test_the_client_knows_nothing_of_the_project() -> None:
+    """It is installed where nothing else of the project is."""
+    forbidden = {"benchmarks", "core", "examples", "service", "tests", "training"}
+    assert forbidden_imports("clients/python/placerec_client", forbidden) == []
+
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = {"core/evaluation/report": {"report"}, "training": {"report"}}
+CLIENT_PROJECT = tomllib.loads((CLIENT / "pyproject.toml").read_text())["project"]
+FOR_TYPES = {"numpy"}
+"""What the client imports for types alone: a caller who gives arrays has it."""
+
+EXTRAS = {
+    "core/evaluation/report": {"report"},
+    "core/recordings": {"bags"},
+    "examples": {"bags"},
+    "training": {"report"},
+}
 """Folders that may import what an extra brings; tests and benchmarks may import all."""
 
 
 def allowed(path: Path) -> set[str]:
     """The distributions that a file may import from."""
+    if path.is_relative_to(CLIENT):
+        texts = [*CLIENT_PROJECT["dependencies"], *CLIENT_PROJECT["optional-dependencies"]["stream"], *FOR_TYPES]
+        return {canonicalize_name(Requirement(text).name) for text in texts}
     extras = PROJECT["optional-dependencies"]
     folders = {str(parent.relative_to(ROOT)) for parent in path.parents if parent.is_relative_to(ROOT)}
     chosen = (
@@ -90,7 +108,11 @@ def allowed(path: Path) -> set[str]:
 
 
 def test_what_is_imported_is_declared() -> None:
-    known = set(sys.stdlib_module_names) | set(FOLDERS) | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    known = (
+        set(sys.stdlib_module_names)
+        | {Path(folder).name for folder in FOLDERS}
+        | {path.stem for path in (ROOT / "examples").glob("*.py")}
+    )
     distributions = packages_distributions()
     undeclared = {
         f"{path.relative_to(ROOT)}: {name}"

@@ -12,6 +12,7 @@ from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+CLIENT = tomllib.loads((ROOT / "clients/python/pyproject.toml").read_text())["project"]
 
 
 def locked(name: str) -> dict[str, Requirement]:
@@ -51,7 +52,8 @@ def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str
     for extra in extras:
         texts = texts + PROJECT["project"]["optional-dependencies"][extra]
     wanted = declared(texts)
-    del wanted["torch"]
+    del wanted["torch"], wanted["placerec-client"]
+    wanted |= declared(CLIENT["dependencies"] + CLIENT["optional-dependencies"]["stream"])
     entries = locked(name)
     outside = {
         package: requirement
@@ -59,6 +61,14 @@ def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str
         if package not in entries or not requirement.specifier.contains(version(entries[package]))
     }
     assert outside == {}, "scripts/lock brings them in step"
+
+
+def test_the_client_is_that_of_the_checkout() -> None:
+    from placerec_client.version import VERSION
+
+    wanted = declared(PROJECT["project"]["dependencies"])["placerec-client"]
+    assert wanted.specifier.contains(VERSION) and PROJECT["project"]["version"] == VERSION
+    assert all("placerec-client" not in locked(name) for name in ("service", "development"))
 
 
 def test_development_is_the_service_and_more() -> None:

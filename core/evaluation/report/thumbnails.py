@@ -9,6 +9,7 @@ from pathlib import Path
 from core.errors import InvalidImage
 from core.frames.containers import read_header
 from core.frames.images import decode, encode_thumbnail
+from core.recordings.pictures import sendable
 
 LONGEST = 256
 """Pixels of a small copy's longer side."""
@@ -48,7 +49,7 @@ class Thumbnails:
 
     def _shrink(self, path: Path) -> Thumbnail | None:
         try:
-            jpeg = encode_thumbnail(decode(path.read_bytes()), longest_side=LONGEST, quality=76)
+            jpeg = encode_thumbnail(decode(sendable(path.read_bytes())), longest_side=LONGEST, quality=76)
         except (OSError, InvalidImage):
             return None
         header = read_header(jpeg)

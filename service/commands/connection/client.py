@@ -7,20 +7,20 @@ take the same routes either way.
 from __future__ import annotations
 
 import asyncio
-import time
-import uuid
-from collections.abc import AsyncIterator, Coroutine
-from contextlib import AsyncExitStack, asynccontextmanager
+from collections.abc import AsyncIterator, Coroutine, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
-from urllib.parse import quote
 
 import httpx
 import typer
 
 from core.errors import DataDirectoryLocked
-from service.commands.connection.credentials import VARIABLE, given_key, headers_for, is_unencrypted
+from placerec_client import AsyncClient, PlacerecError, Problem, Retry, UnexpectedAnswer
+from placerec_client.frames import media_type
+from placerec_client.requests import Part, form, path_of
+from service.commands.connection.credentials import VARIABLE, given_key, is_unencrypted
 from service.commands.console import Failure, remark
 
 if TYPE_CHECKING:
@@ -28,11 +28,9 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-CONNECT_SECONDS, ANSWER_SECONDS = 5.0, 120.0
+ANSWER_SECONDS = 120.0
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 8.0
 PAGE = 500
-PROBLEM = "application/problem+json"
-OVERLOADED = frozenset({429, 502, 503, 504})
 
 Url = Annotated[
     str | None,
@@ -73,10 +71,18 @@ class Target:
 
 
 class Service:
-    """Requests to one service."""
+    """Requests to one service, through its client.
 
-    def __init__(self, client: httpx.AsyncClient, name: str) -> None:
-        self._client, self._name = client, name
+    Args:
+        client: which sends each request once; ``client`` of the object.
+    """
+
+    def __init__(self, client: AsyncClient) -> None:
+        self.client = client
+
+    def patient(self, seconds: float) -> AsyncClient:
+        """The client with so many seconds in which a request is repeated while the service is overloaded."""
+        return self.client.patient(Retry(seconds, FIRST_PAUSE, LONGEST_PAUSE))
 
     async def request(
         self,
@@ -84,49 +90,29 @@ class Service:
         path: str,
         *,
         patience: float = 0.0,
-        final: frozenset[str] = frozenset(),
-        headers: dict[str, str] | None = None,
+        files: Sequence[tuple[str, tuple[str | None, bytes | str, str]]] | None = None,
+        headers: Mapping[str, str] | None = None,
         **options: Any,
     ) -> httpx.Response:
-        """Send a request and return its successful answer.
+        """Send a request and return its successful answer, as the service gave it: commands show it to the last field.
 
         Args:
             path: the path at the service, such as ``/v1/maps``.
             patience: seconds for which the request is repeated, with the same id, while the service is overloaded,
                 starting, or unreachable.
-            final: problems after which it is not repeated, by the last part of their type.
-            options: as for ``httpx.AsyncClient.request``.
+            files: the parts of a form: name, file name, data, content type.
+            headers: besides those of every request.
+            options: as for the client's ``connection.request``.
 
         Raises:
             Refused: the service answers with an error.
             Failure: the service does not answer.
         """
-        until = time.monotonic() + patience
-        pause = FIRST_PAUSE
-        sent = {"X-Request-Id": uuid.uuid4().hex, **(headers or {})}
-        while True:
-            wait = pause
-            try:
-                response = await self._client.request(method, path, headers=sent, **options)
-            except httpx.InvalidURL as error:
-                raise Failure(f"{self._name} is not a URL: {error}.") from error
-            except httpx.TimeoutException as error:
-                failure: Failure = Failure(f"{self._name} did not answer in time.")
-                failure.__cause__ = error
-            except httpx.TransportError as error:
-                failure = Failure(f"{self._name} cannot be reached: {error or type(error).__name__}.")
-                failure.__cause__ = error
-            else:
-                if response.is_success:
-                    return response
-                failure = refused = refusal(response)
-                wait = retry_after(response, pause)
-                if not is_passing(response) or refused.slug in final:
-                    raise failure
-            if time.monotonic() + wait > until:
-                raise failure
-            await asyncio.sleep(wait)
-            pause = min(2 * pause, LONGEST_PAUSE)
+        if files is not None:
+            options["content"], options["media_type"] = form([_part(*one) for one in files])
+        with failures():
+            connection = self.patient(patience).connection
+            return await connection.request(method, path, headers=headers, **options)
 
     async def get(self, path: str, **options: Any) -> Any:
         """GET the JSON at ``path``; it raises what ``request`` raises."""
@@ -136,51 +122,35 @@ class Service:
         """The pages of a listing in order; it raises what ``request`` raises."""
         cursor: str | None = None
         while True:
-            more = {} if cursor is None else {"cursor": cursor}
-            page = await self.get(path, params={"limit": PAGE, **(params or {}), **more})
+            page = await self.get(path, params={"limit": PAGE, **(params or {}), "cursor": cursor})
             yield page
             cursor = page["next_cursor"]
             if cursor is None:
                 return
 
 
-def refusal(response: httpx.Response) -> Refused:
-    """The error for an unsuccessful answer."""
-    if response.headers.get("content-type", "").startswith(PROBLEM):
-        problem = response.json()
-        slug = problem["type"].rpartition(":")[2]
-        hint = f" Set {VARIABLE} to a key of this service." if slug == "key-needed" else ""
-        return Refused(response.status_code, slug, problem["detail"] + hint)
-    return Refused(
-        response.status_code, "", f"{response.url} answered {response.status_code}. Is it a placerec service?"
-    )
+def _part(name: str, content: tuple[str | None, bytes | str, str]) -> Part:
+    filename, data, kind = content
+    return Part(name, data.encode() if isinstance(data, str) else data, kind, is_file=filename is not None)
 
 
-def is_passing(response: httpx.Response) -> bool:
-    """Whether the same request may succeed in a moment.
+@contextmanager
+def failures() -> Iterator[None]:
+    """Turn the client's errors into those of the commands.
 
-    A 503 of the service without ``Retry-After`` does not pass by itself: an operator has to act.
+    Raises:
+        Refused: the service answered with an error.
+        Failure: it did not answer.
     """
-    ours = response.headers.get("content-type", "").startswith(PROBLEM)
-    return response.status_code in OVERLOADED and ("retry-after" in response.headers or not ours)
-
-
-def retry_after(response: httpx.Response, otherwise: float) -> float:
-    """Seconds to wait: what Retry-After says, or ``otherwise``."""
-    asked = response.headers.get("retry-after", "")
-    return float(asked) if asked.isdecimal() else otherwise
-
-
-def path_of(*parts: str) -> str:
-    """The path ``/v1/…`` with these parts, which are quoted."""
-    return "/v1/" + "/".join(quote(part, safe="") for part in parts)
-
-
-def media_type(data: bytes) -> str:
-    """The content type of a frame by its first bytes; image/jpeg if unknown, which the service then checks."""
-    if data.startswith(b"\x89PNG"):
-        return "image/png"
-    return "image/webp" if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else "image/jpeg"
+    try:
+        yield
+    except Problem as problem:
+        hint = f" Set {VARIABLE} to a key of this service." if problem.slug == "key-needed" else ""
+        raise Refused(problem.status, problem.slug, problem.detail + hint) from problem
+    except UnexpectedAnswer as error:
+        raise Refused(error.status, "", str(error)) from error
+    except PlacerecError as error:
+        raise Failure(str(error)) from error
 
 
 def read_bytes(path: Path) -> bytes:
@@ -202,15 +172,14 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
     Raises:
         Failure: the URL or a setting is wrong, or another process uses the data directory.
     """
-    timeout = httpx.Timeout(ANSWER_SECONDS, connect=CONNECT_SECONDS)
     if target.url is not None:
-        if not target.url.startswith(("http://", "https://")):
-            raise Failure(f"{target.url} is not a URL of a service: it has to start with http:// or https://.")
         key = given_key()
         if key is not None and is_unencrypted(target.url):
             remark(f"Warning: the key is sent to {target.url} without encryption. Use https.")
-        async with httpx.AsyncClient(base_url=target.url, timeout=timeout, headers=headers_for(key)) as client:
-            yield Service(client, target.url)
+        with failures():
+            made = AsyncClient(target.url, key=key, timeout=ANSWER_SECONDS, retry=Retry(0))
+        async with made as client:
+            yield Service(client)
         return
     # Imported here because it takes a second: torch, FAISS and the service itself.
     from service.app.application import create_app
@@ -223,9 +192,14 @@ async def open_service(target: Target) -> AsyncIterator[Service]:
             await stack.enter_async_context(application.router.lifespan_context(application))
         except DataDirectoryLocked as error:
             raise Failure(f"{error} Give --url to use the service that holds it.") from error
-        transport = httpx.ASGITransport(application)
-        client = httpx.AsyncClient(base_url="http://placerec", transport=transport, timeout=timeout)
-        yield Service(await stack.enter_async_context(client), "The service in this process")
+        client = AsyncClient(
+            "http://placerec",
+            timeout=ANSWER_SECONDS,
+            retry=Retry(0),
+            transport=httpx.ASGITransport(application),
+            name="The service in this process",
+        )
+        yield Service(await stack.enter_async_context(client))
 
 
 def read_settings(data_dir: Path | None = None) -> Settings:
@@ -266,3 +240,23 @@ def list_items(target: Target, path: str, params: dict[str, Any] | None = None) 
 def run(work: Coroutine[Any, Any, Result]) -> Result:
     """Run the asynchronous work of a command."""
     return asyncio.run(work)
+
+
+__all__ = [
+    "AsJson",
+    "DataDir",
+    "MapId",
+    "Refused",
+    "Service",
+    "Target",
+    "Url",
+    "ask",
+    "failures",
+    "list_items",
+    "media_type",
+    "open_service",
+    "path_of",
+    "read_bytes",
+    "read_settings",
+    "run",
+]

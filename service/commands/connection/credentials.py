@@ -61,11 +61,6 @@ def given_key() -> str | None:
     return _given.get()
 
 
-def headers_for(key: str | None) -> dict[str, str]:
-    """The headers that send a key."""
-    return {} if key is None else {"Authorization": f"Bearer {key}"}
-
-
 def is_unencrypted(url: str) -> bool:
     """Whether others on the network could read what is sent to a URL: it is not local and has no TLS."""
     parts = urlsplit(url)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,6 +26,19 @@ from service.commands.evaluation.saved_results import SavedOptions
 from service.commands.evaluation.systems import build_systems, parse_weights, show_list
 from service.commands.evaluation.traverses import TraverseOptions, TruthOptions, choose_training
 from service.commands.model import ModelsDir, load_image, open_catalogue
+from service.commands.recordings import (
+    PANEL,
+    EveryChange,
+    EveryDegrees,
+    EveryMetres,
+    EverySeconds,
+    LargestGap,
+    PoseTopic,
+    RecordingOptions,
+    Topic,
+    TrajectoryFile,
+    TrajectoryTimes,
+)
 
 if TYPE_CHECKING:
     from core.evaluation.cache import EvaluationCache
@@ -41,12 +55,18 @@ TRAVERSES, TRUTH, SYSTEMS, OUTPUT, FILES = (
 def evaluate(
     reference: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The known traverse: a directory of images.", rich_help_panel=TRAVERSES),
+        typer.Option(
+            metavar="DIR",
+            help="The known traverse: a directory of images, a bag or a video.",
+            rich_help_panel=TRAVERSES,
+        ),
     ] = None,
     query: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="The traverse to recognize: a directory of images.", rich_help_panel=TRAVERSES
+            metavar="DIR",
+            help="The traverse to recognize: a directory of images, a bag or a video.",
+            rich_help_panel=TRAVERSES,
         ),
     ] = None,
     dataset: Annotated[
@@ -211,13 +231,38 @@ def evaluate(
         bool,
         typer.Option("--transposed", help="The matrix has a row per reference instead.", rich_help_panel=FILES),
     ] = False,
+    topic: Topic = None,
+    query_topic: Annotated[
+        str | None, typer.Option(help="The same of the traverse to recognize.", rich_help_panel=PANEL)
+    ] = None,
+    pose_topic: PoseTopic = None,
+    query_pose_topic: Annotated[
+        str | None, typer.Option(help="The same of the traverse to recognize.", rich_help_panel=PANEL)
+    ] = None,
+    trajectory: TrajectoryFile = None,
+    query_trajectory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The same of the traverse to recognize.", rich_help_panel=PANEL),
+    ] = None,
+    trajectory_times: TrajectoryTimes = None,
+    query_trajectory_times: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The same of the traverse to recognize.", rich_help_panel=PANEL),
+    ] = None,
+    largest_gap: LargestGap = None,
+    every_metres: EveryMetres = None,
+    every_degrees: EveryDegrees = None,
+    every_seconds: EverySeconds = None,
+    every_change: EveryChange = None,
 ) -> None:
     """Evaluate place recognition on two traverses of the same places.
 
     Images of a directory (not of its subfolders) are taken in natural order; one
     that cannot be decoded stops the run. A query without a kept true reference is
     a true negative. Results are cached: a second run measures only what is new and
-    repeats the times of the first.
+    repeats the times of the first. Of bags and videos, indices are those of the
+    frames that are taken: in the order of their times, keyframes only where the
+    --every options ask for them.
     """
     truth = TruthOptions(tolerance, ground_truth, poses, metres, degrees)
     if listed:
@@ -239,7 +284,10 @@ def evaluate(
         from core.evaluation.report import check_installed
 
         check_installed()  # before what may take hours
-    options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed)
+    ways = (largest_gap, every_metres, every_degrees, every_seconds, every_change)
+    taken = RecordingOptions(topic, pose_topic, trajectory, trajectory_times, *ways)
+    asked = RecordingOptions(query_topic, query_pose_topic, query_trajectory, query_trajectory_times, *ways)
+    options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed, taken, asked)
     options.check()
     files = parse_weights(weights or [])
 
@@ -247,25 +295,26 @@ def evaluate(
     from core.evaluation.cache import EvaluationCache, default_folder
     from core.evaluation.run import Extras, compare_systems
 
-    pair = options.open()
-    lessons = choose_training(training, pair, seed)
-    systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
-    kept = EvaluationCache(None if no_cache else cache or default_folder())
-    with progress() as bar:
-        extras = Extras(scalability, severity, seed, map_sizes=report is not None)
-        comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras)
-    _show(comparison, kept)
-    by_name = {run.about.name: run for run in comparison.runs}
-    runs = [by_name[system.about.name] for system in systems]  # in the order of the command line
-    if json_file is not None:
-        write_json(json_file, comparison_json(comparison, runs))
-    if results is not None:
-        write_results(results, [(run.identity, run.outcomes) for run in runs])
-    if report is not None:
-        from core.evaluation.report import write_report
+    with ExitStack() as stack:
+        pair = options.open(stack, encoder[0] if encoder else None)
+        lessons = choose_training(training, pair, seed)
+        systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
+        kept = EvaluationCache(None if no_cache else cache or default_folder())
+        with progress() as bar:
+            extras = Extras(scalability, severity, seed, map_sizes=report is not None)
+            comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras)
+        _show(comparison, kept)
+        by_name = {run.about.name: run for run in comparison.runs}
+        runs = [by_name[system.about.name] for system in systems]  # in the order of the command line
+        if json_file is not None:
+            write_json(json_file, comparison_json(comparison, runs))
+        if results is not None:
+            write_results(results, [(run.identity, run.outcomes) for run in runs])
+        if report is not None:
+            from core.evaluation.report import write_report
 
-        write_report(report, comparison)
-        remark(f"The report is written: {report / 'index.html'}")
+            write_report(report, comparison)
+            remark(f"The report is written: {report / 'index.html'}")
 
 
 class _Bar:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import tempfile
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
+from rich.markup import escape
 
 from core.frames.traverses import (
     Truth,
@@ -16,6 +19,8 @@ from core.frames.traverses import (
     read_kept_references,
     tolerance_truth,
 )
+from service.commands.console import progress
+from service.commands.recordings import RecordingOptions
 
 if TYPE_CHECKING:
     from core.evaluation.data.pairs import TraversePair
@@ -69,7 +74,7 @@ class TruthOptions:
 
 @dataclass(frozen=True)
 class TraverseOptions:
-    """Two directories and their truth, or a data set in a directory."""
+    """Two recordings and their truth, or a data set in a directory."""
 
     reference: Path | None
     query: Path | None
@@ -79,6 +84,8 @@ class TraverseOptions:
     reduced: bool
     limit_references: Path | None
     seed: int
+    reference_frames: RecordingOptions
+    query_frames: RecordingOptions
 
     def check(self) -> None:
         """Check that the options go together.
@@ -99,8 +106,12 @@ class TraverseOptions:
         elif self.reduced and self.limit_references is not None:
             raise typer.BadParameter("--reduced and --limit-references both choose the references to keep: give one")
 
-    def open(self) -> TraversePair:
+    def open(self, stack: ExitStack, encoder: str | None) -> TraversePair:
         """The traverses.
+
+        Args:
+            stack: closes the folders into which the frames of bags and videos are written.
+            encoder: by which keyframes are chosen where ``--every-change`` is given; None for the default.
 
         Raises:
             InvalidTraverse, InvalidGroundTruth: something is missing or malformed.
@@ -113,13 +124,29 @@ class TraverseOptions:
             pair = open_dataset(find_dataset(self.dataset), self.data, self.reduced, self.seed)
         else:
             assert self.reference is not None and self.query is not None, "checked"
-            references, queries = find_images(self.reference), find_images(self.query)
+            references = _images(self.reference, self.reference_frames, stack, encoder)
+            queries = _images(self.query, self.query_frames, stack, encoder)
             truth, kept = self.truth.of_images(queries, references), all_references(references)
             pair = TraversePair(name_pair(self.reference, self.query), references, queries, truth, kept)
         if self.limit_references is None:
             return pair
         kept = read_kept_references(self.limit_references, len(pair.references))
         return TraversePair(pair.name, pair.references, pair.queries, pair.truth, kept, pair.notes)
+
+
+def _images(path: Path, options: RecordingOptions, stack: ExitStack, encoder: str | None) -> list[Path]:
+    """The images of a directory, or the frames of a recording, written into a folder that ``stack`` removes."""
+    if path.is_dir() and options == RecordingOptions():
+        from core.recordings.bag import bag_files
+
+        if not bag_files(path):
+            return find_images(path)
+    from core.recordings.extraction import extract
+
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="placerec-")))
+    with options.open(path) as recording, progress() as bar:
+        chosen = options.choose(recording, encoder)
+        return extract(bar.track(chosen, description=f"Reading {escape(path.name)}"), folder)
 
 
 def name_pair(reference: Path, query: Path) -> str:

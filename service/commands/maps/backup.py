@@ -30,7 +30,7 @@ from service.commands.connection.client import (
 )
 from service.commands.console import Commands, Failure, complain, remark, show, table
 from service.commands.jobs import Wait, check_outlives, followed, show_outcome
-from service.commands.maps.transfers import PARTIAL, check_file, download, settle, upload
+from service.commands.maps.transfers import check_file, download, upload
 
 backup = typer.Typer(cls=Commands, help="Save all maps in a folder, verify them, restore them.", no_args_is_help=True)
 
@@ -53,14 +53,12 @@ def export(
     """Save a map as a file. An interrupted download continues when the command is run again."""
     if file.exists() and not overwrite:
         raise Failure(f"{file} already exists. Give --overwrite to replace it.")
-    partial = file.with_name(file.name + PARTIAL)
 
     async def work() -> str | None:
         async with open_service(Target(url, data_dir)) as service:
-            return await download(service, map_id, partial)
+            return await download(service, map_id, file, overwrite=overwrite)
 
     tag = run(work())
-    settle(partial, file)
     remark(f"The map {map_id} is in {file}; the SHA-256 of its manifest is {tag}.")
 
 
@@ -178,13 +176,13 @@ async def _save(service: Service, folder: Path, index: Index, map_id: str) -> No
         with suppress(Failure):  # a missing or damaged file is written again
             check_file(folder / before.file, before.manifest_sha256)
             known = before.manifest_sha256
-    partial = folder / f"{map_id}{PARTIAL}"
-    tag = await download(service, map_id, partial, known)
+    downloaded = folder / map_id
+    tag = await download(service, map_id, downloaded, known, overwrite=True)
     if tag is None:
         remark(f"{map_id}: unchanged.")
         return
     file = folder / f"{map_id}.{tag[:16]}.tar"
-    settle(partial, file)
+    _rename(downloaded, file)
     archive = _manifest_of(file)
     entry = Entry(
         id=map_id,
@@ -197,6 +195,17 @@ async def _save(service: Service, folder: Path, index: Index, map_id: str) -> No
     index.maps = sorted([*(one for one in index.maps if one.id != map_id), entry], key=lambda one: one.id)
     _write_index(folder, index)
     remark(f"{map_id}: {entry.places} places in {file.name}.")
+
+
+def _rename(downloaded: Path, file: Path) -> None:
+    """Give a complete file its name, and sync the folder."""
+    from core.disk.files import sync_folder
+
+    try:
+        downloaded.replace(file)
+        sync_folder(file.absolute().parent)
+    except OSError as error:
+        raise Failure(f"{file} cannot be written: {error.strerror}.") from error
 
 
 def _manifest_of(file: Path) -> Any:

@@ -13,6 +13,7 @@ from core.judgement.calibration import (
     BLOCKS,
     MOST_POINTS,
     Target,
+    adjust_calibration,
     blocks_of,
     cross_validated,
     curve_points,
@@ -271,3 +272,27 @@ def test_trials_are_the_same_as_json() -> None:
     for wrong in ({}, trials.record() | {"right": [True]}, trials.record() | {"frame": ["x"]}):
         with pytest.raises((KeyError, TypeError, ValueError)):
             Trials.of_record(wrong)  # type: ignore[arg-type]
+
+
+def test_doubtful_labels_make_the_probabilities_of_all_answers_better() -> None:
+    base = BASE.model_copy(update={"curve": Curve(slope=60, intercept=-3)})  # too sure, for this environment
+    asked, held_out = drawn(60), drawn(500, seed=1)
+    doubtful = asked.take(~asked.recognized(base))
+    found = adjust_calibration(doubtful, base, "labels")
+    errors = [float(np.mean((held_out.probabilities(one) - held_out.right) ** 2)) for one in (base, found.calibration)]
+    assert errors[1] < 0.8 * errors[0]
+    after = found.calibration
+    assert after.curve is not None and base.curve is not None
+    assert after.curve.probability(after.threshold) == pytest.approx(base.curve.probability(base.threshold))
+    assert (after.margin, after.source, after.frames) == (base.margin, "labels", len(np.unique(doubtful.frame)))
+    assert found.measurement.trials == len(doubtful)
+
+
+def test_a_calibration_is_not_adjusted_to_next_to_nothing() -> None:
+    few = drawn(60).take(np.arange(120) < 9)
+    with pytest.raises(CalibrationImpossible, match="at least 10 labelled frames; here are 9"):
+        adjust_calibration(few, BASE.model_copy(update={"curve": LAW}), "labels")
+    with pytest.raises(CalibrationImpossible, match="no curve"):
+        adjust_calibration(drawn(60), BASE, "labels")
+    wrong = drawn(60).take(~drawn(60).right)
+    assert adjust_calibration(wrong, BASE.model_copy(update={"curve": LAW}), "labels").measurement.right == 0

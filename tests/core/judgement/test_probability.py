@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.linear_model import LogisticRegression
 
-from core.judgement.probability import Curve, fit_curve
+from core.judgement.probability import STRETCH, Curve, fit_curve, moved_curve
 
 SLOPES = st.floats(1e-3, 1e4)
 DECISIONS = st.floats(-1e6, 1e6)
@@ -78,3 +78,45 @@ def test_shares_count_as_repetitions_do() -> None:
 def test_outcomes_that_tell_nothing(decisions: list[float], right: list[bool], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         fit_curve(decisions, right)
+
+
+def moved(curve: Curve, decisions: np.ndarray, right: np.ndarray, factor: float = 1.0) -> Curve:
+    return moved_curve(curve, decisions, np.zeros(len(decisions)), right, np.full(len(decisions), factor))
+
+
+def test_many_outcomes_move_a_curve_to_their_own() -> None:
+    law = Curve(slope=40, intercept=-5)
+    decisions, right = drawn(4000, law)
+    found = moved(Curve(slope=60, intercept=-4, imagined_slope=6, imagined_intercept=1), decisions, right)
+    assert found.slope == pytest.approx(40, rel=0.1) and found.intercept == pytest.approx(-5, abs=0.4)
+    assert found.imagined_slope == pytest.approx(found.slope / 10)
+
+
+def test_outcomes_as_expected_do_not_move_a_curve_and_few_move_it_little() -> None:
+    law = Curve(slope=40, intercept=-5)
+    decisions, right = drawn(4000, law)
+    same = moved(law, decisions, right)
+    assert same.slope == pytest.approx(40, rel=0.06) and same.intercept == pytest.approx(-5, abs=0.3)
+    none = moved(law, np.empty(0), np.empty(0, np.bool_))
+    assert (none.slope, none.intercept) == pytest.approx((40, -5), abs=1e-3)
+    one = moved(law, np.array([0.3]), np.array([False]))
+    assert one.slope > 40 * np.exp(-3 * STRETCH) and one.probability(0.3) < law.probability(0.3)
+
+
+@given(st.lists(st.tuples(st.floats(0, 0.5), st.booleans()), max_size=30), st.floats(0.5, 1))
+def test_whatever_the_outcomes_a_curve_is_a_curve(outcomes: list[tuple[float, bool]], factor: float) -> None:
+    decisions, right = np.array([d for d, _ in outcomes]), np.array([r for _, r in outcomes], np.bool_)
+    found = moved(Curve(slope=40, intercept=-5), decisions, right, factor)
+    assert found.slope > 0 and np.isfinite(found.intercept)
+    if len(outcomes) and not right.any():
+        assert found.probability(0.2) <= Curve(slope=40, intercept=-5).probability(0.2) + 1e-3
+
+
+def test_a_curve_is_not_biased_by_frames_that_were_chosen_by_their_answers() -> None:
+    """Of an environment where answers are less often right, only the doubtful ones are labelled."""
+    law = Curve(slope=60, intercept=-9)
+    decisions, right = drawn(30_000, law)
+    doubtful = decisions < 0.16
+    found = moved(Curve(slope=60, intercept=-6), decisions[doubtful], right[doubtful])
+    where = np.linspace(0, 0.3, 50)
+    assert np.abs(found.probabilities(where) - law.probabilities(where)).max() < 0.06

@@ -240,3 +240,18 @@ def test_a_first_key_may_lock_everybody_out_if_that_is_said(tmp_path: Path) -> N
             assert_problem(robot.get("/v1/keys"), 403, "role-too-low")
     finally:
         assert server.stop() == 0
+
+
+def test_other_machines_cannot_create_the_first_key(tmp_path: Path) -> None:
+    # Written like this the address does not count as this machine's own, although it is.
+    server = Server(tmp_path, settings={"host": "127.1", "allow_anonymous": "true"}).wait()
+    try:
+        body = {"name": "ops", "role": "admin"}
+        assert_problem(server.client.post("/v1/keys", json=body), 403, "first-key-local")
+        assert server.client.get("/v1/maps").status_code == 200
+        _, token = KeyStore(server.data_dir).create("ops", "admin")
+        with asking(server, token) as ops:
+            assert eventually(lambda: ops.get("/v1/key").json().get("keys_needed") is True)
+            assert ops.post("/v1/keys", json={"name": "other", "role": "query"}).status_code == 201
+    finally:
+        assert server.stop() == 0

@@ -17,7 +17,7 @@ import httpx
 import pytest
 from PIL import ExifTags, Image
 
-from service.commands.connection.batches import FIRST_BATCH
+from placerec_client.batches import FIRST_BATCH
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene
 from tests.service.server import ROOT, Server
@@ -189,7 +189,7 @@ class FullAfterOne(http.server.BaseHTTPRequestHandler):
         type(self).taken += 1
         if self.taken == 1:
             items = [{"id": None, "status": 201, "change": "created"}] * frames
-            self.answer(200, "application/json", {"items": items})
+            self.answer(200, "application/json", {"items": items, "encoder": "any"})
         else:
             problem = {"type": "urn:placerec:problem:storage-full", "detail": "The disk is full."}
             self.answer(507, "application/problem+json", problem)

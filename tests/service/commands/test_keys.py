@@ -6,14 +6,14 @@ import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-import httpx
 import pytest
 import typer.main
 
+from placerec_client.problems import KeyNeeded
 from service.access.keys import KeyStore
 from service.access.roles import TOKEN
 from service.commands import application
-from service.commands.connection.client import Refused, refusal
+from service.commands.connection.client import Refused, failures
 from service.commands.connection.credentials import is_unencrypted
 from service.commands.console import Failure
 from service.commands.keys import moment
@@ -105,10 +105,8 @@ def test_a_url_without_encryption() -> None:
 
 
 def test_a_refusal_names_the_variable() -> None:
-    problem = {"type": "urn:placerec:problem:key-needed", "detail": "A key."}
-    answer = httpx.Response(401, json=problem, headers={"Content-Type": "application/problem+json"})
-    found = refusal(answer)
-    assert isinstance(found, Refused) and "PLACEREC_KEY" in str(found)
+    with pytest.raises(Refused, match="PLACEREC_KEY"), failures():
+        raise KeyNeeded({"type": "urn:placerec:problem:key-needed", "detail": "A key."}, 401)
 
 
 def test_the_load_carries_the_key() -> None:

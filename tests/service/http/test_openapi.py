@@ -25,6 +25,7 @@ OPERATIONS = {
     "compare_traverses", "calibrate_map", "reencode_map", "check_health", "align_map", "prune_map", "merge_map",
     "rebuild_map", "fill_keypoints",
     "export_map", "import_map",
+    "list_review", "see_review_picture", "label_frame", "export_labels",
     "list_jobs", "read_job", "follow_job", "cancel_job",
     "encode", "regions", "match", "list_encoders",
     "read_own_key", "list_keys", "create_key", "read_key", "narrow_key", "revoke_key", "read_audit", "read_service",

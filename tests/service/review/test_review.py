@@ -218,12 +218,16 @@ def test_labels_calibrate_the_map(reviewed: Server) -> None:
     alone = calibrate(beside="none").json()
     assert alone["measurement"]["frames"] == 26 and alone["measurement"]["known"] == 24, alone
     assert alone["calibration"]["source"] == "labels" and not alone["stored"] and alone["warnings"]
-    both = calibrate().json()
+    both = calibrate(beside="map").json()
     assert both["measurement"]["frames"] == 26 + 25
+    adjusted = calibrate().json()
+    assert adjusted["measurement"]["trials"] == 26, "each frame is asked once, of the map as it is"
+    before, after = adjusted["previous"], adjusted["calibration"]
+    assert after["margin"] == before["margin"] and after["curve"] != before["curve"]
     job = calibrate(background=True, dry_run=False)
     assert job.status_code == 202
     done = finished(reviewed, job.json())
-    assert done["state"] == "succeeded" and done["result"]["measurement"]["frames"] == 51
+    assert done["state"] == "succeeded" and done["result"]["calibration"] == after
     assert reviewed.client.get("/v1/maps/hall").json()["calibration"]["source"] == "labels"
     reviewed.client.delete("/v1/maps/hall/places/p3")
     assert calibrate(beside="none").json()["measurement"]["frames"] == 25, "a place that is gone is no truth"

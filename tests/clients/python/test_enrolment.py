@@ -10,12 +10,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.commands.connection import batches
-from service.commands.connection.batches import Outcome, enrol_frames
-from service.commands.connection.client import Refused, Service
-from service.commands.console import Failure
-from service.commands.traverse import Frame
-from tests.service.commands.connection.test_client import problem
+from placerec_client import AsyncClient, ConnectionFailed, Enrolled, NewPlace, Retry, batches, problems
+from tests.clients.python.test_retries import problem
 from tests.service.map_jobs import wait_until
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -57,33 +53,33 @@ class Mischief(httpx.AsyncBaseTransport):
         await self._way.aclose()
 
 
-def enrol(server: Server, map_id: str, folder: Path, count: int, way: Mischief) -> list[Outcome]:
-    frames = []
-    for index in range(count):
-        (folder / f"{index}.jpg").write_bytes(jpeg(index, 64, 48))
-        frames.append(Frame(folder / f"{index}.jpg", f"p{index}", "walk", listed=True))
-    told: list[Outcome] = []
+def enrol(server: Server, map_id: str, count: int, way: Mischief, patience: float = 120) -> list[Enrolled]:
+    places = (NewPlace(f"p{index}", jpeg(index, 64, 48), {"sequence": "walk"}) for index in range(count))
+    told: list[Enrolled] = []
 
     async def work() -> None:
-        async with httpx.AsyncClient(transport=way, base_url=server.client.base_url, timeout=60) as client:
-            await enrol_frames(Service(client, "The service"), map_id, frames, frozenset(), None, told.append)
+        retry = Retry(patience, first_pause=0.05)
+        async with AsyncClient(str(server.client.base_url), transport=way, retry=retry) as client:
+            async for one in client.maps[map_id].enrol(places, known=()):
+                told.append(one)  # noqa: PERF401 # what was told before an error counts
 
     try:
         asyncio.run(work())
     finally:
-        assert [one.frame.id for one in told] == [f"p{index}" for index in range(len(told))]
+        assert [one.place.id for one in told] == [f"p{index}" for index in range(len(told))]
     return told
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Batches that are so small that a few frames make many."""
     monkeypatch.setattr(batches, "FIRST_BATCH", 4)
     monkeypatch.setattr(batches, "LARGEST_BATCH", 4)
 
 
-def test_two_at_a_time_in_line(server: Server, map_id: str, tmp_path: Path) -> None:
+def test_two_at_a_time_in_line(server: Server, map_id: str) -> None:
     way = Mischief({})
-    told = enrol(server, map_id, tmp_path, 26, way)
+    told = enrol(server, map_id, 26, way)
     assert list(server.places(map_id)) == [f"p{index}" for index in range(26)]
     assert {one.change for one in told} == {"created"} and len(told) == 26
     assert way.most == 2 and len(way.sent) == 7
@@ -91,7 +87,7 @@ def test_two_at_a_time_in_line(server: Server, map_id: str, tmp_path: Path) -> N
     assert [line.get("after") for line in way.sent] == [None, None, *names[1:-1]]
 
 
-def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, map_id: str, tmp_path: Path) -> None:
+def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, map_id: str) -> None:
     way = Mischief(
         {
             3: problem(503, "queue-full", **{"Retry-After": "0"}),
@@ -100,43 +96,42 @@ def test_refused_for_a_moment_unreachable_lost_and_out_of_line(server: Server, m
         },
         lost=[5, 9],
     )
-    told = enrol(server, map_id, tmp_path, 60, way)
+    told = enrol(server, map_id, 60, way)
     assert list(server.places(map_id)) == [f"p{index}" for index in range(60)]
     assert {one.change for one in told} <= {"created", "unchanged"} and len(told) == 60
     assert len(way.sent) > 15  # those that were sent once more
 
 
-def test_more_than_the_service_takes_at_a_time(server: Server, map_id: str, tmp_path: Path) -> None:
+def test_more_than_the_service_takes_at_a_time(server: Server, map_id: str) -> None:
     way = Mischief({4: problem(413, "body-too-large"), 8: problem(503, "deadline-exceeded", **{"Retry-After": "1"})})
-    assert len(enrol(server, map_id, tmp_path, 30, way)) == 30
+    assert len(enrol(server, map_id, 30, way)) == 30
     assert list(server.places(map_id)) == [f"p{index}" for index in range(30)]
 
 
 @pytest.mark.parametrize("failing", [1, 2, 4])
-def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, tmp_path: Path, failing: int) -> None:
+def test_what_comes_after_a_failure_is_not_stored(server: Server, map_id: str, failing: int) -> None:
     way = Mischief({failing: problem(507, "storage-full")})
-    with pytest.raises(Refused, match="It is storage-full"):
-        enrol(server, map_id, tmp_path, 40, way)
+    with pytest.raises(problems.StorageFull, match="It is storage-full"):
+        enrol(server, map_id, 40, way)
     assert len(way.sent) <= failing + 1
     before = 4 * (failing - 1)
     assert list(server.places(map_id)) == [f"p{index}" for index in range(before)]
     # The same again goes on.
-    enrol(server, map_id, tmp_path, 40, Mischief({}))
+    enrol(server, map_id, 40, Mischief({}))
     assert list(server.places(map_id)) == [f"p{index}" for index in range(40)]
 
 
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("moment", [9, 20])
-def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int) -> None:
-    monkeypatch.setattr(batches, "PATIENCE", 0.0)
+def test_a_kill_leaves_the_beginning(tmp_path: Path, moment: int) -> None:
     server = Server(tmp_path / "service").wait()
     server.create_map("walk")
     way, ended = Mischief({}), list[BaseException]()
 
     def send() -> None:
         try:
-            enrol(server, "walk", tmp_path, 96, way)
-        except Failure as error:
+            enrol(server, "walk", 96, way, patience=0)
+        except ConnectionFailed as error:
             ended.append(error)
 
     sender = threading.Thread(target=send)
@@ -148,6 +143,6 @@ def test_a_kill_leaves_the_beginning(tmp_path: Path, monkeypatch: pytest.MonkeyP
     server = Server(tmp_path / "service").wait()
     kept = list(server.places("walk"))
     assert kept == [f"p{index}" for index in range(len(kept))] and 4 * (moment - 2) <= len(kept) < 96
-    enrol(server, "walk", tmp_path, 96, Mischief({}))
+    enrol(server, "walk", 96, Mischief({}))
     assert list(server.places("walk")) == [f"p{index}" for index in range(96)]
     assert server.stop() == 0

@@ -1,0 +1,57 @@
+"""Waiting and working at the same time, for the asynchronous half; ``_sync/concurrency.py`` is its twin."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from websockets.asyncio.client import ClientConnection
+
+Result = TypeVar("Result")
+
+
+async def sleep(seconds: float) -> None:
+    """Wait so long."""
+    await asyncio.sleep(seconds)
+
+
+async def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
+    """The result of work that blocks, such as reading files."""
+    return await asyncio.to_thread(work, *arguments)
+
+
+class Task(Generic[Result]):
+    """Work that goes on while other things are done."""
+
+    def __init__(self, work: Callable[[], Awaitable[Result]]) -> None:
+        async def run() -> Result:
+            return await work()
+
+        self._task = asyncio.create_task(run())
+
+    async def result(self) -> Result:
+        """Wait for the end of the work; return its result or raise its error."""
+        await asyncio.wait({self._task})
+        return self._task.result()
+
+    async def end(self) -> None:
+        """Break the work off, whatever comes of it."""
+        self._task.cancel()
+        await asyncio.wait({self._task})
+        if not self._task.cancelled():
+            self._task.exception()  # seen, so that nobody is told that it was not
+
+
+Lock = asyncio.Lock
+
+
+async def received(socket: ClientConnection, seconds: float) -> str | bytes:
+    """The next message of a WebSocket.
+
+    Raises:
+        TimeoutError: none has come.
+    """
+    async with asyncio.timeout(seconds):
+        return await socket.recv()

@@ -1,0 +1,250 @@
+"""Requests to one service: sent, sent again where that may help, and their answers or errors."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from typing import Any, TypeVar
+
+from placerec_client._async.concurrency import sleep
+from placerec_client._async.lanes import AsyncLanes
+from placerec_client._http import httpx
+from placerec_client.answers import UNKNOWN_OUTCOME, is_passing, parsed, refusal, retry_after
+from placerec_client.errors import ConnectionFailed, DeadlineExceeded, PlacerecError, Problem
+from placerec_client.model import Model
+from placerec_client.requests import dumps, query_string
+from placerec_client.retry import Clock, Retry
+from placerec_client.version import VERSION
+
+Answer = TypeVar("Answer", bound=Model)
+Content = bytes | Callable[[], AsyncIterator[bytes]] | None
+"""A body, or what makes it piece by piece for each attempt."""
+
+CONNECT_SECONDS = 5.0
+IDLE_SECONDS = 30.0
+"""How long a connection is kept without a request; the service keeps it for longer."""
+
+SILENCE_SECONDS = 30.0
+"""After how long a stream without a byte is taken for lost; the service sends a comment every ten seconds."""
+
+LEAST_SECONDS, MOST_SECONDS = 0.001, 3600.0
+"""Bounds of X-Request-Timeout."""
+
+PAGE = 500
+"""Items of one page of a listing, if the caller does not say."""
+
+KNOWN_URLS = 1000
+
+
+class AsyncConnection:
+    """The connection to a service, which all objects of one client share.
+
+    Args:
+        url: of the service.
+        key: that is sent with every request; None for none.
+        timeout: seconds to wait for one answer.
+        retry: when a request is sent again.
+        transport: of httpx, instead of the network.
+
+    Raises:
+        ConnectionFailed: the URL is none of a service.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        key: str | None,
+        timeout: float,
+        retry: Retry,
+        transport: httpx.AsyncBaseTransport | None,
+        name: str | None = None,
+    ) -> None:
+        if not url.startswith(("http://", "https://")):
+            raise ConnectionFailed(f"{url} is not a URL of a service: it has to start with http:// or https://.")
+        self.url, self.name, self.timeout, self.retry = url.rstrip("/"), name or url, timeout, retry
+        try:
+            parsed_url = httpx.URL(self.url)
+        except (httpx.InvalidURL, ValueError) as error:
+            raise ConnectionFailed(f"{url} is not a URL: {error}.") from error
+        self._transport = transport or AsyncLanes(parsed_url, IDLE_SECONDS)
+        self.headers = [
+            (b"Host", parsed_url.netloc),
+            (b"Accept", b"*/*"),
+            (b"User-Agent", f"placerec-client/{VERSION}".encode()),
+        ]
+        if key is not None:
+            self.headers.append((b"Authorization", f"Bearer {key}".encode("ascii", "replace")))
+        self._urls: dict[str, httpx.URL] = {}
+
+    def patient(self, retry: Retry) -> AsyncConnection:
+        """The same connection with another rule of when a request is sent again."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__, retry=retry)
+        return other
+
+    def lasting(self, patience: float) -> AsyncConnection:
+        """The same connection with this patience at least, if it has any."""
+        retry = self.retry
+        return self.patient(replace(retry, patience=max(patience, retry.patience))) if retry.patience else self
+
+    async def close(self) -> None:
+        """Close all connections."""
+        await self._transport.aclose()
+
+    async def request(
+        self,
+        method: str,
+        path: str,
+        *,
+        params: Mapping[str, Any] | None = None,
+        content: Content = None,
+        json: Any = None,
+        media_type: str | None = None,
+        headers: Mapping[str, str] | None = None,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        final: frozenset[str] = frozenset(),
+        accepted: tuple[int, ...] = (),
+    ) -> httpx.Response:
+        """Send a request and return its successful answer.
+
+        Args:
+            path: the path at the service, such as ``/v1/maps``.
+            params: of the query string; those that are None are left out.
+            content: the body, or what makes its pieces anew for each attempt.
+            json: a body instead, as JSON.
+            media_type: of the body.
+            deadline: seconds from now after which an answer is of no use. The service is told, and drops the request
+                when it is over. None: only ``timeout`` and the patience of ``retry`` hold.
+            request_id: of all attempts; made if left out.
+            final: slugs of problems after which the request is not sent again.
+            accepted: statuses besides 2xx that are returned, not raised.
+
+        Raises:
+            Problem: the service answers with a problem.
+            ConnectionFailed, DeadlineExceeded, UnexpectedAnswer: no answer of a service came, or none in time.
+        """
+        if json is not None:
+            content, media_type = dumps(json).encode(), "application/json"
+        sent = [*self.headers, (b"X-Request-Id", (request_id or uuid.uuid4().hex).encode())]
+        if media_type is not None:
+            sent.append((b"Content-Type", media_type.encode()))
+        if isinstance(content, bytes):
+            sent.append((b"Content-Length", b"%d" % len(content)))
+        elif content is None and method in ("POST", "PUT", "PATCH"):
+            sent.append((b"Content-Length", b"0"))
+        for name, value in (headers or {}).items():
+            sent.append((name.encode(), value.encode()))
+        url = self.url_of(path + query_string(params) if params else path)
+        clock = Clock(deadline, self.retry)
+        while True:
+            outcome = await self._attempt(method, url, sent, content, clock)
+            if isinstance(outcome, httpx.Response):
+                if outcome.is_success or outcome.status_code in accepted:
+                    outcome.extensions["after_loss"] = clock.lost
+                    return outcome
+                failure: PlacerecError = refusal(outcome, clock.lost)
+                if not is_passing(outcome) or (isinstance(failure, Problem) and failure.slug in final):
+                    raise failure
+                clock.lost = clock.lost or outcome.status_code in UNKNOWN_OUTCOME
+                wait = max(self.retry.pause(clock.attempts), retry_after(outcome) or 0.0)
+            else:
+                failure, wait = outcome, self.retry.pause(clock.attempts)
+            if not clock.allows(wait):
+                raise self._given_up(clock, failure)
+            await sleep(wait)
+
+    async def _attempt(
+        self, method: str, url: httpx.URL, headers: list[tuple[bytes, bytes]], content: Content, clock: Clock
+    ) -> httpx.Response | PlacerecError:
+        """One attempt: its answer, or why there is none."""
+        clock.attempts += 1
+        left = clock.left()
+        limit = self.timeout
+        if left is not None:
+            if left < LEAST_SECONDS:
+                return DeadlineExceeded(f"{self.name} did not answer within {clock.deadline:g} s.")
+            limit = min(limit, left)
+            headers = [*headers, (b"X-Request-Timeout", f"{min(left, MOST_SECONDS):.3f}".encode())]
+        times = {"connect": min(CONNECT_SECONDS, limit), "read": limit, "write": limit, "pool": limit}
+        body = content() if callable(content) else content
+        request = httpx.Request(method, url, headers=headers, content=body, extensions={"timeout": times})
+        try:
+            response = await self._transport.handle_async_request(request)
+            response.request = request
+            try:
+                await response.aread()
+            finally:
+                await response.aclose()
+            return response
+        except (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout) as error:
+            return self._failure("cannot be reached", error)
+        except httpx.TimeoutException as error:
+            clock.lost = True
+            return self._failure("did not answer in time", error)
+        except httpx.HTTPError as error:
+            clock.lost = True
+            return self._failure("cannot be reached", error)
+
+    def _failure(self, what: str, error: Exception) -> ConnectionFailed:
+        reason = f": {error or type(error).__name__}" if what == "cannot be reached" else ""
+        failure = ConnectionFailed(f"{self.name} {what}{reason}.")
+        failure.__cause__ = error
+        return failure
+
+    def _given_up(self, clock: Clock, failure: PlacerecError) -> PlacerecError:
+        """The error after the last attempt: that of the attempt, or that the deadline is over."""
+        if clock.deadline is None or isinstance(failure, DeadlineExceeded):
+            return failure
+        exceeded = DeadlineExceeded(f"{self.name} did not answer within {clock.deadline:g} s: {failure}")
+        exceeded.__cause__ = failure
+        return exceeded
+
+    def url_of(self, path: str) -> httpx.URL:
+        """The URL of a path with its query string; parsing one takes time, so those that come again are kept."""
+        found = self._urls.get(path)
+        if found is None:
+            if len(self._urls) >= KNOWN_URLS:
+                self._urls.clear()
+            found = self._urls[path] = httpx.URL(self.url + path)
+        return found
+
+    async def ask(self, model: type[Answer], method: str, path: str, **options: Any) -> Answer:
+        """Send a request and return the model of its answer; it raises what ``request`` raises."""
+        return parsed(model, (await self.request(method, path, **options)).content)
+
+    async def pages(self, model: type[Answer], path: str, params: Mapping[str, Any]) -> AsyncIterator[Answer]:
+        """The pages of a listing in order; it raises what ``request`` raises."""
+        cursor: str | None = None
+        while True:
+            page = await self.ask(model, "GET", path, params={"limit": PAGE, **params, "cursor": cursor})
+            yield page
+            cursor = getattr(page, "next_cursor", None)
+            if cursor is None:
+                return
+
+    @asynccontextmanager
+    async def stream(self, path: str, headers: Mapping[str, str]) -> AsyncIterator[httpx.Response]:
+        """The answer to a GET whose body is read as it comes; it is sent once.
+
+        Raises:
+            Problem, ConnectionFailed, UnexpectedAnswer: it is no success, or none came.
+        """
+        sent = [*self.headers, *((name.encode(), value.encode()) for name, value in headers.items())]
+        limit = min(self.timeout, SILENCE_SECONDS)
+        times = {"connect": CONNECT_SECONDS, "read": limit, "write": limit, "pool": limit}
+        request = httpx.Request("GET", self.url_of(path), headers=sent, extensions={"timeout": times})
+        try:
+            response = await self._transport.handle_async_request(request)
+            response.request = request
+            try:
+                if not response.is_success:
+                    await response.aread()
+                    raise refusal(response)
+                yield response
+            finally:
+                await response.aclose()
+        except httpx.HTTPError as error:
+            raise self._failure("cannot be reached", error) from error

@@ -1,0 +1,66 @@
+"""The keys of a service."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Literal, Unpack
+
+from placerec_client import models, parameters
+from placerec_client._async.connection import AsyncConnection
+from placerec_client.requests import quoted
+
+
+class AsyncKeys:
+    """The keys of a service; iterated, all that were ever created, without their secrets. They need the role admin."""
+
+    def __init__(self, connection: AsyncConnection) -> None:
+        self._connection, self._path = connection, "/v1/keys"
+
+    def __aiter__(self) -> AsyncIterator[models.KeyView]:
+        return self.list()
+
+    async def list(self) -> AsyncIterator[models.KeyView]:
+        """Yield the keys."""
+        async for page in self._connection.pages(models.KeyPage, self._path, {}):
+            for item in page.items:
+                yield item
+
+    async def create(
+        self,
+        name: str,
+        role: Literal["query", "enrol", "admin"],
+        *,
+        lock_out: bool | None = None,
+        **options: Unpack[parameters.NewKey],
+    ) -> models.CreatedKey:
+        """Create a key; its secret is in this answer only.
+
+        Args:
+            name: whose key it is.
+            role: what it may do.
+            lock_out: whether it may be that nobody has the role admin afterwards.
+            options: such as ``maps`` and ``expires_at``.
+        """
+        body = {"name": name, "role": role, **options}
+        return await self._connection.ask(
+            models.CreatedKey, "POST", self._path, params={"lock_out": lock_out}, json=body
+        )
+
+    async def read(self, key_id: str) -> models.KeyView:
+        """Return one key."""
+        return await self._connection.ask(models.KeyView, "GET", self._of(key_id))
+
+    async def narrow(
+        self, key_id: str, changes: parameters.KeyChanges, *, lock_out: bool | None = None
+    ) -> models.KeyView:
+        """Let a key do less, or for a shorter time; what is left out stays."""
+        return await self._connection.ask(
+            models.KeyView, "PATCH", self._of(key_id), params={"lock_out": lock_out}, json=changes
+        )
+
+    async def revoke(self, key_id: str, *, lock_out: bool | None = None) -> models.KeyView:
+        """Revoke a key, so that nobody is let in with it."""
+        return await self._connection.ask(models.KeyView, "DELETE", self._of(key_id), params={"lock_out": lock_out})
+
+    def _of(self, key_id: str) -> str:
+        return f"{self._path}/{quoted(key_id)}"

@@ -1,0 +1,77 @@
+"""Connections to the service, one for each request that is under way at a time.
+
+httpx's pool looks at all of its connections whenever a request begins or ends; with many requests at a time that takes
+longer than the requests themselves.  Here every request has a transport of its own, which has one connection, and is
+lent to the next request afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from urllib.request import getproxies, proxy_bypass
+
+from placerec_client._http import httpx
+
+
+class AsyncLanes(httpx.AsyncBaseTransport):
+    """A transport of httpx to one service.
+
+    Args:
+        url: of the service.
+        idle: seconds for which a connection is kept without a request.
+    """
+
+    def __init__(self, url: httpx.URL, idle: float) -> None:
+        self._limits = httpx.Limits(max_connections=1, max_keepalive_connections=1, keepalive_expiry=idle)
+        self._verify = httpx.create_ssl_context() if url.scheme == "https" else False
+        self._proxy = None if proxy_bypass(url.host) else getproxies().get(url.scheme)
+        self._free: list[httpx.AsyncHTTPTransport] = []
+        self._all: list[httpx.AsyncHTTPTransport] = []
+
+    async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
+        """Send a request; its transport is free again when the answer is closed."""
+        lane = self._lane()
+        try:
+            response = await lane.handle_async_request(request)
+        except BaseException:
+            self._free.append(lane)  # its connection is closed
+            raise
+        assert isinstance(response.stream, httpx.AsyncByteStream)
+        response.stream = AsyncLent(response.stream, self._free, lane)
+        return response
+
+    def _lane(self) -> httpx.AsyncHTTPTransport:
+        try:
+            return self._free.pop()
+        except IndexError:
+            made = httpx.AsyncHTTPTransport(verify=self._verify, limits=self._limits, proxy=self._proxy)
+            self._all.append(made)
+            return made
+
+    async def aclose(self) -> None:
+        """Close all connections."""
+        for lane in self._all:
+            await lane.aclose()
+
+
+class AsyncLent(httpx.AsyncByteStream):
+    """The body of an answer, whose transport is given back when it is closed."""
+
+    def __init__(
+        self, stream: httpx.AsyncByteStream, free: list[httpx.AsyncHTTPTransport], lane: httpx.AsyncHTTPTransport
+    ) -> None:
+        self._stream, self._free, self._lane = stream, free, lane
+        self._open = True
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        async for chunk in self._stream:
+            yield chunk
+
+    async def aclose(self) -> None:
+        """Close the answer."""
+        if self._open:
+            self._open = False
+            try:
+                await self._stream.aclose()
+            finally:
+                self._free.append(self._lane)

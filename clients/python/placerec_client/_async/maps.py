@@ -1,0 +1,524 @@
+"""Maps: the listing, and one map with all that can be done with it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import AsyncGenerator, AsyncIterator, Container, Iterable, Mapping, Sequence
+from contextlib import aclosing
+from typing import Any, Literal, Unpack, overload
+
+from placerec_client import models, parameters, problems
+from placerec_client._async.batches import AsyncQueries
+from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.enrolment import AsyncEnrolment, enrol_by_job
+from placerec_client._async.following import follow
+from placerec_client._async.jobs import AsyncJob
+from placerec_client._async.places import AsyncPlaces
+from placerec_client._async.review import AsyncReview
+from placerec_client._async.sessions import AsyncSessions
+from placerec_client._async.transfers import Progress, export, upload
+from placerec_client.answers import parsed
+from placerec_client.batches import PATIENCE, Enrolled, Located, NewPlace
+from placerec_client.events import MapEvent
+from placerec_client.frames import Frame, frame_bytes, media_type
+from placerec_client.requests import Part, dumps, fields, form, path_of, quoted
+
+TRANSFER_PATIENCE = 3600.0
+"""Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
+a map, which for 100 000 places takes minutes; if the client has any patience."""
+
+
+class AsyncMaps:
+    """The maps of a service; iterated, their settings in the order of their ids."""
+
+    def __init__(self, connection: AsyncConnection) -> None:
+        self._connection = connection
+
+    def __getitem__(self, map_id: str) -> AsyncMap:
+        return AsyncMap(self._connection, map_id)
+
+    def __aiter__(self) -> AsyncIterator[models.MapView]:
+        return self.list()
+
+    async def list(self) -> AsyncIterator[models.MapView]:
+        """Yield the settings of every map, page by page."""
+        async for page in self.pages():
+            for item in page.items:
+                yield item
+
+    async def pages(self) -> AsyncIterator[models.MapPage]:
+        """Yield the pages of the listing; each also names the maps that are damaged and out of service."""
+        async for page in self._connection.pages(models.MapPage, "/v1/maps", {}):
+            yield page
+
+    async def create(self, map_id: str, **options: Unpack[parameters.NewMap]) -> AsyncMap:
+        """Create a map, bound for life to one encoder.
+
+        If the answer to the first attempt is lost, an empty map of this id with these settings counts as created.
+
+        Raises:
+            MapExists: there is a map of this id.
+        """
+        body = {"id": map_id, **options}
+        made = self[map_id]
+        try:
+            made.view = await self._connection.ask(models.MapView, "POST", "/v1/maps", json=body)
+        except problems.MapExists as problem:
+            if not problem.after_loss:
+                raise
+            found = await made.read()
+            if found.places or not _holds(found, {**options, "encoder": None}):
+                raise
+        return made
+
+    async def import_(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        id: str | None = None,
+        encoder: str | None = None,
+        progress: Progress | None = None,
+    ) -> AsyncJob:
+        """Upload the file of an exported map, and return the job that makes a map of it.
+
+        Args:
+            path: of the file.
+            id: of the new map; the file's own if left out.
+            encoder: name or identity that the map must have.
+            progress: is called with the bytes sent and their number, and may be called again from the beginning.
+        """
+        return await upload(self._connection.lasting(TRANSFER_PATIENCE), path, id, encoder, progress)
+
+
+class AsyncMap:
+    """One map; nothing is sent before a method is called.
+
+    Attributes:
+        id: of the map.
+        view: its settings as they were last read, created or edited through this object; None before.
+        places: its places.
+        sequences: its traverses.
+        cameras: its cameras.
+        sessions: its sessions.
+        review: frames of queries that it keeps for review.
+    """
+
+    def __init__(self, connection: AsyncConnection, map_id: str) -> None:
+        self.id = map_id
+        self.view: models.MapView | None = None
+        self.connection = connection
+        self.path = path_of("maps", map_id)
+        self.places = AsyncPlaces(connection, self.path)
+        self.sequences = AsyncSequences(connection, self.path)
+        self.cameras = AsyncCameras(connection, self.path)
+        self.sessions = AsyncSessions(connection, self.path)
+        self.review = AsyncReview(connection, self.path)
+        self._query = self.path + "/query"
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.id!r})"
+
+    async def read(self) -> models.MapView:
+        """Return the settings, the calibration and the size of the map."""
+        self.view = await self.connection.ask(models.MapView, "GET", self.path)
+        return self.view
+
+    async def edit(self, changes: parameters.MapChanges, *, if_match: int | str | None = None) -> models.MapView:
+        """Change settings; those left out stay, and None clears a field.
+
+        Args:
+            changes: the fields to change.
+            if_match: the revision that the map must have, or its ETag.
+
+        Raises:
+            RevisionMismatch: the map has another revision; nothing is changed.
+        """
+        try:
+            self.view = await self.connection.ask(
+                models.MapView, "PATCH", self.path, json=changes, headers=_condition(if_match)
+            )
+        except problems.RevisionMismatch as problem:
+            if not problem.after_loss or not _holds(await self.read(), changes):
+                raise
+        assert self.view is not None
+        return self.view
+
+    async def delete(self, *, if_match: int | str | None = None) -> None:
+        """Delete the map with everything that it contains."""
+        try:
+            await self.connection.request("DELETE", self.path, headers=_condition(if_match))
+        except problems.UnknownMap as problem:
+            if not problem.after_loss:
+                raise
+
+    @overload
+    async def verify(self) -> models.VerifyReport: ...
+    @overload
+    async def verify(self, *, background: Literal[True]) -> AsyncJob: ...
+    async def verify(self, *, background: bool = False) -> models.VerifyReport | AsyncJob:
+        """Read all that is stored of the map and compare it with its checksums; in the ``background`` as a job."""
+        path = self.path + "/verify"
+        if background:
+            return await self._job(path, params={"background": True})
+        return await self.connection.ask(models.VerifyReport, "POST", path)
+
+    async def health(self, **options: Unpack[parameters.CheckHealth]) -> models.MapHealth:
+        """Report how well the map works, and which stretches should be recorded again."""
+        return await self.connection.ask(models.MapHealth, "GET", self.path + "/health", params=options)
+
+    async def plan(self, **options: Unpack[parameters.ReadPlan]) -> models.PlanView:
+        """Return where all places are, column by column: made for maps of many places."""
+        return await self.connection.ask(models.PlanView, "GET", self.path + "/plan", params=options)
+
+    async def compare(self, query: str, reference: str) -> models.SimilarityView:
+        """Compare two traverses frame by frame: what they share, and the size and scale of the matrix of scores."""
+        params = {"query": query, "reference": reference}
+        return await self.connection.ask(models.SimilarityView, "GET", self.path + "/similarity", params=params)
+
+    async def draw_comparison(self, query: str, reference: str) -> bytes:
+        """Return the matrix of scores of two traverses as a grey picture, a PNG file."""
+        params, headers = {"query": query, "reference": reference}, {"Accept": "image/png"}
+        response = await self.connection.request("GET", self.path + "/similarity", params=params, headers=headers)
+        return response.content
+
+    async def answers(self, **options: Unpack[parameters.ListAnswers]) -> models.RecentAnswerList:
+        """Return the latest answers that the service remembers, and the mix of verdicts."""
+        return await self.connection.ask(models.RecentAnswerList, "GET", self.path + "/answers", params=options)
+
+    async def calibration(self, **options: Unpack[parameters.ReadCalibration]) -> models.CalibrationState:
+        """Return the calibration, and what another ``threshold`` or ``margin`` would do."""
+        return await self.connection.ask(models.CalibrationState, "GET", self.path + "/calibration", params=options)
+
+    async def query(
+        self,
+        frame: Frame,
+        *,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.Query],
+    ) -> models.QueryAnswer:
+        """Ask where a frame was taken.
+
+        Args:
+            frame: bytes, a path, an open file, or pixels.
+            deadline: seconds after which an answer is of no use; the request is sent again until then.
+            request_id: under which the service logs the request; made if left out.
+            options: such as ``k``, ``verify``, ``camera``, ``x``, ``y`` and ``radius``.
+        """
+        data = frame_bytes(frame)
+        response = await self.connection.request(
+            "POST",
+            self._query,
+            params=options,
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
+        return parsed(models.QueryAnswer, response.content)
+
+    async def query_batch(
+        self, frames: Iterable[Frame], **options: Unpack[parameters.QueryBatch]
+    ) -> AsyncGenerator[Located]:
+        """Ask where many frames were taken; yield the answers in their order.
+
+        The frames are read a batch ahead, and batches are as large as the service is fast. Those that were answered
+        are not sent again when a connection is lost. A frame that cannot be used has an ``error``.
+
+        Args:
+            frames: read in a thread when their turn comes.
+            options: as of ``query``; they hold for every frame.
+        """
+        queries = AsyncQueries(self.connection.lasting(PATIENCE), self.path + "/query:batch", frames, options)
+        async with aclosing(queries.run()) as answers:
+            async for located in answers:
+                yield located
+
+    async def enrol(
+        self,
+        places: Iterable[NewPlace],
+        *,
+        known: Container[str] | None = None,
+        encoder: str | None = None,
+    ) -> AsyncGenerator[Enrolled]:
+        """Enrol many frames in their order, and yield what became of each.
+
+        It can be broken off and called again with the same frames: those that the map holds already are neither sent
+        nor encoded a second time; their fields are updated. A frame that cannot be used has an ``error``, and the
+        others are enrolled. Within a batch, frames that the map holds come first.
+
+        ::
+
+            frames = (NewPlace(path.stem, path, {"sequence": "monday"}) for path in sorted(folder.glob("*.jpg")))
+            async for one in lab.enrol(frames):
+                print(one.place.id, one.change or one.error)
+
+        Args:
+            places: read in a thread when their turn comes.
+            known: ids that the map has; found out if left out.
+            encoder: name or identity that the map must have.
+        """
+        if known is None:
+            known = {place.id async for place in self.places.list()}
+        options = {"encoder": encoder}
+        lasting = self.connection.lasting(PATIENCE)
+        enrolment = AsyncEnrolment(lasting, self.path + "/places", places, known, options)
+        async with aclosing(enrolment.run()) as outcomes:
+            async for outcome in outcomes:
+                yield outcome
+
+    async def enrol_by_job(
+        self, places: Sequence[NewPlace], *, align: bool = False, encoder: str | None = None
+    ) -> AsyncJob:
+        """Send many frames in one request, and return the job that enrols them.
+
+        Args:
+            places: all are read twice; none of them is kept in memory.
+            align: whether the job then finds which frames show places that the map had already.
+            encoder: name or identity that the map must have.
+
+        Raises:
+            InvalidFrame: a frame cannot be read; nothing is enrolled.
+        """
+        options = {"align": align or None, "encoder": encoder}
+        return await enrol_by_job(self.connection.lasting(PATIENCE), self.path + "/places", places, options)
+
+    async def query_or_enrol(
+        self,
+        place_id: str,
+        frame: Frame,
+        *,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.QueryOrEnrol],
+    ) -> models.ClosureAnswer:
+        """Ask where a frame was taken, and enrol it as a place if that is unknown, as one step.
+
+        Args:
+            place_id: of the place that it becomes.
+            frame, deadline, request_id, options: as of ``query``.
+        """
+        data = frame_bytes(frame)
+        return await self.connection.ask(
+            models.ClosureAnswer,
+            "POST",
+            self.path + "/query:enrol",
+            params={**options, "id": place_id},
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
+
+    async def events(self, **options: Unpack[parameters.FollowMap]) -> AsyncGenerator[MapEvent]:
+        """Yield what happens in the map: queries, enrolments, sessions, jobs, and changes of the map.
+
+        A connection that is lost is taken up again; the event ``missed`` says how many were lost all the same.
+
+        ::
+
+            async for event in lab.events(kinds=["query"], verdicts=["unknown"]):
+                print(event.data["at"], event.data["best"])
+
+        Args:
+            options: such as ``kinds``, ``verdicts`` and ``pictures``.
+        """
+        async with aclosing(follow(self.connection, self.path + "/events", options)) as events:
+            async for event in events:
+                made = MapEvent(event.name, event.id, event.json())
+                yield made
+                if made.kind == "map" and made.data.get("change") == "deleted":
+                    return
+
+    async def explanation(self, explanation: str) -> bytes:
+        """Return the picture of an explanation, a PNG file, by its id or the address in an answer."""
+        name = explanation.rpartition("/")[2]
+        return (await self.connection.request("GET", f"{self.path}/explanations/{quoted(name)}")).content
+
+    @overload
+    async def calibrate(
+        self,
+        method: Literal["frames", "sequence", "map", "labels"],
+        *,
+        frames: Mapping[str, Frame] | None = None,
+        if_match: int | str | None = None,
+        deadline: float | None = None,
+        background: Literal[False] = False,
+        **options: Unpack[parameters.CalibrationOrder],
+    ) -> models.CalibrationReport: ...
+    @overload
+    async def calibrate(
+        self,
+        method: Literal["frames", "sequence", "map", "labels"],
+        *,
+        frames: Mapping[str, Frame] | None = None,
+        if_match: int | str | None = None,
+        deadline: float | None = None,
+        background: Literal[True],
+        **options: Unpack[parameters.CalibrationOrder],
+    ) -> AsyncJob: ...
+    async def calibrate(
+        self,
+        method: Literal["frames", "sequence", "map", "labels"],
+        *,
+        frames: Mapping[str, Frame] | None = None,
+        if_match: int | str | None = None,
+        deadline: float | None = None,
+        background: bool = False,
+        **options: Any,
+    ) -> models.CalibrationReport | AsyncJob:
+        """Measure when the map's answers can be believed, and store the result.
+
+        Args:
+            method: ``frames`` with labels, a ``sequence`` of the map, the ``map`` itself, or the ``labels`` of reviewed
+                frames.
+            frames: with ``frames``: those that ``labels`` names as files.
+            if_match: the revision that the map must have.
+            deadline: seconds after which an answer is of no use.
+            background: return a job, which may take longer than a request.
+            options: such as ``target``, ``labels``, ``sequence``, ``pairs``, ``dry_run``.
+        """
+        order = {"method": method, **fields(options), "background": background}
+        sent: dict[str, Any] = {"headers": _condition(if_match), "deadline": deadline}
+        if frames is None:
+            sent["json"] = order
+        else:
+            read = {name: frame_bytes(frame) for name, frame in frames.items()}
+            parts = [Part("calibration", dumps(order).encode(), "application/json", is_file=False)]
+            parts += [Part(name, data, media_type(data)) for name, data in read.items()]
+            sent["content"], sent["media_type"] = form(parts)
+        path = self.path + "/calibrate"
+        if background:
+            return await self._job(path, **sent)
+        return await self.connection.ask(models.CalibrationReport, "POST", path, **sent)
+
+    async def align(
+        self, sequence: str, with_: list[str] | None = None, **options: Unpack[parameters.Aligning]
+    ) -> AsyncJob:
+        """Find which frames of a traverse show the places of others, of all or those of ``with_``, by a job."""
+        body = {"sequence": sequence, "with": with_, **fields(options)}
+        return await self._job(self.path + "/align", json=body)
+
+    async def prune(self, **options: Unpack[parameters.Pruning]) -> AsyncJob:
+        """Remove places whose neighbours can stand in for them, by a job; it only reports unless ``dry_run=False``."""
+        return await self._job(self.path + "/prune", json=options)
+
+    async def merge(self, other: str, **options: Unpack[parameters.Merging]) -> AsyncJob:
+        """Copy the places of another map into this one, by a job; it only reports unless ``dry_run=False``."""
+        return await self._job(self.path + "/merge", json={"from": other, **options})
+
+    async def reencode(self, to: str, **options: Unpack[parameters.Reencoding]) -> AsyncJob:
+        """Make the new map ``to`` from the pictures of this one, by a job."""
+        return await self._job(self.path + "/re-encode", json={"to": to, **options})
+
+    async def rebuild(self) -> AsyncJob:
+        """Rebuild the search index of the map, by a job."""
+        return await self._job(self.path + "/rebuild")
+
+    async def keypoints(self) -> AsyncJob:
+        """Find the keypoints of places that have none, by a job."""
+        return await self._job(self.path + "/keypoints")
+
+    async def export(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        overwrite: bool = False,
+        known: str | None = None,
+        progress: Progress | None = None,
+    ) -> str | None:
+        """Download the map as a file; a download that was broken off goes on where it was.
+
+        Args:
+            path: of the file; until it is complete and compared with its checksums, its name ends with ``.part``.
+            overwrite: whether an existing file is replaced.
+            known: what an earlier call returned; nothing is downloaded if the map has not changed since.
+            progress: is called with the bytes that are there and their number.
+
+        Returns:
+            The SHA-256 of the file's manifest, which names its content; None if it is ``known``.
+
+        Raises:
+            TransferFailed: the file exists, cannot be written, or is damaged.
+        """
+        return await export(self.connection.lasting(TRANSFER_PATIENCE), self.path, path, overwrite, known, progress)
+
+    async def _job(self, path: str, **options: Any) -> AsyncJob:
+        return await AsyncJob.submit(self.connection, path, **options)
+
+
+class AsyncSequences:
+    """The traverses of a map."""
+
+    def __init__(self, connection: AsyncConnection, path: str) -> None:
+        self._connection, self._path = connection, path + "/sequences"
+
+    def __aiter__(self) -> AsyncIterator[models.SequenceSummary]:
+        return self.list()
+
+    async def list(self) -> AsyncIterator[models.SequenceSummary]:
+        """Yield the traverses in the order of their names."""
+        async for page in self._connection.pages(models.SequencePage, self._path, {}):
+            for item in page.items:
+                yield item
+
+    async def forget(self, name: str) -> models.ForgottenSequence:
+        """Delete all places of a traverse. If the answer to the first attempt is lost, 0 places are reported."""
+        try:
+            path = f"{self._path}/{quoted(name)}"
+            return await self._connection.ask(models.ForgottenSequence, "DELETE", path)
+        except problems.UnknownSequence as problem:
+            if not problem.after_loss:
+                raise
+            return models.ForgottenSequence(name=name, places=0)
+
+
+class AsyncCameras:
+    """The cameras of a map."""
+
+    def __init__(self, connection: AsyncConnection, path: str) -> None:
+        self._connection, self._path = connection, path + "/cameras"
+
+    def __aiter__(self) -> AsyncIterator[models.CameraView]:
+        return self.list()
+
+    async def list(self) -> AsyncIterator[models.CameraView]:
+        """Yield the cameras."""
+        async for page in self._connection.pages(models.CameraList, self._path, {"limit": None}):
+            for item in page.items:
+                yield item
+
+    async def put(self, name: str, **options: Unpack[parameters.CameraDefinition]) -> models.CameraView:
+        """Create or replace a camera: ``mask`` is what to ignore in its frames, ``intrinsics`` measure poses."""
+        return await self._connection.ask(models.CameraView, "PUT", self._of(name), json=options)
+
+    async def read(self, name: str) -> models.CameraView:
+        """Return one camera."""
+        return await self._connection.ask(models.CameraView, "GET", self._of(name))
+
+    async def forget(self, name: str) -> None:
+        """Forget a camera; places that were enrolled with it stay."""
+        try:
+            await self._connection.request("DELETE", self._of(name))
+        except problems.UnknownCamera as problem:
+            if not problem.after_loss:
+                raise
+
+    def _of(self, name: str) -> str:
+        return f"{self._path}/{quoted(name)}"
+
+
+def _condition(if_match: int | str | None) -> dict[str, str]:
+    """The header that makes an edit depend on the revision."""
+    if if_match is None:
+        return {}
+    return {"If-Match": if_match if isinstance(if_match, str) and if_match.startswith('"') else f'"{if_match}"'}
+
+
+def _holds(view: models.MapView, wanted: Mapping[str, Any]) -> bool:
+    """Whether a map has these settings; None stands for any value."""
+    found = view.model_dump()
+    return all(
+        value is None or name not in found or isinstance(value, Mapping) or found[name] == value
+        for name, value in wanted.items()
+    )

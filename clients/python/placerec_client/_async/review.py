@@ -1,0 +1,40 @@
+"""Frames of queries that a map keeps for review, and their labels."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from typing import Unpack
+
+from placerec_client import models, parameters
+from placerec_client._async.connection import AsyncConnection
+
+
+class AsyncReview:
+    """The frames that a map keeps for review; iterated, one after the other."""
+
+    def __init__(self, connection: AsyncConnection, path: str) -> None:
+        self._connection, self._path = connection, path + "/review"
+
+    def __aiter__(self) -> AsyncIterator[models.ReviewFrameView]:
+        return self.list()
+
+    async def list(self, **options: Unpack[parameters.ListReview]) -> AsyncIterator[models.ReviewFrameView]:
+        """Yield the frames; ``labelled`` chooses those with or without a label."""
+        async for page in self._connection.pages(models.ReviewPage, self._path, dict(options)):
+            for item in page.items:
+                yield item
+
+    async def labels(self) -> Sequence[models.ExportedLabel]:
+        """Return all labels."""
+        return (await self._connection.ask(models.LabelList, "GET", self._path + "/labels")).items
+
+    async def picture(self, frame: int) -> bytes:
+        """Return the file of a frame."""
+        return (await self._connection.request("GET", f"{self._path}/{frame}/picture")).content
+
+    async def label(
+        self, frame: int, *, deadline: float | None = None, **options: Unpack[parameters.LabelOrder]
+    ) -> models.Labelled:
+        """Say what a frame shows: a ``place``, a ``new`` place, a ``stranger``; or ``discard`` it."""
+        path = f"{self._path}/{frame}"
+        return await self._connection.ask(models.Labelled, "POST", path, json=options, deadline=deadline)

@@ -1,0 +1,197 @@
+"""Maps as files: downloads in pieces that can be taken up again, and uploads."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from placerec_client import problems
+from placerec_client._async.concurrency import in_thread
+from placerec_client._async.connection import AsyncConnection
+from placerec_client._async.jobs import AsyncJob
+from placerec_client._http import httpx
+from placerec_client.archives import check_archive, digest_of, partial_tag
+from placerec_client.errors import TransferFailed
+from placerec_client.requests import query_string
+
+PIECE_BYTES = 16 << 20
+"""Bytes of one request of a download: they are in memory at one time, and lost if the connection breaks."""
+
+CHUNK_BYTES = 1 << 20
+RESTARTS = 3
+"""How often a download begins again because the service no longer keeps the export of which a part is here."""
+
+PARTIAL = ".part"
+Progress = Callable[[int, int], object]
+"""Is called with the bytes that are through, and their number."""
+
+
+async def export(
+    connection: AsyncConnection,
+    map_path: str,
+    path: str | os.PathLike[str],
+    overwrite: bool = False,
+    known: str | None = None,
+    progress: Progress | None = None,
+) -> str | None:
+    """Download a map to a file; see ``AsyncMap.export``."""
+    file = Path(path)
+    if file.exists() and not overwrite:
+        raise TransferFailed(f"{file} already exists.")
+    partial = file.with_name(file.name + PARTIAL)
+    tag = await download(connection, map_path, partial, known, progress)
+    if tag is not None:
+        await in_thread(settle, partial, file)
+    return tag
+
+
+async def download(
+    connection: AsyncConnection, map_path: str, partial: Path, known: str | None, progress: Progress | None
+) -> str | None:
+    """Download a map to ``partial``, after the part of the same export that is there; compare it with its checksums.
+
+    Returns:
+        The SHA-256 of the manifest; None if it is ``known``.
+
+    Raises:
+        Problem, ConnectionFailed: the download failed; its part stays, to be continued.
+        TransferFailed: the file cannot be written, is damaged, or changes faster than it can be downloaded.
+    """
+    for _ in range(RESTARTS):
+        try:
+            tag = await _pieces(connection, map_path + "/export", partial, known, progress)
+        except (problems.ExportGone, problems.RangeNotSatisfiable):
+            partial.unlink(missing_ok=True)
+            continue
+        if tag is None:
+            partial.unlink(missing_ok=True)
+            return None
+        try:
+            await in_thread(check_archive, partial, tag)
+        except TransferFailed:
+            partial.unlink(missing_ok=True)  # it cannot be continued
+            raise
+        return tag
+    raise TransferFailed("The map changes faster than it can be downloaded: increase PLACEREC_EXPORT_SECONDS.")
+
+
+async def _pieces(
+    connection: AsyncConnection, path: str, partial: Path, known: str | None, progress: Progress | None
+) -> str | None:
+    tag = await in_thread(partial_tag, partial)
+    if tag is None:
+        partial.unlink(missing_ok=True)
+    with _opened(partial) as file:
+        position, size = file.seek(0, os.SEEK_END), None
+        while size is None or position < size:
+            response = await _piece(connection, path, position, tag, known)
+            if response is None:  # the file is complete or damaged, which is checked later
+                break
+            if response.status_code == 304:
+                return None
+            tag, size = response.headers["etag"].strip('"'), _size_of(response.headers)
+            if response.status_code == 200:
+                position = file.seek(0)
+                file.truncate()
+            content = response.content
+            await in_thread(_write, file, content)
+            position += len(content)
+            if progress is not None:
+                progress(position, size)
+        await in_thread(_sync, file)
+    return tag
+
+
+async def _piece(
+    connection: AsyncConnection, path: str, position: int, tag: str | None, known: str | None
+) -> httpx.Response | None:
+    headers = {"Range": f"bytes={position}-{position + PIECE_BYTES - 1}"}
+    if tag is not None:
+        headers["If-Match"] = f'"{tag}"'
+    elif known is not None:
+        headers["If-None-Match"] = f'"{known}"'
+    try:
+        return await connection.request("GET", path, headers=headers, accepted=(304,))
+    except problems.RangeNotSatisfiable:
+        if position:
+            return None
+        raise
+
+
+async def upload(
+    connection: AsyncConnection,
+    path: str | os.PathLike[str],
+    map_id: str | None,
+    encoder: str | None,
+    progress: Progress | None,
+) -> AsyncJob:
+    """Upload the file of a map; see ``AsyncMaps.import_``."""
+    file = Path(path)
+    try:
+        size = file.stat().st_size
+        digest = await in_thread(digest_of, file)
+    except OSError as error:
+        raise TransferFailed(f"{file} cannot be read: {error.strerror}.") from error
+
+    async def pieces() -> AsyncIterator[bytes]:
+        sent = 0
+        with file.open("rb") as opened:
+            while piece := await in_thread(opened.read, CHUNK_BYTES):
+                yield piece
+                sent += len(piece)
+                if progress is not None:
+                    progress(sent, size)
+
+    parameters = {"background": True, "id": map_id, "encoder": encoder}
+    headers = {"Content-Length": str(size), "Content-Digest": f"sha-256=:{digest}:"}
+    return await AsyncJob.submit(
+        connection,
+        "/v1/maps/import" + query_string(parameters),
+        content=pieces,
+        media_type="application/x-tar",
+        headers=headers,
+    )
+
+
+def settle(partial: Path, path: Path) -> None:
+    """Give a complete file its final name, and sync the folder.
+
+    Raises:
+        TransferFailed: the file cannot be renamed.
+    """
+    try:
+        os.replace(partial, path)
+        folder = os.open(path.absolute().parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError as error:
+        raise TransferFailed(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _size_of(headers: Mapping[str, str]) -> int:
+    whole = headers.get("content-range", "").rpartition("/")[2]
+    return int(whole) if whole else int(headers["content-length"])
+
+
+def _opened(path: Path) -> BinaryIO:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("ab" if path.exists() else "wb")
+    except OSError as error:
+        raise TransferFailed(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _write(file: BinaryIO, content: bytes) -> None:
+    try:
+        file.write(content)
+    except OSError as error:
+        raise TransferFailed(f"{file.name} cannot be written: {error.strerror}.") from error
+
+
+def _sync(file: BinaryIO) -> None:
+    file.flush()
+    os.fsync(file.fileno())

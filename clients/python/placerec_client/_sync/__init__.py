@@ -1,0 +1,1 @@
+"""The synchronous half of the client, written from the asynchronous one by scripts/client."""

@@ -1,0 +1,154 @@
+# Written from _async/batches.py by scripts/client.  Do not edit.
+"""Batches of frames whose size adapts to the speed.
+
+Two batches are under way at a time, so that one is encoded while the other is stored and the next is read.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from typing import Any, Generic, TypeVar
+
+from placerec_client import models
+from placerec_client._sync.concurrency import Task, in_thread
+from placerec_client._sync.connection import Connection
+from placerec_client.answers import problem_of
+from placerec_client.batches import BATCH_BYTES, OF_THE_FRAME, TOO_SLOW, Located, Pace, too_large
+from placerec_client.errors import InvalidFrame, Problem, UnexpectedAnswer
+from placerec_client.frames import Frame, frame_bytes, media_type
+from placerec_client.requests import Part, form
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+
+class Batch(Generic[Item, Outcome]):
+    """A batch: what is known of some of its frames already, and the frames that are to be sent."""
+
+    def __init__(self, told: Sequence[Outcome], items: Sequence[Item]) -> None:
+        self.told, self.items = told, items
+
+
+class Sent(Generic[Outcome]):
+    """A batch under way."""
+
+    def __init__(self, frames: int, task: Task[list[Outcome]]) -> None:
+        self.frames, self.task, self.began = frames, task, time.monotonic()
+
+
+class Batches(ABC, Generic[Item, Outcome]):
+    """Sends frames batch by batch, and yields an outcome for each in their order."""
+
+    def __init__(self) -> None:
+        self.pace = Pace()
+
+    @abstractmethod
+    def read(self) -> Batch[Item, Outcome] | None:
+        """The next batch; None at the end. It is called for the next batch while others are under way."""
+
+    @abstractmethod
+    def begin(self, batch: Batch[Item, Outcome], before: Sent[Outcome] | None) -> Sent[Outcome]:
+        """Begin to send a batch, after the one that is under way."""
+
+    def run(self) -> Generator[Outcome]:
+        """Yield the outcomes.
+
+        Raises:
+            PlacerecError: a batch failed for a reason that concerns no single frame; the outcomes so far are final.
+        """
+        started: list[Sent[Outcome]] = []
+        alone = True
+        following = Task(self.read)
+        try:
+            while batch := following.result():
+                following = Task(self.read)
+                started.append(self.begin(batch, started[-1] if started else None))
+                # The first batch goes alone: it shows what the service accepts, and how fast it is.
+                if len(started) == 2 or alone:
+                    for outcome in self._end(started.pop(0)):
+                        yield outcome
+                alone = False
+            while started:
+                for outcome in self._end(started.pop(0)):
+                    yield outcome
+        finally:
+            under_way: list[Task[Any]] = [following, *(sent.task for sent in started)]
+            for task in under_way:
+                task.end()
+
+    def _end(self, sent: Sent[Outcome]) -> list[Outcome]:
+        """Wait for the outcomes of a batch, and adapt the size of the next one to its speed."""
+        outcomes = sent.task.result()
+        if sent.frames:
+            self.pace.took(sent.frames, time.monotonic() - sent.began)
+        return outcomes
+
+
+class Queries(Batches[tuple[Frame, bytes], Located]):
+    """Queries of many frames."""
+
+    def __init__(self, connection: Connection, path: str, frames: Iterable[Frame], options: Mapping[str, Any]) -> None:
+        super().__init__()
+        self._connection, self._path, self._options = connection, path, options
+        self._frames = iter(frames)
+
+    def read(self) -> Batch[tuple[Frame, bytes], Located] | None:
+        """Read frames until the batch is full; one that cannot be read ends it."""
+        told: list[Located] = []
+        items = in_thread(self._read, told)
+        return Batch(told, items) if told or items else None
+
+    def _read(self, told: list[Located]) -> list[tuple[Frame, bytes]]:
+        items: list[tuple[Frame, bytes]] = []
+        size = 0
+        while len(items) < self.pace.frames and size < BATCH_BYTES and not told:
+            try:
+                frame = next(self._frames)
+            except StopIteration:
+                break
+            try:
+                items.append((frame, frame_bytes(frame)))
+                size += len(items[-1][1])
+            except InvalidFrame as error:
+                told.append(Located(frame, None, error))
+        return items
+
+    def begin(self, batch: Batch[tuple[Frame, bytes], Located], before: Sent[Located] | None) -> Sent[Located]:
+        """Begin to send a batch."""
+
+        def send() -> list[Located]:
+            return [*self._send(batch.items), *batch.told]
+
+        return Sent(len(batch.items), Task(send))
+
+    def _send(self, items: Sequence[tuple[Frame, bytes]]) -> list[Located]:
+        """Send a batch, in halves if the service finds it too large."""
+        if not items:
+            return []
+        content, kind = form([Part(str(index), data, media_type(data)) for index, (_, data) in enumerate(items)])
+        try:
+            answers = self._connection.ask(
+                models.BatchAnswers,
+                "POST",
+                self._path,
+                params=self._options,
+                content=content,
+                media_type=kind,
+                final=TOO_SLOW if len(items) > 1 else frozenset(),
+            )
+        except (Problem, UnexpectedAnswer) as error:
+            if too_large(error, len(items)):
+                half = self.pace.halve(len(items))
+                return [*self._send(items[:half]), *self._send(items[half:])]
+            if error.status in OF_THE_FRAME:
+                return [Located(items[0][0], None, error)]
+            raise
+        return [_located(frame, item) for (frame, _), item in zip(items, answers.items, strict=True)]
+
+
+def _located(frame: Frame, item: models.BatchAnswer) -> Located:
+    if item.problem is not None:
+        return Located(frame, None, problem_of(item.problem.model_dump(exclude_none=True), item.status))
+    return Located(frame, item.answer)

@@ -1,0 +1,238 @@
+# Written from _async/client.py by scripts/client.  Do not edit.
+"""The client of a placerec service."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from types import TracebackType
+from typing import Any, Literal, Self, Unpack
+
+from placerec_client import models, parameters
+from placerec_client._http import httpx
+from placerec_client._sync.connection import Connection
+from placerec_client._sync.jobs import Jobs
+from placerec_client._sync.keys import Keys
+from placerec_client._sync.maps import Maps
+from placerec_client.frames import Frame, frame_bytes, media_type
+from placerec_client.requests import Part, form
+from placerec_client.retry import Retry
+
+
+class Client:
+    """A placerec service.
+
+    ::
+
+        with Client("http://127.0.0.1:8000") as client:
+            answer = client.maps["lab"].query("frame.jpg")
+
+    All calls raise :class:`~placerec_client.PlacerecError`: a class of :mod:`placerec_client.problems` for each kind of
+    problem that the service answers with, ``ConnectionFailed`` without an answer, ``DeadlineExceeded`` without one in
+    time.
+
+    Args:
+        url: of the service.
+        key: to send with every request; None for a service without keys.
+        timeout: seconds to wait for one answer.
+        retry: for how long a request is sent again while the service is overloaded, restarts or cannot be reached.
+        transport: of httpx, to reach the service otherwise than by the network.
+        name: what errors call the service; its URL if left out.
+
+    Attributes:
+        maps: the maps of the service; iterated, their settings; ``maps["lab"]`` is one map.
+        jobs: its jobs; iterated, the newest first; ``jobs[id]`` is one job.
+        encoders: its encoders; iterated, their definitions.
+        keys: its keys.
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8000",
+        *,
+        key: str | None = None,
+        timeout: float = 120.0,
+        retry: Retry | None = None,
+        transport: httpx.BaseTransport | None = None,
+        name: str | None = None,
+    ) -> None:
+        self._bind(Connection(url, key, timeout, retry or Retry(), transport, name))
+
+    def _bind(self, connection: Connection) -> None:
+        self.connection = connection
+        self.maps = Maps(connection)
+        self.jobs = Jobs(connection)
+        self.encoders = Encoders(connection)
+        self.keys = Keys(connection)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections; the client cannot be used any more."""
+        self.connection.close()
+
+    def patient(self, retry: Retry) -> Client:
+        """Return this client, on the same connections, with another rule of when a request is sent again."""
+        other = object.__new__(type(self))
+        other._bind(self.connection.patient(retry))
+        return other
+
+    def query(
+        self,
+        frames: Frame | Mapping[str, Frame],
+        *,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.QueryMaps],
+    ) -> models.SeveralAnswer:
+        """Ask several maps where a frame, or the frames of one moment, were taken.
+
+        Args:
+            frames: one frame, or those of a rig by the names of their cameras.
+            deadline: seconds after which an answer is of no use.
+            request_id: under which the service logs the request; made if left out.
+            options: such as ``maps``, ``k``, ``cameras``.
+        """
+        if isinstance(frames, Mapping):
+            read = {name: frame_bytes(frame) for name, frame in frames.items()}
+            content, kind = form([Part(name, data, media_type(data)) for name, data in read.items()])
+        else:
+            content = frame_bytes(frames)
+            kind = media_type(content)
+        return self.connection.ask(
+            models.SeveralAnswer,
+            "POST",
+            "/v1/query",
+            params=options,
+            content=content,
+            media_type=kind,
+            deadline=deadline,
+            request_id=request_id,
+        )
+
+    def encode(
+        self, frame: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Encode]
+    ) -> models.Descriptor:
+        """Return the descriptor of a frame, base64 of float32."""
+        return self._ask(models.Descriptor, "/v1/encode", frame, deadline, options)
+
+    def regions(
+        self, frame: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Regions]
+    ) -> models.RegionsView:
+        """Return the regions of interest of a frame."""
+        options["format"] = "json"
+        return self._ask(models.RegionsView, "/v1/regions", frame, deadline, options)
+
+    def draw_regions(
+        self, frame: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Regions]
+    ) -> bytes:
+        """Return the regions of interest of a frame, drawn into it: a PNG file."""
+        data = frame_bytes(frame)
+        response = self.connection.request(
+            "POST",
+            "/v1/regions",
+            params={**options, "format": "png"},
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+        )
+        return response.content
+
+    def match(
+        self, a: Frame, b: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Match]
+    ) -> models.MatchScore:
+        """Return how alike two frames are: near 0 for unrelated ones, at most 1."""
+        content, kind = _two(a, b)
+        return self.connection.ask(
+            models.MatchScore,
+            "POST",
+            "/v1/match",
+            params={**options, "format": "json"},
+            content=content,
+            media_type=kind,
+            deadline=deadline,
+        )
+
+    def draw_match(
+        self, a: Frame, b: Frame, *, deadline: float | None = None, **options: Unpack[parameters.Match]
+    ) -> bytes:
+        """Return two frames side by side with lines between what answers each other: a PNG file."""
+        content, kind = _two(a, b)
+        response = self.connection.request(
+            "POST",
+            "/v1/match",
+            params={**options, "format": "png"},
+            content=content,
+            media_type=kind,
+            deadline=deadline,
+        )
+        return response.content
+
+    def liveness(self) -> models.Health:
+        """Return whether the process answers."""
+        return self.connection.ask(models.Health, "GET", "/livez")
+
+    def readiness(self) -> models.Readiness:
+        """Return what the service checks of itself.
+
+        Raises:
+            NotReady: it cannot answer queries; ``problem.body["checks"]`` says why.
+        """
+        return self.connection.ask(models.Readiness, "GET", "/readyz")
+
+    def version(self) -> models.Version:
+        """Return the versions of the service and its libraries."""
+        return self.connection.ask(models.Version, "GET", "/version")
+
+    def state(self) -> models.ServiceState:
+        """Return what the service is doing: its queue, latencies, memory, disk and limits, and what this key may do."""
+        return self.connection.ask(models.ServiceState, "GET", "/v1/service")
+
+    def own_key(self) -> models.OwnKey:
+        """Return what the key of this client may do."""
+        return self.connection.ask(models.OwnKey, "GET", "/v1/key")
+
+    def audit(self, **options: Unpack[parameters.ReadAudit]) -> Iterator[models.AuditEntry]:
+        """Yield who changed what, the newest first; ``map``, ``key``, ``operation``, ``after``, ``before`` choose."""
+        for page in self.connection.pages(models.AuditPage, "/v1/audit", dict(options)):
+            for item in page.items:
+                yield item
+
+    def metrics(self) -> str:
+        """Return the metrics in the text format of Prometheus."""
+        return (self.connection.request("GET", "/metrics")).text
+
+    def _ask(
+        self, model: type[Any], path: str, frame: Frame, deadline: float | None, options: Mapping[str, Any]
+    ) -> Any:
+        data = frame_bytes(frame)
+        return self.connection.ask(
+            model, "POST", path, params=options, content=data, media_type=media_type(data), deadline=deadline
+        )
+
+
+class Encoders:
+    """The encoders of a service."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def list(self) -> Iterator[models.EncoderSummary]:
+        """Yield the installed encoders, including damaged ones."""
+        for page in self._connection.pages(models.EncoderPage, "/v1/encoders", {"limit": None}):
+            for item in page.items:
+                yield item
+
+    def __iter__(self) -> Iterator[models.EncoderSummary]:
+        return self.list()
+
+
+def _two(a: Frame, b: Frame) -> tuple[bytes, str]:
+    """The form of two frames, and its content type."""
+    read: dict[Literal["a", "b"], bytes] = {"a": frame_bytes(a), "b": frame_bytes(b)}
+    return form([Part(name, data, media_type(data)) for name, data in read.items()])

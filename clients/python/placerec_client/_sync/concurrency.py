@@ -1,0 +1,63 @@
+"""Waiting and working at the same time, for the synchronous half; ``_async/concurrency.py`` is its twin."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+Result = TypeVar("Result")
+
+END_SECONDS = 10.0
+"""How long work that is broken off is waited for: a thread cannot be stopped, but its request has an end."""
+
+
+def sleep(seconds: float) -> None:
+    """Wait so long."""
+    time.sleep(seconds)
+
+
+def in_thread(work: Callable[..., Result], *arguments: Any) -> Result:
+    """The result of work that blocks; here everything does."""
+    return work(*arguments)
+
+
+class Task(Generic[Result]):
+    """Work that goes on in a thread of its own, which does not keep the process from ending."""
+
+    def __init__(self, work: Callable[[], Result]) -> None:
+        self._future: Future[Result] = Future()
+
+        def run() -> None:
+            try:
+                self._future.set_result(work())
+            except BaseException as error:
+                self._future.set_exception(error)
+
+        self._thread = threading.Thread(target=run, daemon=True, name="placerec")
+        self._thread.start()
+
+    def result(self) -> Result:
+        """Wait for the end of the work; return its result or raise its error."""
+        return self._future.result()
+
+    def end(self) -> None:
+        """Wait for a moment that the work ends, whatever comes of it."""
+        self._thread.join(END_SECONDS)
+
+
+Lock = threading.Lock
+
+
+def received(socket: ClientConnection, seconds: float) -> str | bytes:
+    """The next message of a WebSocket.
+
+    Raises:
+        TimeoutError: none has come.
+    """
+    return socket.recv(timeout=seconds)

@@ -1,0 +1,143 @@
+# Written from _async/jobs.py by scripts/client.  Do not edit.
+"""Jobs: the listing, and one job that is followed, waited for or cancelled."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
+from datetime import timedelta
+from typing import Any, Unpack
+
+from placerec_client import models, parameters, problems
+from placerec_client._sync.connection import Connection
+from placerec_client._sync.following import follow
+from placerec_client.answers import parsed, problem_of
+from placerec_client.errors import DeadlineExceeded, JobCancelled
+from placerec_client.requests import path_of
+
+OPEN = ("queued", "running")
+WAIT_SECONDS = 20.0
+"""How long one request waits for the end of a job; with a progress function, PROGRESS_SECONDS."""
+
+PROGRESS_SECONDS = 1.0
+
+Progress = Callable[[models.JobView], object]
+
+
+class Jobs:
+    """The jobs of a service; iterated, the newest first."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def __getitem__(self, job_id: str) -> Job:
+        return Job(self._connection, job_id)
+
+    def __iter__(self) -> Iterator[models.JobView]:
+        return self.list()
+
+    def list(self, **options: Unpack[parameters.ListJobs]) -> Iterator[models.JobView]:
+        """Yield the jobs, the newest first; ``map``, ``kind`` and ``state`` choose among them."""
+        for page in self._connection.pages(models.JobPage, "/v1/jobs", dict(options)):
+            for item in page.items:
+                yield item
+
+
+class Job:
+    """One job.
+
+    Attributes:
+        id: of the job.
+        view: the job as it was last seen; None before.
+    """
+
+    def __init__(self, connection: Connection, job_id: str, view: models.JobView | None = None) -> None:
+        self._connection, self.id, self.view = connection, job_id, view
+        self._path = path_of("jobs", job_id)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.id!r})"
+
+    @classmethod
+    def submit(cls, connection: Connection, path: str, **options: Any) -> Job:
+        """Ask for a job. If an answer was lost, the job that it was about is taken and the second one cancelled."""
+        began = time.monotonic()
+        response = connection.request("POST", path, **options)
+        view = parsed(models.JobView, response.content)
+        if response.extensions.get("after_loss"):
+            window = timedelta(seconds=time.monotonic() - began + 1)
+            for other in Jobs(connection).list(kind=view.kind):
+                same = (other.map, other.arguments) == (view.map, view.arguments) and other.id != view.id
+                if same and view.created_at - window <= other.created_at <= view.created_at:
+                    with suppress(problems.JobEnded):
+                        cls(connection, view.id).cancel()
+                    view = other
+        return cls(connection, view.id, view)
+
+    def read(self) -> models.JobView:
+        """Return the job as it is now."""
+        self.view = self._connection.ask(models.JobView, "GET", self._path)
+        return self.view
+
+    def wait(self, progress: Progress | None = None, *, deadline: float | None = None) -> models.JobView:
+        """Wait until the job ends, over restarts of the service, and return it.
+
+        Args:
+            progress: is called with the job whenever it was seen.
+            deadline: seconds to wait at most; the job goes on.
+
+        Raises:
+            Problem: the job has failed; the class is that of its problem.
+            JobCancelled: it was cancelled.
+            DeadlineExceeded: it has not ended in time.
+        """
+        until = None if deadline is None else time.monotonic() + deadline
+        step = WAIT_SECONDS if progress is None else PROGRESS_SECONDS
+        while True:
+            left = step if until is None else min(step, max(until - time.monotonic(), 0.0))
+            self.view = job = self._connection.ask(models.JobView, "GET", self._path, params={"wait": left})
+            if progress is not None:
+                progress(job)
+            if job.state not in OPEN:
+                return ended(job)
+            if until is not None and time.monotonic() >= until:
+                raise DeadlineExceeded(f"The job {self.id} has not ended within {deadline:g} s; it goes on.")
+
+    def cancel(self) -> models.JobView:
+        """Ask the job to stop; it stops at its next safe point.
+
+        Raises:
+            JobEnded: it has ended already.
+        """
+        try:
+            self.view = self._connection.ask(models.JobView, "POST", self._path + "/cancel")
+        except problems.JobEnded as problem:
+            if not problem.after_loss or (self.read()).state != "cancelled":
+                raise
+        assert self.view is not None
+        return self.view
+
+    def events(self) -> Generator[models.JobView]:
+        """Yield the job whenever it has changed, until it has ended; a lost connection is taken up again."""
+        with closing(follow(self._connection, self._path + "/events", {})) as events:
+            for event in events:
+                self.view = job = parsed(models.JobView, event.data)
+                yield job
+                if job.state not in OPEN:
+                    return
+
+
+def ended(job: models.JobView) -> models.JobView:
+    """Return a job that has succeeded.
+
+    Raises:
+        Problem: it has failed.
+        JobCancelled: it was cancelled.
+    """
+    if job.state == "failed":
+        found = job.problem.model_dump(exclude_none=True) if job.problem else {"detail": f"The job {job.id} failed."}
+        raise problem_of(found)
+    if job.state == "cancelled":
+        raise JobCancelled(job)
+    return job

@@ -1,0 +1,78 @@
+# Written from _async/lanes.py by scripts/client.  Do not edit.
+"""Connections to the service, one for each request that is under way at a time.
+
+httpx's pool looks at all of its connections whenever a request begins or ends; with many requests at a time that takes
+longer than the requests themselves.  Here every request has a transport of its own, which has one connection, and is
+lent to the next request afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from urllib.request import getproxies, proxy_bypass
+
+from placerec_client._http import httpx
+
+
+class Lanes(httpx.BaseTransport):
+    """A transport of httpx to one service.
+
+    Args:
+        url: of the service.
+        idle: seconds for which a connection is kept without a request.
+    """
+
+    def __init__(self, url: httpx.URL, idle: float) -> None:
+        self._limits = httpx.Limits(max_connections=1, max_keepalive_connections=1, keepalive_expiry=idle)
+        self._verify = httpx.create_ssl_context() if url.scheme == "https" else False
+        self._proxy = None if proxy_bypass(url.host) else getproxies().get(url.scheme)
+        self._free: list[httpx.HTTPTransport] = []
+        self._all: list[httpx.HTTPTransport] = []
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        """Send a request; its transport is free again when the answer is closed."""
+        lane = self._lane()
+        try:
+            response = lane.handle_request(request)
+        except BaseException:
+            self._free.append(lane)  # its connection is closed
+            raise
+        assert isinstance(response.stream, httpx.SyncByteStream)
+        response.stream = Lent(response.stream, self._free, lane)
+        return response
+
+    def _lane(self) -> httpx.HTTPTransport:
+        try:
+            return self._free.pop()
+        except IndexError:
+            made = httpx.HTTPTransport(verify=self._verify, limits=self._limits, proxy=self._proxy)
+            self._all.append(made)
+            return made
+
+    def close(self) -> None:
+        """Close all connections."""
+        for lane in self._all:
+            lane.close()
+
+
+class Lent(httpx.SyncByteStream):
+    """The body of an answer, whose transport is given back when it is closed."""
+
+    def __init__(
+        self, stream: httpx.SyncByteStream, free: list[httpx.HTTPTransport], lane: httpx.HTTPTransport
+    ) -> None:
+        self._stream, self._free, self._lane = stream, free, lane
+        self._open = True
+
+    def __iter__(self) -> Iterator[bytes]:
+        for chunk in self._stream:
+            yield chunk
+
+    def close(self) -> None:
+        """Close the answer."""
+        if self._open:
+            self._open = False
+            try:
+                self._stream.close()
+            finally:
+                self._free.append(self._lane)

@@ -1,0 +1,98 @@
+# Written from _async/places.py by scripts/client.  Do not edit.
+"""The places of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Unpack
+
+from placerec_client import models, parameters, problems
+from placerec_client._sync.connection import Connection
+from placerec_client.frames import Frame, frame_bytes, media_type
+from placerec_client.requests import fields, quoted
+
+
+class Places:
+    """The places of a map; iterated, in the order of their enrolment."""
+
+    def __init__(self, connection: Connection, path: str) -> None:
+        self._connection, self._path = connection, path + "/places"
+
+    def __iter__(self) -> Iterator[models.PlaceView]:
+        return self.list()
+
+    def list(self, **options: Unpack[parameters.ListPlaces]) -> Iterator[models.PlaceView]:
+        """Yield the places in the order of their enrolment.
+
+        Args:
+            options: which places: ``sequence``, ``camera``, ``after``, ``before``, ``where``.
+        """
+        for page in self._connection.pages(models.PlacePage, self._path, dict(options)):
+            for item in page.items:
+                yield item
+
+    def put(
+        self,
+        place_id: str,
+        frame: Frame,
+        *,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.EnrolPlace],
+    ) -> models.EnrolledPlace:
+        """Enrol one frame as a place, or replace the place of this id. The answer says that it is on disk.
+
+        Args:
+            place_id: which the caller chooses.
+            frame: bytes, a path, an open file, or pixels.
+            deadline: seconds after which an answer is of no use.
+            request_id: under which the service logs the request; made if left out.
+            options: such as ``x``, ``y``, ``heading``, ``sequence``, ``timestamp``, ``camera``, ``metadata``.
+        """
+        data = frame_bytes(frame)
+        return self._connection.ask(
+            models.EnrolledPlace,
+            "PUT",
+            self._of(place_id),
+            params=options,
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
+
+    def read(self, place_id: str) -> models.PlaceView:
+        """Return one place."""
+        return self._connection.ask(models.PlaceView, "GET", self._of(place_id))
+
+    def edit(self, place_id: str, changes: parameters.PlaceChanges) -> models.PlaceView:
+        """Change fields of a place; those left out stay, and None clears a field."""
+        return self._connection.ask(models.PlaceView, "PATCH", self._of(place_id), json=changes)
+
+    def forget(self, place_id: str) -> None:
+        """Delete a place: no later query finds it."""
+        try:
+            self._connection.request("DELETE", self._of(place_id))
+        except problems.UnknownPlace as problem:
+            if not problem.after_loss:
+                raise
+
+    def forget_many(self, **options: Unpack[parameters.Forgetting]) -> models.ForgottenPlaces:
+        """Delete the places of these ``ids``, or those that a ``filter`` lets through, in one commit.
+
+        It only reports which these are unless ``dry_run=False``.
+        """
+        path = self._path + ":forget"
+        return self._connection.ask(models.ForgottenPlaces, "POST", path, json=fields(options))
+
+    def matches(self, place_id: str, **options: Unpack[parameters.ListPlaceMatches]) -> models.PlaceMatchList:
+        """Return the latest answers in which a place was a match."""
+        path = self._of(place_id) + "/matches"
+        return self._connection.ask(models.PlaceMatchList, "GET", path, params=options)
+
+    def thumbnail(self, place_id: str) -> bytes:
+        """Return a small picture of a place, a JPEG file, if the map keeps one."""
+        return (self._connection.request("GET", self._of(place_id) + "/thumbnail")).content
+
+    def _of(self, place_id: str) -> str:
+        return f"{self._path}/{quoted(place_id)}"

@@ -1,0 +1,147 @@
+# Written from _async/sessions.py by scripts/client.  Do not edit.
+"""Sessions: the frames of one robot in order, and the belief about where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from types import TracebackType
+from typing import TYPE_CHECKING, Self, Unpack
+
+from placerec_client import models, parameters, problems
+from placerec_client._sync.connection import Connection
+from placerec_client._sync.numbering import Numbering
+from placerec_client.errors import PlacerecError
+from placerec_client.frames import Frame, frame_bytes, media_type
+from placerec_client.requests import quoted
+
+if TYPE_CHECKING:
+    from placerec_client._sync.streams import Stream
+
+
+class Sessions:
+    """The sessions of a map that have not ended; iterated, in the order of their ids."""
+
+    def __init__(self, connection: Connection, path: str) -> None:
+        self._connection, self._path = connection, path + "/sessions"
+
+    def __getitem__(self, session_id: str) -> Session:
+        return Session(self._connection, self._path, {}, session_id)
+
+    def __iter__(self) -> Iterator[models.SessionView]:
+        return self.list()
+
+    def list(self) -> Iterator[models.SessionView]:
+        """Yield the sessions."""
+        for page in self._connection.pages(models.SessionPage, self._path, {}):
+            for item in page.items:
+                yield item
+
+    def begin(self, **options: Unpack[parameters.NewSession]) -> Session:
+        """Return a session that begins when it is entered, and ends when it is left.
+
+        ::
+
+            with lab.sessions.begin(filter="bayes") as session:
+                answer = session.send(frame)
+
+        Args:
+            options: such as ``filter``, ``advance``, ``lag``, ``camera``, ``verify``, ``expires_after``.
+        """
+        return Session(self._connection, self._path, options)
+
+
+class Session:
+    """One session of one robot. Its frames are sent one after the other.
+
+    Attributes:
+        id: of the session; empty before it has begun.
+    """
+
+    def __init__(self, connection: Connection, path: str, options: parameters.NewSession, session_id: str = "") -> None:
+        self._connection, self._sessions, self._options, self.id = connection, path, options, session_id
+        self._numbering = Numbering(connection, self.path, None) if session_id else None
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.id!r})"
+
+    def __enter__(self) -> Self:
+        if not self.id:
+            self.begin()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    def begin(self) -> models.SessionView:
+        """Begin the session. If the answer to an attempt is lost, the session of that attempt ends by itself."""
+        view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
+        self.id = view.id
+        self._numbering = Numbering(self._connection, self.path, 0)
+        return view
+
+    def end(self) -> None:
+        """End the session; one that has ended already is left so."""
+        with suppress(problems.UnknownSession, problems.SessionExpired):
+            self._connection.request("DELETE", self.path)
+
+    def read(self) -> models.SessionReport:
+        """Return the session and the present belief about where its robot is."""
+        return self._connection.ask(models.SessionReport, "GET", self.path)
+
+    def send(
+        self,
+        image: Frame,
+        *,
+        deadline: float | None = None,
+        request_id: str | None = None,
+        **options: Unpack[parameters.SendFrame],
+    ) -> models.SessionAnswer:
+        """Send one frame, and return the belief after it.
+
+        A frame that is sent again because an answer was lost counts once, by its number.
+
+        Args:
+            image: the frame.
+            deadline: seconds after which an answer is of no use.
+            request_id: under which the service logs the request; made if left out.
+            options: such as ``frame`` (the robot's own number of the frame, growing; counted here if left out),
+                ``timestamp``, ``forward``, ``left``, ``turn``.
+        """
+        data = frame_bytes(image)
+        return self._connection.ask(
+            models.SessionAnswer,
+            "POST",
+            self.path + "/frames",
+            params=self._numbers().number(options),
+            content=data,
+            media_type=media_type(data),
+            deadline=deadline,
+            request_id=request_id,
+        )
+
+    def stream(self) -> Stream:
+        """Return a WebSocket to the session, for frames without a request for each.
+
+        It needs the package websockets, which ``placerec-client[stream]`` brings.
+
+        ::
+
+            with session.stream() as stream:
+                answer = stream.send(frame)
+        """
+        from placerec_client._sync.streams import Stream
+
+        return Stream(self._connection, self.path + "/stream", self._numbers())
+
+    def _numbers(self) -> Numbering:
+        if self._numbering is None:
+            raise PlacerecError("The session has not begun: enter it, or call begin().")
+        return self._numbering
+
+    @property
+    def path(self) -> str:
+        """The path of the session at the service."""
+        return f"{self._sessions}/{quoted(self.id)}"

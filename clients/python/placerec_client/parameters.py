@@ -1,0 +1,1112 @@
+"""The keyword arguments of the calls, as types: what each operation takes besides its frames.
+
+Written from openapi.json by scripts/client.  Do not edit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from typing import Any, Literal, NotRequired, TypedDict
+
+
+class Query(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/query``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: str | None
+    """The traverse that the frame belongs to."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    radius: float | None
+    """Metres: the place lies within this distance of the given position."""
+
+    heading_tolerance: float | None
+    """Degrees: the heading of the place differs by at most this much from `heading`."""
+
+    bbox: str | Sequence[float] | None
+    """west,south,east,north in degrees; a west greater than east crosses the antimeridian."""
+
+    sequences: str | Sequence[str] | None
+    """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    after: datetime | str | None
+    """The place was enrolled with this timestamp or later."""
+
+    before: datetime | str | None
+    """The place was enrolled with this timestamp or earlier."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: the place's metadata has these values under these keys, at its top level. Numbers are compared
+    as numbers; texts may have at most 512 characters.
+    """
+
+    soft: str | Sequence[str] | None
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
+    """
+
+    prior_trust: float | None
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
+    """
+
+    exclude_frames: int | None
+    """Leave out so many of the last places of the frame's own sequence."""
+
+    exclude_seconds: float | None
+    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
+    have no timestamp.
+    """
+
+    k: int
+    """How many matches to list."""
+
+    verify: Literal["auto", "always", "never"]
+    """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
+    where the scores leave doubt.
+    """
+
+    explain: bool
+    """Explain the score of the best match."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class QueryBatch(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/query:batch``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: str | None
+    """The traverse that the frame belongs to."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    radius: float | None
+    """Metres: the place lies within this distance of the given position."""
+
+    heading_tolerance: float | None
+    """Degrees: the heading of the place differs by at most this much from `heading`."""
+
+    bbox: str | Sequence[float] | None
+    """west,south,east,north in degrees; a west greater than east crosses the antimeridian."""
+
+    sequences: str | Sequence[str] | None
+    """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    after: datetime | str | None
+    """The place was enrolled with this timestamp or later."""
+
+    before: datetime | str | None
+    """The place was enrolled with this timestamp or earlier."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: the place's metadata has these values under these keys, at its top level. Numbers are compared
+    as numbers; texts may have at most 512 characters.
+    """
+
+    soft: str | Sequence[str] | None
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
+    """
+
+    prior_trust: float | None
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
+    """
+
+    exclude_frames: int | None
+    """Leave out so many of the last places of the frame's own sequence."""
+
+    exclude_seconds: float | None
+    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
+    have no timestamp.
+    """
+
+    k: int
+    """How many matches to list."""
+
+    verify: Literal["auto", "always", "never"]
+    """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
+    where the scores leave doubt.
+    """
+
+    explain: bool
+    """Explain the score of the best match."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class ListMaps(TypedDict, total=False):
+    """Parameters of ``/v1/maps``."""
+
+    limit: int
+    """Most items on a page."""
+
+
+class VerifyMap(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/verify``."""
+
+
+class EnrolPlace(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places/{place}``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: str | None
+    """The traverse that the frame belongs to."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    metadata: str | Mapping[str, Any] | None
+    """A JSON object."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class ListPlaces(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places``."""
+
+    limit: int
+    """Most items on a page."""
+
+    sequence: str | None
+    """Only the places of this traverse."""
+
+    camera: str | None
+    """Only places that this camera took."""
+
+    after: datetime | str | None
+    """Only places with this timestamp or a later one."""
+
+    before: datetime | str | None
+    """Only places with this timestamp or an earlier one."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: only places whose metadata has these values under these keys, at its top level."""
+
+
+class EnrolPlaces(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places``."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+    align: bool
+    """With background: align the traverses of the form with those that the map has, once all frames are enrolled, as
+    POST …/align does; the job's result has the reports in `aligned`.
+    """
+
+    batch: str | None
+    """A name for this batch, for example a random one, to which another batch can refer with after."""
+
+    after: str | None
+    """The batch of this map after which this one is to be stored. It may still be under way: this one is encoded
+    meanwhile. If it is not stored in time, the answer is 409 batch-out-of-order, and nothing of this batch is
+    stored.
+    """
+
+
+class ListSequences(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/sequences``."""
+
+    limit: int
+    """Most items on a page."""
+
+
+class ReadPlan(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/plan``."""
+
+    step: int
+    """List about every so manieth place."""
+
+
+class FollowMap(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/events``."""
+
+    kinds: str | Sequence[str] | None
+    """The kinds of events, separated by commas: query, enrolment, session, job, map; all if left out."""
+
+    verdicts: str | Sequence[str] | None
+    """Only queries with these verdicts, separated by commas: recognized, ambiguous, unknown; all if left out. Events
+    of other kinds are not affected.
+    """
+
+    pictures: bool
+    """Tell queries with a small picture of the frame, if the map keeps pictures of its places. This needs a key of
+    the role `enrol`.
+    """
+
+
+class ReadCalibration(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/calibration``."""
+
+    threshold: float | None
+    """Another threshold on the decision value."""
+
+    margin: float | None
+    """Another margin."""
+
+
+class QueryOrEnrol(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/query:enrol``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: str | None
+    """The traverse that the frame belongs to."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    radius: float | None
+    """Metres: the place lies within this distance of the given position."""
+
+    heading_tolerance: float | None
+    """Degrees: the heading of the place differs by at most this much from `heading`."""
+
+    bbox: str | Sequence[float] | None
+    """west,south,east,north in degrees; a west greater than east crosses the antimeridian."""
+
+    sequences: str | Sequence[str] | None
+    """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    after: datetime | str | None
+    """The place was enrolled with this timestamp or later."""
+
+    before: datetime | str | None
+    """The place was enrolled with this timestamp or earlier."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: the place's metadata has these values under these keys, at its top level. Numbers are compared
+    as numbers; texts may have at most 512 characters.
+    """
+
+    soft: str | Sequence[str] | None
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
+    """
+
+    prior_trust: float | None
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
+    """
+
+    exclude_frames: int | None
+    """Leave out so many of the last places of the frame's own sequence."""
+
+    exclude_seconds: float | None
+    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
+    have no timestamp.
+    """
+
+    metadata: str | Mapping[str, Any] | None
+    """A JSON object."""
+
+    k: int
+    """How many matches to list."""
+
+    verify: Literal["auto", "always", "never"]
+    """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
+    where the scores leave doubt.
+    """
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class QueryMaps(TypedDict, total=False):
+    """Parameters of ``/v1/query``."""
+
+    x: float | None
+    """Metres in the map's frame; with y."""
+
+    y: float | None
+    """Metres in the map's frame; with x."""
+
+    z: float | None
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: float | None
+    """Degrees, WGS 84."""
+
+    longitude: float | None
+    """Degrees, WGS 84."""
+
+    heading: float | None
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: datetime | str | None
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: str | None
+    """The traverse that the frame belongs to."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    radius: float | None
+    """Metres: the place lies within this distance of the given position."""
+
+    heading_tolerance: float | None
+    """Degrees: the heading of the place differs by at most this much from `heading`."""
+
+    bbox: str | Sequence[float] | None
+    """west,south,east,north in degrees; a west greater than east crosses the antimeridian."""
+
+    sequences: str | Sequence[str] | None
+    """The place belongs to one of these traverses: names separated by commas, or a JSON array of texts."""
+
+    after: datetime | str | None
+    """The place was enrolled with this timestamp or later."""
+
+    before: datetime | str | None
+    """The place was enrolled with this timestamp or earlier."""
+
+    where: str | Mapping[str, Any] | None
+    """A JSON object: the place's metadata has these values under these keys, at its top level. Numbers are compared
+    as numbers; texts may have at most 512 characters.
+    """
+
+    soft: str | Sequence[str] | None
+    """Which of position, bbox, heading, sequences, time, where are not filters but priors, which weigh the places;
+    separated by commas.
+    """
+
+    prior_trust: float | None
+    """The probability that the soft parameters are right; 0.9 if left out. The odds of a place that contradicts them
+    are multiplied by at least 1 - prior_trust.
+    """
+
+    exclude_frames: int | None
+    """Leave out so many of the last places of the frame's own sequence."""
+
+    exclude_seconds: float | None
+    """Leave out the places of the frame's own sequence that were taken within so many seconds of the frame, or that
+    have no timestamp.
+    """
+
+    maps: str | Sequence[str] | None
+    """Ids of the maps, separated by commas, at most 100; all maps if left out."""
+
+    cameras: str | Mapping[str, Any] | None
+    """A JSON object with the camera of each part of the form."""
+
+    k: int
+    """How many matches to list."""
+
+    verify: Literal["auto", "always", "never"]
+    """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
+    where the scores leave doubt.
+    """
+
+
+class ListSessions(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/sessions``."""
+
+    limit: int
+    """Most items on a page."""
+
+
+class SendFrame(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/sessions/{session}/frames``."""
+
+    frame: int | None
+    """The robot's own number of the frame; numbers grow. A missing number is a frame that did not arrive; the last
+    number again is the same frame sent again, and gets the same answer.
+    """
+
+    timestamp: datetime | str | None
+    """When the frame was taken; never before the last one."""
+
+    forward: float | None
+    """Odometry: metres forward since the frame before, in the direction that the robot faced then."""
+
+    left: float | None
+    """Odometry: metres to the left; with forward."""
+
+    turn: float | None
+    """Odometry: degrees turned counter-clockwise since the frame before; with forward."""
+
+    deviation: float | None
+    """Standard deviation of forward and left, metres."""
+
+    turn_deviation: float | None
+    """Standard deviation of turn, degrees."""
+
+    k: int
+    """How many matches to list."""
+
+    encoder: str | None
+    """Name or identity that the map's encoder must have (409 otherwise)."""
+
+
+class ListReview(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/review``."""
+
+    limit: int
+    """Most items on a page."""
+
+    labelled: bool | None
+    """Only frames with a label, or only those without one."""
+
+
+class ListAnswers(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/answers``."""
+
+    limit: int
+    """Most answers, the latest ones."""
+
+    verdict: Literal["recognized", "ambiguous", "unknown"] | None
+    """Only answers with this verdict."""
+
+
+class ListPlaceMatches(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/places/{place}/matches``."""
+
+    limit: int
+    """Most answers, the latest ones."""
+
+
+class Encode(TypedDict, total=False):
+    """Parameters of ``/v1/encode``."""
+
+    encoder: str | None
+    """Name or identity; the default encoder if left out."""
+
+
+class Regions(TypedDict, total=False):
+    """Parameters of ``/v1/regions``."""
+
+    encoder: str | None
+    """Name or identity; the default encoder if left out."""
+
+    limit: int | None
+    """Only so many, those of the highest energy."""
+
+    format: Literal["json", "png"] | None
+    """json or png; if left out, the Accept header decides, and json is the default."""
+
+
+class Match(TypedDict, total=False):
+    """Parameters of ``/v1/match``."""
+
+    encoder: str | None
+    """Name or identity; the default encoder if left out."""
+
+    explain: bool
+    """Say which words, regions and cells carried the score."""
+
+    format: Literal["json", "png"] | None
+    """png: both frames side by side, what answers each other joined by lines; if left out, the Accept header
+    decides, and json is the default.
+    """
+
+
+class CheckHealth(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/health``."""
+
+    seconds: float
+    """Seconds for examining the map's frames; of a large map only a part is examined in that time."""
+
+    limit: int
+    """How many places, gaps and stretches are listed at most, each."""
+
+
+class CompareTraverses(TypedDict, total=False):
+    """Parameters of ``/v1/maps/{map}/similarity``."""
+
+
+class ImportMap(TypedDict, total=False):
+    """Parameters of ``/v1/maps/import``."""
+
+    id: str | None
+    """Id of the new map; if left out, the one that the file states."""
+
+    encoder: str | None
+    """Name or identity of the encoder that the map is expected to have."""
+
+
+class ListJobs(TypedDict, total=False):
+    """Parameters of ``/v1/jobs``."""
+
+    limit: int
+    """Most items on a page."""
+
+    map: str | None
+    """Only the jobs of this map."""
+
+    kind: str | None
+    """Only the jobs of this kind."""
+
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"] | None
+    """Only the jobs in this state."""
+
+
+class ReadJob(TypedDict, total=False):
+    """Parameters of ``/v1/jobs/{job}``."""
+
+
+class ListKeys(TypedDict, total=False):
+    """Parameters of ``/v1/keys``."""
+
+    limit: int
+    """Most items on a page."""
+
+
+class CreateKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class NarrowKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys/{key}``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class RevokeKey(TypedDict, total=False):
+    """Parameters of ``/v1/keys/{key}``."""
+
+    lock_out: bool
+    """Go on although no key of the role admin for all maps will be in force, so that only a command on the service's
+    machine can change keys.
+    """
+
+
+class ReadAudit(TypedDict, total=False):
+    """Parameters of ``/v1/audit``."""
+
+    limit: int
+    """Most items on a page."""
+
+    map: str | None
+    """Only lines about this map."""
+
+    key: str | None
+    """Only what the key of this id or name asked for."""
+
+    operation: str | None
+    """Only this operation."""
+
+    after: datetime | str | None
+    """Only lines of this time or later."""
+
+    before: datetime | str | None
+    """Only lines of this time or earlier."""
+
+
+class NewMap(TypedDict, total=False):
+    """The settings of a new map."""
+
+    description: str
+
+    keep: Literal["none", "thumbnail", "image"]
+    """What is kept of each frame. A change applies to frames enrolled from then on."""
+
+    same_place_radius: float
+    """Places within so many metres are the same place."""
+
+    same_place_frames: int
+    """Without poses: places so many frames apart in their sequence are the same place."""
+
+    verification: bool
+    """Whether keypoints are kept of each frame, by which answers are verified. A change applies to frames enrolled
+    from then on.
+    """
+
+    index: Literal["auto", "exact", "compact", "inverted"]
+    """How the map is searched: every place compared (exact), by codes (compact; inverted, a former tier, is another
+    name of it), or by what suits its size (auto): compact from 256 places.
+    """
+
+    review: ReviewSetting | None
+    """Which frames are kept to be reviewed by people; null: none."""
+
+    encoder: str | None
+    """Name or full identity of the encoder; the default encoder if left out."""
+
+    precision: Literal["half", "compressed"]
+    """How the descriptors are stored; it cannot be changed later."""
+
+
+class MapChanges(TypedDict, total=False):
+    """A merge patch (RFC 7396) of a map: null restores the default, and what is left out stays as it is."""
+
+    description: str | None
+
+    keep: Literal["none", "thumbnail", "image"] | None
+
+    same_place_radius: float | None
+
+    same_place_frames: int | None
+
+    verification: bool | None
+
+    index: Literal["auto", "exact", "compact", "inverted"] | None
+    """auto, exact or compact (auto from 256 places on); inverted is compact."""
+
+    review: ReviewChanges | None
+    """null: no frames are kept from now on."""
+
+    calibration: CalibrationChanges | None
+
+
+class PlaceChanges(TypedDict, total=False):
+    """A merge patch (RFC 7396) of a place: null clears a field, and fields that are left out stay."""
+
+    pose: PoseChanges | None
+
+    timestamp: datetime | str | None
+
+    sequence: str | None
+
+    metadata: Mapping[str, Any] | None
+
+
+class NewSession(TypedDict, total=False):
+    """The options of a session."""
+
+    filter: Literal["bayes", "path"]
+    """bayes: a hidden Markov model over the places. path: the best straight path through the last frames, as in
+    SeqSLAM; it uses neither odometry nor a speed limit.
+    """
+
+    advance: float
+    """By how many frames of the map's traverse the robot usually moves on from one frame to the next; used where
+    neither odometry nor a speed limit is given.
+    """
+
+    backwards: bool
+    """The robot may move against the traverse as well as along it."""
+
+    speed_limit: float | None
+    """Metres per second. Every frame then needs a timestamp, and the places need poses."""
+
+    sequences: Sequence[str] | None
+    """Only the places of these traverses."""
+
+    lag: int
+    """Also estimate where the robot was so many frames ago, given all frames since."""
+
+    path_frames: int
+    """Frames of a path; for the filter path."""
+
+    camera: str | None
+    """The camera of the map that took the frame; its mask is applied."""
+
+    verify: Literal["auto", "always", "never"]
+    """Whether the keypoints of the frame and of its best candidates are compared: always, never, or (auto) only
+    where the scores leave doubt.
+    """
+
+    expires_after: float | None
+    """Seconds without a frame after which the session ends; the service's setting is the default and the maximum."""
+
+
+class Aligning(TypedDict, total=False):
+    """Which traverse is aligned with which others."""
+
+    poses: bool
+    """Give each frame without a pose that of its counterpart; the place then says so in `pose_of`."""
+
+    dry_run: bool
+    """Only report what would be stored."""
+
+
+class Pruning(TypedDict, total=False):
+    """Which places are removed because their neighbours can stand in for them."""
+
+    dry_run: bool
+    """Only report which places would be removed, and how much recall would be lost."""
+
+    max_recall_loss: float
+    """How much recall may be lost, as a share of the queries."""
+
+    similarity: float | None
+    """How alike two frames of one place must look (score of the first stage) for one to stand in for the other. If
+    left out, it is chosen by the loss of recall; if given, `max_recall_loss` is ignored.
+    """
+
+    sequence: str | None
+    """Only places of this traverse may be removed."""
+
+    queries: str | None
+    """The traverse whose frames are the queries; it is neither searched nor pruned. If left out, every frame is a
+    query for which the map is searched without that frame. This overestimates recall, since the neighbouring frames
+    were taken with it.
+    """
+
+    sample: int
+    """How many queries are asked at most."""
+
+
+class Merging(TypedDict, total=False):
+    """Which map is merged into this one, and how conflicts are solved."""
+
+    dry_run: bool
+    """Only report what would be copied, and how far the maps overlap."""
+
+    on_conflict: Literal["refuse", "rename", "skip"]
+    """What to do if an id belongs to another frame here, both maps have a sequence of the same name, or a camera has
+    another mask: `refuse` the merge; `rename` what is copied, with `prefix`; `skip` such places, and append places
+    of a sequence to the sequence of the same name.
+    """
+
+    prefix: str | None
+    """Put before names on conflict; if left out, the other map's id and a hyphen."""
+
+    sample: int
+    """How many places the overlap is measured with at most; 0: it is not measured."""
+
+
+class Reencoding(TypedDict, total=False):
+    """Which new map is made from a map, and for which encoder."""
+
+    encoder: str | None
+    """Name or full identity of the encoder; the default encoder if left out."""
+
+
+class CalibrationOrder(TypedDict, total=False):
+    """How a map is to be calibrated, and for which target."""
+
+    target: Target
+    """What the threshold is chosen to reach."""
+
+    dry_run: bool
+    """Report the calibration without storing it."""
+
+    sequence: str | None
+    """The traverse whose frames are asked."""
+
+    pairs: Mapping[str, str | None] | None
+    """For places of the sequence, the id of a place of another sequence that shows the same, or null if there is
+    none. Only these places are asked. If left out, poses decide which places are the same.
+    """
+
+    most: int
+    """How many frames are asked at most; they are chosen evenly."""
+
+    beside: Literal["encoder", "map", "none"]
+    """With the method labels, what the labels join, since they are few and of the doubtful frames. `encoder`: the
+    encoder's calibration, whose curve is moved as far as the labels demand; the target is not used then. `map`: the
+    map's own frames, which are asked as well. `none`: nothing.
+    """
+
+    labels: Sequence[Label] | None
+    """One label for each frame of the form."""
+
+
+class CameraDefinition(TypedDict, total=False):
+    """Which part of a camera's frames is ignored, and which direction each pixel looks in."""
+
+    mask: Mask | None
+    """The part that is ignored; null if nothing is."""
+
+    intrinsics: Intrinsics | None
+    """Of the upright frame, as in ROS's CameraInfo; null if they are not known."""
+
+
+class NewKey(TypedDict, total=False):
+    """A key to create."""
+
+    maps: Sequence[str] | None
+    """Limit it to these maps; null or left out: all maps."""
+
+    expires_at: datetime | str | None
+    """When it expires; null or left out: never."""
+
+
+class KeyChanges(TypedDict, total=False):
+    """A merge patch (RFC 7396) of a key; what is left out stays. The key can only be narrowed."""
+
+    role: Literal["query", "enrol", "admin"] | None
+    """Not higher than now."""
+
+    maps: Sequence[str] | None
+    """Some of the present ones; null: all maps."""
+
+    expires_at: datetime | str | None
+    """Not later than now; null: never."""
+
+
+class Forgetting(TypedDict, total=False):
+    """Which places to forget: those of some ids, or those that fulfil some conditions."""
+
+    ids: Sequence[str] | None
+    """Ids of places; those that are gone are told."""
+
+    filter: PlaceConditions | None
+    """Conditions, at least one."""
+
+    dry_run: bool
+    """Only say which places would be forgotten."""
+
+
+class LabelOrder(TypedDict, total=False):
+    """What a frame shows, or that it is thrown away: exactly one of these."""
+
+    place: str | None
+    """It shows this place of the map."""
+
+    new: NewPlace | None
+    """It shows a new place, as which it is enrolled."""
+
+    stranger: bool
+    """It shows no place of this map."""
+
+    discard: bool
+    """It is thrown away."""
+
+
+class Label(TypedDict):
+    """The true place of one frame of a form."""
+
+    file: str
+    """Name of the file part that holds the frame."""
+
+    place: str | None
+    """Id of the place that the frame shows; null if the map lacks that place."""
+
+    camera: NotRequired[str | None]
+    """The camera of the map that took the frame; its mask is applied."""
+
+
+class Target(TypedDict):
+    """What the threshold is to reach. ``precision``: so many of the answers believed are right.
+    ``false_accept_rate``: at most so many of the frames of places that the map lacks are believed.
+    ``mean_of_negatives``: the rule of the thesis (3.4.3), the mean over the frames of places that the map lacks; it
+    has no value.
+    """
+
+    rule: Literal["precision", "false_accept_rate", "mean_of_negatives"]
+
+    value: NotRequired[float | None]
+
+
+class Intrinsics(TypedDict):
+    """Focal lengths, principal point and distortion of a camera, for upright frames of width x height pixels."""
+
+    width: int
+    """Pixels of a row of the upright frame for which the other values hold."""
+
+    height: int
+
+    fx: float
+    """Focal length in pixels, as is fy."""
+
+    fy: float
+
+    cx: float
+    """Principal point in pixels, as is cy; the first pixel's centre is at 0."""
+
+    cy: float
+
+    distortion_model: NotRequired[Literal["none", "plumb_bob", "rational_polynomial", "equidistant"]]
+    """As in ROS's CameraInfo; equidistant: fisheye."""
+
+    distortion: NotRequired[Sequence[float]]
+    """k1, k2, p1, p2, k3 of plumb_bob, and k4, k5, k6; k1 to k4 of equidistant."""
+
+
+class Mask(TypedDict):
+    """What to ignore in each frame of one camera. ``polygons`` are given by their corners, (x, y) in shares of the
+    upright frame's width and height, from its top left corner; where they overlap, all that any of them holds is
+    covered.
+    """
+
+    polygons: Sequence[Sequence[tuple[float, float]]]
+
+
+class PlaceConditions(TypedDict):
+    """Conditions on a place; all that are given have to hold."""
+
+    sequence: NotRequired[str | None]
+    """It belongs to this traverse."""
+
+    camera: NotRequired[str | None]
+    """This camera took its frame."""
+
+    after: NotRequired[datetime | str | None]
+    """It has this timestamp or a later one."""
+
+    before: NotRequired[datetime | str | None]
+    """It has this timestamp or an earlier one."""
+
+    where: NotRequired[Mapping[str, Any] | None]
+    """Its metadata has these values under these keys, at its top level."""
+
+
+class NewPlace(TypedDict):
+    """The place as which a frame is enrolled."""
+
+    x: NotRequired[float | None]
+    """Metres in the map's frame; with y."""
+
+    y: NotRequired[float | None]
+    """Metres in the map's frame; with x."""
+
+    z: NotRequired[float | None]
+    """Metres in the map's frame; beside x and y."""
+
+    latitude: NotRequired[float | None]
+    """Degrees, WGS 84."""
+
+    longitude: NotRequired[float | None]
+    """Degrees, WGS 84."""
+
+    heading: NotRequired[float | None]
+    """Degrees: counter-clockwise from +x beside x and y, clockwise from north beside a latitude."""
+
+    timestamp: NotRequired[datetime | str | None]
+    """When the frame was taken (ISO 8601; UTC without a zone)."""
+
+    sequence: NotRequired[str | None]
+    """The traverse that the frame belongs to."""
+
+    camera: NotRequired[str | None]
+    """The camera of the map that took the frame; its mask is applied."""
+
+    id: str
+    """Id of the place."""
+
+    metadata: NotRequired[Mapping[str, Any]]
+
+
+class CalibrationChanges(TypedDict):
+    """Values of a calibration to set by hand; null restores the encoder's value."""
+
+    threshold: NotRequired[float | None]
+
+    margin: NotRequired[float | None]
+
+
+class ReviewChanges(TypedDict):
+    """Which frames to keep for review; null restores a default."""
+
+    verdicts: NotRequired[Sequence[Literal["recognized", "ambiguous", "unknown"]] | None]
+
+    most_frames: NotRequired[int | None]
+
+    most_bytes: NotRequired[int | None]
+
+
+class ReviewSetting(TypedDict):
+    """Which frames a map keeps so that people can say later what they show, and how many at most."""
+
+    verdicts: NotRequired[Sequence[Literal["recognized", "ambiguous", "unknown"]]]
+    """Frames that are answered with one of these are kept."""
+
+    most_frames: NotRequired[int]
+    """Most frames; the oldest go first."""
+
+    most_bytes: NotRequired[int]
+    """Most bytes of their files together; the oldest go first."""
+
+
+class PoseChanges(TypedDict):
+    """Part of a pose; null removes a coordinate."""
+
+    x: NotRequired[float | None]
+
+    y: NotRequired[float | None]
+
+    z: NotRequired[float | None]
+
+    latitude: NotRequired[float | None]
+
+    longitude: NotRequired[float | None]
+
+    heading: NotRequired[float | None]

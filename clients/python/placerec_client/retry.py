@@ -1,0 +1,58 @@
+"""When a request is sent again, and how long the client waits before."""
+
+from __future__ import annotations
+
+import random
+import time
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Retry:
+    """How long a request is repeated while the service is overloaded, restarts, or cannot be reached.
+
+    A request is repeated only where another answer may come: after 429, 502, 503, 504 and a lost connection, always
+    under the same ``X-Request-Id``, after pauses that double, with some randomness, and never sooner than the service's
+    ``Retry-After`` says.
+
+    Args:
+        patience: seconds after the first attempt in which further ones may begin; 0 sends once. A call with a deadline
+            is repeated until its deadline instead.
+        first_pause, longest_pause: seconds.
+    """
+
+    patience: float = 30.0
+    first_pause: float = 0.1
+    longest_pause: float = 8.0
+
+    def pause(self, attempt: int) -> float:
+        """Seconds to wait after so many failed attempts, at random between half and one and a half of the nominal."""
+        nominal = self.first_pause * 2.0 ** min(attempt - 1, 30)
+        return min(nominal, self.longest_pause) * random.uniform(0.5, 1.5)
+
+
+class Clock:
+    """The time of one call.
+
+    Args:
+        deadline: seconds until an answer is of no use; None for none.
+        retry: for how long the call is repeated if it has no deadline.
+    """
+
+    __slots__ = ("_patience", "_until", "attempts", "deadline", "lost")
+
+    def __init__(self, deadline: float | None, retry: Retry) -> None:
+        now = time.monotonic()
+        self._until = None if deadline is None else now + deadline
+        self._patience = now + retry.patience if self._until is None or not retry.patience else self._until
+        self.deadline = deadline
+        self.attempts = 0
+        self.lost = False  # whether the service may have done what was asked for without being heard
+
+    def left(self) -> float | None:
+        """Seconds until the deadline; None without one."""
+        return None if self._until is None else self._until - time.monotonic()
+
+    def allows(self, pause: float) -> bool:
+        """Whether another attempt may begin after this pause."""
+        return time.monotonic() + pause < self._patience

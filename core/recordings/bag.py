@@ -1,0 +1,253 @@
+"""Bags: rosbag2 (SQLite, MCAP) and ROS 1; their topics, the frames of one of them, and the path that another tells."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from core.errors import InvalidRecording, InvalidTrajectory, UnknownTopic
+from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES, natural_key
+from core.recordings.frame import NANOSECONDS, Frame, make_id, utc
+from core.recordings.mcap_storage import McapStorage
+from core.recordings.messages import FIX, POSE_TYPES, check_installed, picture_of, pose_of
+from core.recordings.ros1_storage import Ros1Storage
+from core.recordings.sqlite_storage import SqliteStorage
+from core.recordings.storage import Entry, Storage, Topic
+from core.recordings.trajectory import Trajectory
+
+STORAGES: dict[str, type[SqliteStorage] | type[McapStorage] | type[Ros1Storage]] = {
+    ".db3": SqliteStorage,
+    ".mcap": McapStorage,
+    ".bag": Ros1Storage,
+}
+PACKED = ".zstd"
+"""The further suffix of a file that the recorder has compressed as a whole."""
+
+LONGEST_TOPIC = 96
+"""Characters of a topic's name in the ids of places."""
+
+JUMP_SECONDS, JUMP_STEPS = 60.0, 100.0
+"""A clock jumps ahead if it goes on by more than a minute and a hundred times the usual step."""
+
+
+OF_DIRECTORIES = (".db3", ".mcap")
+
+
+def bag_files(path: Path) -> list[Path]:
+    """The files of a bag by their names: the file itself, or those of a rosbag2 directory in natural order.
+
+    There are none if the path is no bag.  A directory with pictures is none, whatever else lies in it.
+    """
+    if not path.is_dir():
+        return [path] if _kind_of(path) in STORAGES else []
+    try:
+        entries = [one for one in path.iterdir() if not one.name.startswith(".")]
+    except OSError:
+        return []
+    if any(one.suffix.lower() in SUPPORTED_SUFFIXES | OTHER_SUFFIXES for one in entries):
+        return []
+    files = [one for one in entries if _kind_of(one) in OF_DIRECTORIES]
+    return sorted(files, key=lambda one: natural_key(one.name))
+
+
+def _kind_of(path: Path) -> str:
+    """The suffix without that of the compression."""
+    return Path(path.name.removesuffix(PACKED)).suffix.lower()
+
+
+class Bag:
+    """The files of one bag, opened.
+
+    remarks: sentences about what was found in them that a user must know.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a bag: a file, or a directory of files.
+
+        Raises:
+            MissingExtra: what reads bags is not installed.
+            InvalidRecording: a file cannot be read, or is no bag.
+        """
+        check_installed()
+        self.path, self.remarks = path, list[str]()
+        self._lock = threading.Lock()  # of the files: frames may be loaded by any thread
+        self._unpacked = tempfile.TemporaryDirectory(prefix="placerec-")
+        self._files: list[tuple[Path, Storage]] = []
+        try:
+            for file in bag_files(path):
+                self._files.append((file, self._open(file)))
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, file: Path) -> Storage:
+        try:
+            file.open("rb").close()  # SQLite would not say why it cannot
+            if file.name.endswith(PACKED):
+                return STORAGES[_kind_of(file)](self._unpack(file))
+            return STORAGES[_kind_of(file)](file)
+        except OSError as error:
+            raise InvalidRecording(f"{file} cannot be read: {error.strerror or error}.") from error
+
+    def _unpack(self, file: Path) -> Path:
+        """The file that the recorder has compressed as a whole, unpacked into a folder that goes with this object."""
+        import zstandard
+
+        unpacked = Path(self._unpacked.name) / file.name.removesuffix(PACKED)
+        try:
+            with file.open("rb") as packed, unpacked.open("wb") as plain:
+                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), plain)
+        except zstandard.ZstdError as error:
+            self.remarks.append(f"{file.name} is cut short or damaged ({error}); what could be unpacked of it is read.")
+        return unpacked
+
+    def close(self) -> None:
+        """Close the files."""
+        for _, storage in self._files:
+            storage.close()
+        self._unpacked.cleanup()
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """The topics of all files by name."""
+        found: dict[str, Topic] = {}
+        for _, storage in self._files:
+            for name, topic in storage.topics.items():
+                before = found.get(name, Topic(topic.kind, 0, topic.coding))
+                found[name] = Topic(before.kind, before.messages + topic.messages, before.coding)
+        return found
+
+    def choose(self, name: str | None, kinds: Sequence[str], what: str) -> str:
+        """The topic of this name, or without a name the only one of these types that has messages.
+
+        Args:
+            what: such topics are called in messages.
+
+        Raises:
+            UnknownTopic: there is none, it is of another type or has no message, or several could be meant.
+        """
+        topics = self.topics
+        fitting = {one: topic for one, topic in topics.items() if topic.kind in kinds}
+        told = "; ".join(f"{one} ({topic.kind}, {topic.messages} messages)" for one, topic in fitting.items())
+        there = f"It has these topics of {what}: {told}." if told else f"It has no topic of {what}."
+        if name is None:
+            filled = [one for one, topic in fitting.items() if topic.messages]
+            if len(filled) == 1:
+                return self.choose(filled[0], kinds, what)
+            wish = "Name one with --topic. " if filled else ""
+            raise UnknownTopic(f"{self.path} has {len(filled)} topics of {what} with messages. {wish}{there}")
+        if name not in topics:
+            raise UnknownTopic(f"{self.path} has no topic {name!r}. {there}")
+        topic = topics[name]
+        if topic.kind not in kinds:
+            raise UnknownTopic(f"The topic {name} of {self.path} is of the type {topic.kind}, not of {what}. {there}")
+        if not topic.messages:
+            raise UnknownTopic(f"The topic {name} of {self.path} has no messages. {there}")
+        if topic.coding is None:
+            raise UnknownTopic(f"The messages of {name} in {self.path} are written neither by ROS 1 nor by ROS 2.")
+        return name
+
+    def frames(self, name: str) -> list[Frame]:
+        """The frames of a topic that ``choose`` has given, in the order of their times; remarks tell what is odd.
+
+        The id of a frame is made of the topic and its stamp.
+        """
+        found = self._entries(name)
+        entries = self._in_time(name, found)
+        start = make_id(name.strip("/"))[:LONGEST_TOPIC]
+        frames, seen = [], Counter[int]()
+        for file, entry in entries:
+            taken = entry.stamp or entry.received
+            seen[taken] += 1
+            seconds, rest = divmod(taken, NANOSECONDS)
+            written = f"{seconds}.{rest:09d}"
+            again = f"~{seen[taken]}" if seen[taken] > 1 else ""
+            load = partial(self._picture, file, name, entry)
+            frames.append(Frame(f"{start}-{written}{again}", f"{name} at {written}", load, None, utc(taken), taken))
+        return frames
+
+    def _picture(self, file: int, name: str, entry: Entry) -> bytes:
+        storage = self._files[file][1]
+        with self._lock:
+            data = storage.read(entry.key)
+        topic = storage.topics[name]
+        return picture_of(data, topic.kind, topic.coding or "cdr")
+
+    def _entries(self, name: str) -> list[tuple[int, Entry]]:
+        """The messages of a topic in the order of the bag, with the numbers of their files."""
+        with self._lock:
+            return [
+                (file, entry)
+                for file, (_, storage) in enumerate(self._files)
+                if name in storage.topics
+                for entry in storage.entries(name)
+            ]
+
+    def _in_time(self, name: str, found: list[tuple[int, Entry]]) -> list[tuple[int, Entry]]:
+        """Entries in the order of their times; what is odd about the times becomes a remark."""
+        unstamped = sum(not entry.stamp for _, entry in found)
+        if unstamped:
+            self.remarks.append(
+                f"{unstamped} of {len(found)} messages of {name} have no stamp: for them the time counts at which the "
+                "bag received them."
+            )
+        times = np.array([entry.stamp or entry.received for _, entry in found], np.int64)
+        steps = np.diff(times) / NANOSECONDS
+        if (steps < 0).any():
+            self.remarks.append(
+                f"The times of {name} go back {(steps < 0).sum()} times in the bag, by up to {-steps.min():.3f} s: its "
+                "frames are taken in the order of their times, not in that of the bag."
+            )
+        order = np.argsort(times, kind="stable")
+        steps = np.diff(times[order]) / NANOSECONDS
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        jumps = np.flatnonzero((steps > JUMP_SECONDS) & (steps > JUMP_STEPS * usual))
+        if jumps.size:
+            self.remarks.append(
+                f"The times of {name} jump ahead {jumps.size} times, by up to {steps[jumps].max():.0f} s: the clock "
+                "was set, or the recording was paused."
+            )
+        return [found[number] for number in order]
+
+    def trajectory(self, name: str) -> Trajectory:
+        """The path that the poses of a topic tell.
+
+        Raises:
+            UnknownTopic: the bag has no such topic of poses.
+            InvalidTrajectory: no message of it tells a pose.
+        """
+        self.choose(name, POSE_TYPES, "poses")
+        times, places, turns, idle = [], [], [], 0
+        for file, entry in self._entries(name):
+            storage = self._files[file][1]
+            topic = storage.topics[name]
+            with self._lock:
+                data = storage.read(entry.key)
+            pose = pose_of(data, topic.kind, topic.coding or "cdr")
+            if pose is None:
+                idle += 1
+                continue
+            times.append(entry.stamp or entry.received)
+            places.append(pose[0])
+            turns.append(pose[1])
+        if idle:
+            self.remarks.append(f"{idle} messages of {name} tell no position (no fix) and are left out.")
+        if not times:
+            raise InvalidTrajectory(f"No message of {name} tells a position.")
+        return Trajectory.of_samples(times, places, turns, self.topics[name].kind == FIX)
+
+    def told(self) -> list[str]:
+        """All remarks, those about damaged files first."""
+        damaged = [
+            f"{file.name} {storage.problem}: what could be read of it is taken."
+            for file, storage in self._files
+            if storage.problem is not None
+        ]
+        return damaged + self.remarks

@@ -1,0 +1,141 @@
+"""A folder of pictures: those that its ``places.csv`` lists, in that order, or all, in natural order."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from core.errors import InvalidRecording, InvalidTraverse
+from core.frames.traverses import find_images
+from core.places import PlaceFields, Pose, Timestamp, check_place_id, microseconds
+from core.recordings.frame import Frame, make_id
+from core.recordings.pictures import sendable
+
+FILE_NAME = "places.csv"
+POSE = ("x", "y", "z", "heading", "latitude", "longitude")
+COLUMNS = ("file", "id", *POSE, "timestamp")
+
+
+class _Row(BaseModel):
+    """The cells of one row of ``places.csv`` that are not empty."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
+    heading: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    timestamp: Timestamp | None = None
+
+
+def folder_frames(directory: Path, prefix: str = "") -> tuple[list[Frame], list[str]]:
+    """The frames of a directory, and remarks on them.
+
+    Args:
+        prefix: of the ids that are made from file names.
+
+    Raises:
+        InvalidTraverse: the directory has neither a list nor an image; the list is malformed or names a missing file;
+            or two frames have the same id.
+    """
+    listed = directory / FILE_NAME
+    remarks = []
+    if listed.is_file():
+        found = list(_listed_frames(listed, prefix))
+        if not found:
+            raise InvalidTraverse(f"{listed} lists no frame.")
+        left_out = len({path.resolve() for path in find_images(directory)} - {path.resolve() for path, _ in found})
+        if left_out:
+            remarks.append(f"{left_out} images of {directory} are not listed in {FILE_NAME} and are left out.")
+    else:
+        found = [
+            (path, Frame(_id(path, prefix), path.name, partial(read_picture, path), embedded=True))
+            for path in find_images(directory)
+        ]
+    first: dict[str, Path] = {}
+    for path, frame in found:
+        if frame.id in first:
+            raise InvalidTraverse(
+                f"{first[frame.id].name} and {path.name} would both have the id {frame.id!r}; "
+                f"give their ids in {FILE_NAME}."
+            )
+        first[frame.id] = path
+    return [frame for _, frame in found], remarks
+
+
+def picture_frame(path: Path) -> Frame:
+    """A single image file as a frame; its pose and time are those of its EXIF data.
+
+    Raises:
+        InvalidTraverse: no id can be made of its name.
+    """
+    return Frame(_id(path, ""), str(path), partial(read_picture, path), embedded=True)
+
+
+def read_picture(path: Path) -> bytes:
+    """The bytes of an image file as the service takes them.
+
+    Raises:
+        OSError: it cannot be read.
+        InvalidImage: it is none.
+    """
+    return sendable(path.read_bytes())
+
+
+def _id(path: Path, prefix: str) -> str:
+    try:
+        return make_id(path.stem, prefix)
+    except InvalidRecording as error:
+        raise InvalidTraverse(str(error)) from error
+
+
+def _listed_frames(path: Path, prefix: str) -> Iterator[tuple[Path, Frame]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file, skipinitialspace=True, strict=True)
+            columns = [(name or "").strip() for name in reader.fieldnames or []]
+            _check_columns(path, columns)
+            reader.fieldnames = columns
+            for cells in reader:
+                yield _listed_frame(path, reader.line_num, cells, prefix)
+    except OSError as error:
+        raise InvalidTraverse(f"{path} cannot be read: {error.strerror}.") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidTraverse(f"{path} is not a CSV file in UTF-8: {error}.") from error
+
+
+def _check_columns(path: Path, columns: list[str]) -> None:
+    unknown = [name for name in columns if name not in COLUMNS]
+    if unknown or "file" not in columns or len(set(columns)) < len(columns):
+        wrong = f"an unknown column {unknown[0]!r}" if unknown else "columns missing or given twice"
+        raise InvalidTraverse(
+            f"{path} has {wrong}. Its first line must name 'file' and may name {', '.join(COLUMNS[1:])}."
+        )
+
+
+def _listed_frame(path: Path, line: int, cells: dict[str, str], prefix: str) -> tuple[Path, Frame]:
+    where = f"{path.name}, line {line}"
+    if None in cells or None in cells.values():
+        raise InvalidTraverse(f"{where}: the row has more or fewer cells than the first line.")
+    given = {name: cell.strip() for name, cell in cells.items() if cell.strip()}
+    image = path.parent / given.get("file", "")
+    if "file" not in given or not image.is_file():
+        raise InvalidTraverse(f"{where}: there is no file {given.get('file', '')!r}.")
+    try:
+        row = _Row.model_validate(given)
+        pose = {name: value for name in POSE if (value := getattr(row, name)) is not None}
+        fields = PlaceFields(pose=Pose.model_validate(pose) if pose else None, timestamp=row.timestamp)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        location = "".join(f"{part}: " for part in fault["loc"])
+        raise InvalidTraverse(f"{where}: {location}{fault['msg'].removeprefix('Value error, ')}.") from error
+    chosen = check_place_id(given["id"]) if "id" in given else _id(image, prefix)
+    taken = None if fields.timestamp is None else 1000 * microseconds(fields.timestamp)
+    load = partial(read_picture, image)
+    return image, Frame(chosen, image.name, load, fields.pose, fields.timestamp, taken)

@@ -1,0 +1,69 @@
+"""One frame of a recording: its id, where and when it was taken, and how its bytes are read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+
+from core.errors import InvalidRecording
+from core.frames.exif import read_pose_and_time
+from core.places import Pose, microseconds
+
+NANOSECONDS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame that is read when it is needed.
+
+    id: the id of its place, the same whenever the recording is opened.
+    name: what a message calls it, such as the name of its file.
+    load: reads the bytes of a JPEG, PNG or WebP file; raises OSError or InvalidImage.  Frames that are loaded in their
+        order cost least, for a bag keeps one chunk unpacked and a video decodes forward only.
+    nanoseconds: when it was taken by the recording's own clock, which for bags counts from 1970; None if not known.
+    timestamp: when it was taken, UTC; None if not known, as for a video.
+    embedded: whether pose and timestamp are those of the EXIF data of its bytes, which ``described`` reads.
+    """
+
+    id: str
+    name: str
+    load: Callable[[], bytes]
+    pose: Pose | None = None
+    timestamp: datetime | None = None
+    nanoseconds: int | None = None
+    embedded: bool = False
+
+    def described(self, data: bytes | None = None) -> Frame:
+        """The frame with the pose and the time that its bytes tell, if that is where they stand.
+
+        Args:
+            data: its bytes, if they are at hand; otherwise they are loaded.
+        """
+        if not self.embedded:
+            return self
+        pose, timestamp = read_pose_and_time(self.load() if data is None else data)
+        told = None if timestamp is None else 1000 * microseconds(timestamp)
+        return replace(self, pose=pose, timestamp=timestamp, nanoseconds=told, embedded=False)
+
+
+def utc(nanoseconds: int) -> datetime | None:
+    """The time so long after 1970, to the microsecond; None after the year 9999."""
+    try:
+        return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=nanoseconds // 1000)
+    except OverflowError:
+        return None
+
+
+def make_id(text: str, prefix: str = "") -> str:
+    """The id of a place made from a text; characters that no id may have become hyphens.
+
+    Raises:
+        InvalidRecording: no character of an id is left.
+    """
+    made = re.sub(r"[^A-Za-z0-9._~-]+", "-", prefix + text)
+    made = re.sub(r"^[^A-Za-z0-9]+", "", made)[:128]
+    if not made.strip("-"):
+        raise InvalidRecording(f"No id can be made from the name {text!r}; give one in places.csv.")
+    return made

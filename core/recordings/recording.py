@@ -1,0 +1,187 @@
+"""A recording as enrolment and evaluation take it: frames in order, with poses; from a bag, a video or a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+
+from core.errors import InvalidRecording, InvalidTrajectory
+from core.frames.traverses import OTHER_SUFFIXES, SUPPORTED_SUFFIXES
+from core.recordings.bag import Bag, bag_files
+from core.recordings.folder import folder_frames
+from core.recordings.frame import NANOSECONDS, Frame, make_id
+from core.recordings.messages import IMAGE_TYPES
+from core.recordings.trajectory import Trajectory, missing
+from core.recordings.trajectory_files import read_trajectory
+from core.recordings.video import SUFFIXES as VIDEOS
+from core.recordings.video import Video
+
+LARGEST_GAP = 1.5
+"""Seconds between two known poses between which a pose is interpolated; a satellite receiver tells one a second."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where the poses of a recording come from, if not from the recording's own list or EXIF data.
+
+    topic: of the bag.
+    file: a trajectory in the form of TUM or KITTI.
+    times: of the trajectory in the form of KITTI; None if it has a pose for each frame.
+    largest_gap: seconds between two poses between which one is interpolated.
+    """
+
+    topic: str | None = None
+    file: Path | None = None
+    times: Path | None = None
+    largest_gap: float = LARGEST_GAP
+
+
+@dataclass
+class Recording:
+    """The frames of a recording, in the order in which they were taken.
+
+    name: of its file or folder, without the suffix.
+    remarks: sentences about what was found that a user must know.
+    """
+
+    name: str
+    frames: list[Frame]
+    remarks: list[str] = field(default_factory=list)
+    _close: Callable[[], None] = lambda: None
+
+    def close(self) -> None:
+        """Close its files; frames cannot be loaded after that."""
+        self._close()
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is that of a bag, a video or a directory, not of a single picture, by its name and kind."""
+    return path.is_dir() or bool(bag_files(path)) or path.suffix.lower() in VIDEOS
+
+
+def open_recording(path: Path, topic: str | None = None, poses: Poses = Poses(), prefix: str = "") -> Recording:
+    """Open a rosbag2 (a directory, or a ``.db3`` or ``.mcap`` file), a ROS 1 bag, a video file or a folder of pictures.
+
+    Args:
+        topic: of the pictures in a bag; None for the only one that there is.
+        poses: where they come from.
+        prefix: of the ids of places.
+
+    Raises:
+        InvalidRecording, InvalidTraverse: it cannot be read, or has no frame; or an option does not go with it.
+        UnknownTopic: the bag has no such topic, or several could be meant.
+        InvalidTrajectory: the trajectory cannot be read, or does not fit the frames.
+        MissingExtra: what reads bags is not installed.
+    """
+    of_bag = bool(bag_files(path))
+    for option, value in (("--topic", topic), ("--pose-topic", poses.topic)):
+        if value is not None and not of_bag:
+            raise InvalidRecording(f"{path} is not a bag, so it has no topics: leave out {option}.")
+    if poses.times is not None and poses.file is None:
+        raise InvalidTrajectory("A file of times goes with a trajectory.")
+    if of_bag:
+        recording = _open_bag(path, topic, poses)
+    else:
+        recording = _open_video(path) if _is_video(path) else _open_folder(path, prefix)
+    try:
+        if poses.file is not None:
+            trajectory, by_frame = read_trajectory(poses.file, poses.times)
+            _place(recording, trajectory, by_frame, poses.largest_gap)
+        if prefix and (of_bag or _is_video(path)):
+            recording.frames = [replace(frame, id=_prefixed(prefix, frame.id)) for frame in recording.frames]
+    except BaseException:
+        recording.close()
+        raise
+    return recording
+
+
+def _is_video(path: Path) -> bool:
+    """Whether a path is to be read as a video: a file that is no picture, or a name as a video has."""
+    suffix = path.suffix.lower()
+    return suffix in VIDEOS or (path.is_file() and suffix not in SUPPORTED_SUFFIXES | OTHER_SUFFIXES)
+
+
+def _prefixed(prefix: str, text: str) -> str:
+    made = make_id(text, prefix)
+    if not made.endswith(text):
+        raise InvalidRecording(f"With the prefix {prefix!r} the id {text!r} would be longer than an id may be.")
+    return made
+
+
+def _open_bag(path: Path, topic: str | None, poses: Poses) -> Recording:
+    bag = Bag(path)
+    try:
+        recording = Recording(
+            path.resolve().name if path.is_dir() else path.name.removesuffix(".zstd").rpartition(".")[0],
+            bag.frames(bag.choose(topic, IMAGE_TYPES, "pictures")),
+            _close=bag.close,
+        )
+        if poses.topic is not None:
+            _place(recording, bag.trajectory(poses.topic), False, poses.largest_gap)
+        recording.remarks = bag.told() + recording.remarks
+    except BaseException:
+        bag.close()
+        raise
+    return recording
+
+
+def _open_folder(path: Path, prefix: str) -> Recording:
+    frames, remarks = folder_frames(path, prefix)
+    return Recording(path.resolve().name, frames, remarks)
+
+
+def _open_video(path: Path) -> Recording:
+    video = Video(path)
+    try:
+        frames, remarks = video.frames()
+    except BaseException:
+        video.close()
+        raise
+    return Recording(path.stem, frames, remarks, video.close)
+
+
+def _place(recording: Recording, trajectory: Trajectory, by_frame: bool, largest_gap: float) -> None:
+    """Give the frames their poses.
+
+    Raises:
+        InvalidTrajectory: the frames have no times, or another number than the trajectory; or no frame gets a pose.
+    """
+    frames = [frame.described() for frame in recording.frames]
+    if by_frame:
+        if len(trajectory) != len(frames):
+            raise InvalidTrajectory(
+                f"The trajectory has {len(trajectory)} poses and {recording.name} has {len(frames)} frames: without a "
+                "file of times there must be one for each frame."
+            )
+        times = [number * NANOSECONDS for number in range(len(frames))]
+    else:
+        times = [frame.nanoseconds for frame in frames if frame.nanoseconds is not None]
+        if len(times) < len(frames):
+            raise InvalidTrajectory(
+                f"{len(frames) - len(times)} of {len(frames)} frames of {recording.name} have no time, so a trajectory "
+                "with times tells nothing about them."
+            )
+    found = trajectory.at(times, largest_gap)
+    without = missing(found)
+    if without == len(frames):
+        first, last = min(times) / NANOSECONDS, max(times) / NANOSECONDS
+        raise InvalidTrajectory(
+            f"No frame of {recording.name} gets a pose: its frames are of {first:.3f} s to {last:.3f} s, the poses of "
+            f"{trajectory.span()}, and only gaps of up to {largest_gap:g} s are bridged."
+        )
+    if without:
+        recording.remarks.append(
+            f"{without} of {len(frames)} frames get no pose: they lie before the first or after the last known pose, "
+            f"or in a gap of more than {largest_gap:g} s."
+        )
+    recording.frames = [replace(frame, pose=pose) for frame, pose in zip(frames, found, strict=True)]

@@ -1,0 +1,124 @@
+"""A trajectory: where a robot was at certain times, and by interpolation at the times between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from core.errors import InvalidTrajectory
+from core.places import Pose
+from core.recordings.frame import NANOSECONDS
+
+LARGEST_COORDINATE = 1e9
+"""Metres; no pose of a place may be further away."""
+
+LEAST_HORIZONTAL = 1e-6
+"""An axis that is so near the vertical points nowhere in the plane."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Samples of a path, in order of time, each time once.
+
+    nanoseconds: int64 [n].
+    positions: float64 [n, 3], metres, or latitude and longitude in degrees and 0.
+    turns: float64 [n, 4], unit quaternions x, y, z, w; NaN where the orientation is not known.
+    geographic: whether positions are in degrees.
+    """
+
+    nanoseconds: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    turns: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))
+    geographic: bool = False
+
+    @classmethod
+    def of_samples(
+        cls, nanoseconds: ArrayLike, positions: ArrayLike, turns: ArrayLike, geographic: bool = False
+    ) -> Trajectory:
+        """Samples in any order; of several at one time the first counts.
+
+        Raises:
+            InvalidTrajectory: there is no sample, or a position is not a finite number of at most 1e9.
+        """
+        times = np.asarray(nanoseconds, np.int64)
+        places = np.asarray(positions, np.float64).reshape(-1, 3)
+        if not len(times):
+            raise InvalidTrajectory("The trajectory has no pose.")
+        if not (np.abs(places) <= LARGEST_COORDINATE).all():
+            raise InvalidTrajectory(f"The trajectory has a position beyond {LARGEST_COORDINATE:g} m, or none.")
+        times, first = np.unique(times, return_index=True)
+        return cls(times, places[first], np.asarray(turns, np.float64).reshape(-1, 4)[first], geographic)
+
+    def __len__(self) -> int:
+        return len(self.nanoseconds)
+
+    def at(self, nanoseconds: ArrayLike, largest_gap: float) -> list[Pose | None]:
+        """The poses at some times: positions on the straight line between two samples, turns on the shortest arc.
+
+        The heading is the direction of the x axis of what moves, seen from above.
+
+        Args:
+            largest_gap: seconds; between samples further apart, and beyond the ends, there is no pose.
+        """
+        times = np.asarray(nanoseconds, np.int64)
+        after = np.searchsorted(self.nanoseconds, times, side="left")
+        inside = after < len(self)
+        exact = inside & (self.nanoseconds[np.minimum(after, len(self) - 1)] == times)
+        last = np.where(inside, after, len(self) - 1)
+        first = np.where(exact, last, np.maximum(last - 1, 0))
+        gaps = self.nanoseconds[last] - self.nanoseconds[first]
+        known = exact | (inside & (after > 0) & (gaps <= largest_gap * NANOSECONDS))
+        share = np.where(gaps > 0, (times - self.nanoseconds[first]) / np.maximum(gaps, 1), 0.0)
+        places = self._positions(first, last, share)
+        headings = self._headings(first, last, share)
+        return [
+            self._pose(place, heading) if one else None
+            for place, heading, one in zip(places, headings, known, strict=True)
+        ]
+
+    def _positions(
+        self, first: NDArray[np.int64], last: NDArray[np.int64], share: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        steps = self.positions[last] - self.positions[first]
+        if self.geographic:  # across the meridian of 180 degrees the short way round
+            steps[:, 1] = (steps[:, 1] + 180) % 360 - 180
+        places = self.positions[first] + share[:, None] * steps
+        if self.geographic:
+            places[:, 1] = (places[:, 1] + 180) % 360 - 180
+        return places
+
+    def _headings(
+        self, first: NDArray[np.int64], last: NDArray[np.int64], share: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Degrees counter-clockwise from +x, [0, 360); NaN where an orientation is not known or points straight up."""
+        from scipy.spatial.transform import Rotation
+
+        headings = np.full(len(first), math.nan)
+        known = np.isfinite(self.turns[first]).all(axis=1) & np.isfinite(self.turns[last]).all(axis=1)
+        if not known.any():
+            return headings
+        begin, end = (Rotation.from_quat(self.turns[rows[known]]) for rows in (first, last))
+        arc = (begin.inv() * end).as_rotvec()  # at most half a turn
+        axes = (begin * Rotation.from_rotvec(share[known, None] * arc)).apply([1.0, 0.0, 0.0])
+        found = np.degrees(np.arctan2(axes[:, 1], axes[:, 0])) % 360
+        headings[known] = np.where(np.hypot(axes[:, 0], axes[:, 1]) < LEAST_HORIZONTAL, math.nan, found)
+        return headings
+
+    def _pose(self, place: NDArray[np.float64], heading: float) -> Pose:
+        if self.geographic:
+            return Pose(latitude=float(place[0]), longitude=float(place[1]))
+        told = None if math.isnan(heading) else float(heading)
+        return Pose(x=float(place[0]), y=float(place[1]), z=float(place[2]), heading=told)
+
+    def span(self) -> str:
+        """From when to when it reaches, in seconds, for messages."""
+        return f"{self.nanoseconds[0] / NANOSECONDS:.3f} s to {self.nanoseconds[-1] / NANOSECONDS:.3f} s"
+
+
+def missing(poses: Sequence[Pose | None]) -> int:
+    """How many frames have no pose."""
+    return sum(pose is None for pose in poses)

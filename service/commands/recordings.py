@@ -1,0 +1,172 @@
+"""Recordings on the command line: the options that say which frames are taken of them, and where they were taken."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from service.commands.console import Failure, messages, progress, remark
+
+if TYPE_CHECKING:
+    from core.recordings import Frame, Recording
+    from core.recordings.keyframes import Describe
+
+PANEL = "Recordings"
+
+Topic = Annotated[
+    str | None,
+    typer.Option(help="Of a bag: the topic of the pictures; default: the only one.", rich_help_panel=PANEL),
+]
+PoseTopic = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a bag: the topic of poses (Odometry, PoseStamped, PoseWithCovarianceStamped, NavSatFix).",
+        rich_help_panel=PANEL,
+    ),
+]
+TrajectoryFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--trajectory", metavar="FILE", help="Poses from a file in the form of TUM or KITTI.", rich_help_panel=PANEL
+    ),
+]
+TrajectoryTimes = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Seconds of each pose of a KITTI file; without it there is one pose for each frame.",
+        rich_help_panel=PANEL,
+    ),
+]
+LargestGap = Annotated[
+    float | None,
+    typer.Option(
+        min=0, help="Seconds between two poses that are bridged; default: 1.5.", rich_help_panel=PANEL, metavar="S"
+    ),
+]
+EveryMetres = Annotated[
+    float | None,
+    typer.Option(min=0, help="Keyframes: take a frame after so many metres.", rich_help_panel=PANEL, metavar="N"),
+]
+EveryDegrees = Annotated[
+    float | None,
+    typer.Option(min=0, help="Keyframes: or after a turn by so many degrees.", rich_help_panel=PANEL, metavar="N"),
+]
+EverySeconds = Annotated[
+    float | None,
+    typer.Option(min=0, help="Keyframes: or after so many seconds.", rich_help_panel=PANEL, metavar="N"),
+]
+EveryChange = Annotated[
+    float | None,
+    typer.Option(
+        min=0,
+        max=2,
+        help="Keyframes: or when the descriptor has changed so much (1 less the cosine).",
+        rich_help_panel=PANEL,
+        metavar="N",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """The options of one recording, as they are given."""
+
+    topic: str | None = None
+    pose_topic: str | None = None
+    trajectory: Path | None = None
+    trajectory_times: Path | None = None
+    largest_gap: float | None = None
+    every_metres: float | None = None
+    every_degrees: float | None = None
+    every_seconds: float | None = None
+    every_change: float | None = None
+
+    @contextmanager
+    def open(self, path: Path, prefix: str = "") -> Iterator[Recording]:
+        """Open a recording and say what is odd about it; its frames are those before any choice of keyframes.
+
+        Raises:
+            typer.BadParameter: options do not go together.
+            Others: as ``core.recordings.open_recording``.
+        """
+        if self.pose_topic is not None and self.trajectory is not None:
+            raise typer.BadParameter("give --pose-topic or --trajectory, not both")
+        if self.trajectory_times is not None and self.trajectory is None:
+            raise typer.BadParameter("--trajectory-times goes with --trajectory")
+        # Imported here because it takes a moment.
+        from core.recordings import Poses, open_recording
+        from core.recordings.recording import LARGEST_GAP
+
+        gap = LARGEST_GAP if self.largest_gap is None else self.largest_gap
+        poses = Poses(self.pose_topic, self.trajectory, self.trajectory_times, gap)
+        with messages.status(f"Reading {path} …"):
+            recording = open_recording(path, self.topic, poses, prefix)
+        with recording:
+            for sentence in recording.remarks:
+                remark(sentence)
+            yield recording
+
+    @property
+    def choosing(self) -> bool:
+        """Whether not all frames are taken."""
+        measures = (self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
+        return any(measure is not None for measure in measures)
+
+    def choose(self, recording: Recording, encoder: str | None) -> list[Frame]:
+        """The frames that are taken: the keyframes that the options ask for, or all.
+
+        Args:
+            encoder: name or identity of that whose descriptors tell how much a frame has changed; None for the default.
+
+        Raises:
+            Failure: no frame can be judged by the options.
+            UnknownEncoder: the encoder is not installed here.
+        """
+        if not self.choosing:
+            return recording.frames
+        from core.recordings.keyframes import Left, Spacing, keyframes
+
+        spacing = Spacing(self.every_metres, self.every_degrees, self.every_seconds, self.every_change)
+        left = Left()
+        describe = None if self.every_change is None else describer(encoder)
+        with progress() as bar:
+            task = bar.add_task("Choosing keyframes", total=len(recording.frames))
+            chosen = list(keyframes(bar.track(recording.frames, task_id=task), spacing, describe, left))
+        if not chosen:
+            raise Failure(
+                f"No frame of {recording.name} can be judged by the --every options: none has the pose, the time or "
+                "the descriptor that they need."
+            )
+        unjudged = (
+            f"; {left.unjudged} lack the pose, the time or the descriptor that is needed" if left.unjudged else ""
+        )
+        remark(f"{len(chosen)} of {len(recording.frames)} frames are keyframes{unjudged}.")
+        return chosen
+
+
+def describer(encoder: str | None) -> Describe:
+    """What describes frames by an encoder that is installed here; frames that cannot be used have no descriptor."""
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from core.errors import InvalidImage, InvalidRecording
+    from core.frames.images import decode
+    from service.commands.model import default_encoder, open_catalogue
+
+    used = open_catalogue(None).get(encoder or default_encoder())
+
+    def describe(frame: Frame) -> NDArray[np.float32] | None:
+        try:
+            descriptor = used.encode(decode(frame.load())).descriptor
+        except (InvalidImage, InvalidRecording, OSError):
+            return None
+        length = float(np.linalg.norm(descriptor))
+        return descriptor / length if length > 0 else None
+
+    return describe

@@ -1,0 +1,42 @@
+"""What is written from ``openapi.json`` and from the asynchronous half is up to date."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.clients.python import models, twin
+from tests.clients.python.models import PACKAGE
+
+
+@pytest.mark.parametrize("name", models.MODULES)
+def test_a_module_says_what_openapi_json_says(name: str) -> None:
+    assert (PACKAGE / name).read_text() == models.rendered(name), "run scripts/client"
+
+
+@pytest.mark.parametrize("name", twin.modules())
+def test_both_halves_are_the_same(name: str) -> None:
+    assert (PACKAGE / "_sync" / name).read_text() == twin.rendered(name), "run scripts/client"
+
+
+def test_no_module_is_left_over() -> None:
+    halves = [{path.name for path in (PACKAGE / half).glob("*.py")} for half in ("_async", "_sync")]
+    assert halves[0] == halves[1]
+
+
+def test_what_is_not_used_is_not_imported() -> None:
+    """That keeps the import short: of httpx's command line, of WebSockets, of the other half, nothing is there."""
+    program = "import sys; from placerec_client import Client; print(*sys.modules)"
+    loaded = set(
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    )
+    assert {"httpx", "pydantic"} <= loaded
+    assert not loaded & {"rich", "click", "pygments", "numpy", "websockets", "placerec_client._async.client"}
+
+
+def test_every_name_can_be_imported() -> None:
+    program = "import placerec_client as c; print([getattr(c, name) for name in c.__all__]); c.no_such_name"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout and "no attribute 'no_such_name'" in done.stderr

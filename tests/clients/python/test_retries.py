@@ -1,0 +1,229 @@
+"""When a request is sent again, and when it is not; what the caller is told."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import pytest
+
+from placerec_client import Client, ConnectionFailed, DeadlineExceeded, Problem, Retry, UnexpectedAnswer, problems
+from placerec_client.answers import problem_of
+from placerec_client.requests import path_of
+from tests.clients.python.fault_proxy import Fault, FaultProxy
+from tests.service.scenes import jpeg
+from tests.service.server import Server, free_port
+
+PROBLEM = {"content-type": "application/problem+json"}
+Handler = Callable[[httpx.Request], httpx.Response]
+
+
+def problem(status: int, slug: str, **headers: str) -> httpx.Response:
+    content = json.dumps({"type": f"urn:placerec:problem:{slug}", "detail": f"It is {slug}.", "status": status})
+    return httpx.Response(status, headers={**PROBLEM, **headers}, content=content)
+
+
+def ask(handler: Handler, patience: float = 0.0, **options: Any) -> httpx.Response:
+    transport = httpx.MockTransport(handler)
+    with Client("http://robot", retry=Retry(patience, first_pause=0.01), transport=transport) as client:
+        return client.connection.request("PUT", "/v1/x", content=b"frame", **options)
+
+
+def in_turn(*answers: httpx.Response | Exception) -> tuple[Handler, list[httpx.Request]]:
+    """A service that gives these answers one after the other, and what it was asked."""
+    asked: list[httpx.Request] = []
+
+    def handle(request: httpx.Request) -> httpx.Response:
+        asked.append(request)
+        answer = answers[len(asked) - 1]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    return handle, asked
+
+
+def test_a_request_is_sent_again_under_the_same_id() -> None:
+    handle, asked = in_turn(
+        problem(503, "queue-full", **{"Retry-After": "0"}),
+        httpx.ConnectError("refused"),
+        httpx.ReadError("lost"),
+        httpx.Response(502, content=b"a proxy"),
+        httpx.Response(201, json={"change": "created"}),
+    )
+    assert ask(handle, patience=10).json() == {"change": "created"}
+    assert len(asked) == 5
+    assert len({request.headers["X-Request-Id"] for request in asked}) == 1
+    assert all(request.content == b"frame" for request in asked)
+
+
+def test_the_service_says_when() -> None:
+    handle, asked = in_turn(problem(429, "rate-exceeded", **{"Retry-After": "1"}), httpx.Response(200))
+    began = time.monotonic()
+    assert ask(handle, patience=10).is_success and len(asked) == 2
+    assert time.monotonic() - began >= 1
+
+
+def test_patience_ends() -> None:
+    handle, asked = in_turn(*[problem(503, "queue-full", **{"Retry-After": "60"})] * 2)
+    with pytest.raises(problems.QueueFull, match=r"It is queue-full\.") as refused:
+        ask(handle, patience=5)
+    assert (refused.value.status, refused.value.retry_after) == (503, 60)
+    assert len(asked) == 1  # it asks to wait longer than there is patience
+
+
+@pytest.mark.parametrize(
+    ("status", "slug"),
+    [
+        (503, "map-quarantined"),
+        (404, "unknown-map"),
+        (507, "storage-full"),
+        (500, "internal-error"),
+        (422, "no-regions"),
+    ],
+)
+def test_what_a_moment_does_not_change_is_not_sent_again(status: int, slug: str) -> None:
+    handle, asked = in_turn(problem(status, slug))
+    with pytest.raises(problems.BY_SLUG[slug]) as refused:
+        ask(handle, patience=60)
+    assert (refused.value.status, refused.value.slug, len(asked)) == (status, slug, 1)
+
+
+def test_a_kind_of_problem_that_is_not_known_here_is_a_problem() -> None:
+    found = problem_of({"type": "urn:placerec:problem:of-tomorrow", "status": 418, "detail": "New."})
+    assert type(found) is Problem and (found.slug, found.status, str(found)) == ("of-tomorrow", 418, "New.")
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [(httpx.ConnectError("refused"), "cannot be reached: refused"), (httpx.ReadTimeout(""), "did not answer in time")],
+)
+def test_a_service_that_is_not_there(error: Exception, message: str) -> None:
+    handle, _ = in_turn(error)
+    with pytest.raises(ConnectionFailed, match=message):
+        ask(handle)
+
+
+def test_another_service_is_told_apart() -> None:
+    handle, _ = in_turn(httpx.Response(404, content=b"<html>"))
+    with pytest.raises(UnexpectedAnswer, match=r"answered 404\. Is it a placerec service") as answered:
+        ask(handle)
+    assert answered.value.status == 404
+    with pytest.raises(ConnectionFailed, match="has to start with http"):
+        Client("ftp://robot")
+    with pytest.raises(ConnectionFailed, match="is not a URL"):
+        Client("http://robot:x")
+
+
+def test_an_answer_that_is_no_answer() -> None:
+    transport = httpx.MockTransport(lambda _: httpx.Response(200, json={"hello": "world"}))
+    with Client("http://robot", transport=transport) as client, pytest.raises(UnexpectedAnswer, match="no QueryAnswer"):
+        client.maps["lab"].query(b"frame")
+
+
+def test_pages_are_followed_to_the_last() -> None:
+    pages: dict[str | None, Any] = {
+        None: {"items": [{"name": "a", "places": 1}, {"name": "b", "places": 1}], "next_cursor": "a"},
+        "a": {"items": [{"name": "c", "places": 1}], "next_cursor": "b"},
+        "b": {"items": [], "next_cursor": None},
+    }
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, json=pages[request.url.params.get("cursor")]))
+    with Client("http://robot", transport=transport) as client:
+        assert [one.name for one in client.maps["lab"].sequences] == ["a", "b", "c"]
+
+
+def test_names_are_quoted_in_paths() -> None:
+    assert path_of("maps", "lab", "sequences", "a b/ü?") == "/v1/maps/lab/sequences/a%20b%2F%C3%BC%3F"
+
+
+def test_the_key_is_sent() -> None:
+    handle, asked = in_turn(httpx.Response(200, json={"status": "ok"}))
+    with Client("http://robot", key="placerec_k", transport=httpx.MockTransport(handle)) as client:
+        client.liveness()
+    assert asked[0].headers["Authorization"] == "Bearer placerec_k"
+
+
+# Deadlines
+
+
+def test_the_service_is_told_the_deadline(server: Server) -> None:
+    with Client(str(server.client.base_url)) as client:
+        with pytest.raises(DeadlineExceeded):
+            client.maps["no-map"].query(jpeg(0), deadline=1e-4)
+        with pytest.raises(problems.UnknownMap):
+            client.maps["no-map"].query(jpeg(0), deadline=20)
+    handle, asked = in_turn(httpx.ReadError("lost"), httpx.Response(200))
+    ask(handle, deadline=5, patience=1)
+    left = [float(request.headers["X-Request-Timeout"]) for request in asked]
+    assert 0 < left[1] < left[0] <= 5
+
+
+def test_no_answer_before_the_deadline() -> None:
+    began = time.monotonic()
+    with Client(f"http://127.0.0.1:{free_port()}") as client, pytest.raises(DeadlineExceeded, match=r"within 0\.3 s"):
+        client.maps["lab"].query(b"frame", deadline=0.3)
+    assert time.monotonic() - began < 5
+
+
+def test_the_deadline_counts_more_than_the_wish_of_the_service() -> None:
+    handle, asked = in_turn(*[problem(503, "queue-full", **{"Retry-After": "30"})] * 2)
+    with pytest.raises(DeadlineExceeded, match="It is queue-full") as exceeded:
+        ask(handle, deadline=0.5, patience=60)
+    assert len(asked) == 1 and isinstance(exceeded.value.__cause__, problems.QueueFull)
+
+
+def test_the_problem_of_the_service_is_a_deadline_too() -> None:
+    handle, _ = in_turn(problem(503, "deadline-exceeded", **{"Retry-After": "1"}))
+    with pytest.raises(DeadlineExceeded) as exceeded:
+        ask(handle)
+    assert isinstance(exceeded.value, problems.DeadlineExceededByService)
+
+
+# Answers that are lost
+
+
+class Script:
+    """Faults for the requests to one path, in turn; nothing happens to others."""
+
+    def __init__(self, method: str, *faults: Fault) -> None:
+        self._method, self._faults = method.encode(), list(faults)
+
+    def __call__(self, head: bytes) -> Fault:
+        return self._faults.pop(0) if head.startswith(self._method) and self._faults else "none"
+
+
+def through(server: Server, method: str, *faults: Fault) -> FaultProxy:
+    return FaultProxy(server.port, choose=Script(method, *faults))
+
+
+def test_what_was_done_before_the_answer_was_lost_counts(server: Server) -> None:
+    with through(server, "POST /v1/maps ", "lose-answer", "none", "lose-answer") as way, Client(way.url) as client:
+        lab = client.maps.create("lost-answer", description="made once")
+        assert lab.read().description == "made once"
+        with pytest.raises(problems.MapExists):
+            client.maps.create("lost-answer", description="another")
+    with through(server, "PATCH", "lose-answer") as way, Client(way.url) as client:
+        lab, revision = client.maps["lost-answer"], client.maps["lost-answer"].read().revision
+        assert lab.edit({"description": "edited"}, if_match=revision).description == "edited"
+        with pytest.raises(problems.RevisionMismatch):
+            lab.edit({"description": "edited"}, if_match=revision)
+    server.enrol("lost-answer", "p", jpeg(1), sequence="walk")
+    with through(server, "DELETE", "lose-answer", "none", "lose-answer") as way, Client(way.url) as client:
+        lab = client.maps["lost-answer"]
+        lab.places.forget("p")
+        lab.delete()
+        with pytest.raises(problems.UnknownMap):
+            lab.delete()
+
+
+def test_a_job_whose_answer_was_lost_is_not_done_twice(server: Server) -> None:
+    server.create_map("job-once")
+    with FaultProxy(server.port, choose=Script("POST", "lose-answer")) as way, Client(way.url) as client:
+        job = client.maps["job-once"].rebuild()
+        assert job.wait().state == "succeeded"
+        found = list(client.jobs.list(map="job-once", kind="rebuild"))
+        assert sorted(one.state for one in found) in (["cancelled", "succeeded"], ["succeeded", "succeeded"])
+        assert job.id == found[-1].id

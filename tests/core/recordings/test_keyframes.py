@@ -1,0 +1,82 @@
+"""Keyframes by distance, angle, time and change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from core.places import Pose
+from core.recordings import Frame
+from core.recordings.frame import NANOSECONDS
+from core.recordings.keyframes import Left, Spacing, keyframes
+
+
+def frame(number: int, x: float | None = None, heading: float | None = None, seconds: float | None = None) -> Frame:
+    pose = None if x is None else Pose(x=x, y=0, heading=heading)
+    taken = None if seconds is None else round(seconds * NANOSECONDS)
+    return Frame(str(number), str(number), bytes, pose, nanoseconds=taken)
+
+
+def chosen(frames: Sequence[Frame], **measures: float) -> list[int]:
+    return [int(one.id) for one in keyframes(frames, Spacing(**measures))]
+
+
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=30), st.floats(0.1, 50))
+def test_every_keyframe_is_far_from_the_one_before_and_no_frame_between_is(places: list[float], metres: float) -> None:
+    kept = chosen([frame(index, x) for index, x in enumerate(places)], metres=metres)
+    assert kept[0] == 0
+    for before, after in zip(kept, [*kept[1:], len(places)], strict=True):
+        assert all(abs(places[index] - places[before]) < metres for index in range(before + 1, after))
+        assert after == len(places) or abs(places[after] - places[before]) >= metres
+
+
+def test_one_measure_that_is_reached_is_enough() -> None:
+    frames = [frame(0, 0, 350, 0), frame(1, 1, 352, 1), frame(2, 1.5, 10, 2), frame(3, 4, 12, 3), frame(4, 4, 12, 13)]
+    assert chosen(frames, metres=2) == [0, 3]
+    assert chosen(frames, degrees=20) == [0, 2]
+    assert chosen(frames, seconds=3) == [0, 3, 4]
+    assert chosen(frames, metres=2, degrees=20, seconds=10) == [0, 2, 3, 4]
+
+
+def test_frames_that_cannot_be_judged_are_left_out_and_counted() -> None:
+    frames = [frame(0), frame(1, 0), frame(2), frame(3, 5), frame(4, 5.5)]
+    left = Left()
+    assert [one.id for one in keyframes(frames, Spacing(metres=2), left=left)] == ["1", "3"]
+    assert left.unjudged == 2
+    frames = [frame(0, seconds=0), frame(1, 0, seconds=1), frame(2, 9, seconds=1.5)]
+    assert chosen(frames, metres=2, seconds=5) == [0, 1, 2]  # the first keyframe with a pose, then by it
+
+
+def test_change_is_measured_from_the_last_keyframe() -> None:
+    angles = {str(index): np.radians(angle) for index, angle in enumerate((0, 20, 40, 70, 90, 95))}
+    asked: list[str] = []
+
+    def describe(one: Frame) -> NDArray[np.float32] | None:
+        asked.append(one.id)
+        angle = angles[one.id]
+        return None if one.id == "4" else np.array([np.cos(angle), np.sin(angle)], np.float32)
+
+    left = Left()
+    frames = [frame(index) for index in range(6)]
+    kept = [one.id for one in keyframes(frames, Spacing(change=1 - np.cos(np.radians(35))), describe, left)]
+    assert kept == ["0", "2", "5"] and left.unjudged == 1
+    assert asked == ["0", "1", "2", "3", "4", "5"]
+    assert not Spacing() and Spacing(change=0)
+
+
+def test_poses_in_metres_and_in_degrees_are_far_apart() -> None:
+    north = Frame("1", "1", bytes, Pose(latitude=1, longitude=1))
+    assert [one.id for one in keyframes([frame(0, 0), north], Spacing(metres=1e6))] == ["0", "1"]
+
+
+def test_measures_on_the_earth_are_in_metres() -> None:
+    frames = [Frame(str(index), "", bytes, Pose(latitude=index * 1e-5, longitude=0)) for index in range(10)]
+    assert chosen(frames, metres=3.0) == [0, 3, 6, 9]  # a hundred-thousandth of a degree is 1.11 m
+    assert pytest.approx(1.11, abs=0.01) == float(
+        np.linalg.norm((frames[1].pose or Pose(x=0, y=0)).position() - (frames[0].pose or Pose(x=0, y=0)).position())
+    )
