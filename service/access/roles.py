@@ -105,6 +105,10 @@ OPERATIONS: dict[str, Rule] = {
     "read_documentation_file": Rule("open", "none"),
     "read_service": Rule("query", "shown"),  # memory, disk and settings only to admins for all maps
     "read_metrics": Rule("query", "all"),  # its series name all maps
+    # The console's own files; what they ask for needs a key like any other request
+    "read_console": Rule("open", "none"),
+    "find_console": Rule("open", "none"),
+    "read_console_file": Rule("open", "none"),
     # Keys and the audit trail: they tell of all maps, and of everybody
     "read_own_key": Rule("query", "none"),
     "list_keys": Rule("admin", "all"),

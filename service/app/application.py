@@ -24,6 +24,7 @@ from service.app import routes as root
 from service.app import service_state
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
+from service.console import routes as console
 from service.errors.problems import install_problems, problem_response
 from service.events.schemas import EnrolmentEvent, JobEvent, Listening, MapEvent, Missed, QueryEvent, SessionEvent
 from service.frames import routes as frames
@@ -117,6 +118,7 @@ ROUTERS = (
     audit_routes.router,
     service_state.router,
     root.encoders,
+    console.router,
 )
 
 

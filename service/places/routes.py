@@ -266,6 +266,8 @@ def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: En
     if not order.dry_run:
         tell_change(engine, map_, "deleted", len(found))
     changed = {} if found and not order.dry_run else {"change": None}
+    if not order.dry_run:
+        tell_change(engine, map_, "deleted", len(found))
     request.state.noted = {"map": map_id, "places": len(found), **changed}
     there = set(found)
     missing = [place_id for place_id in wanted.ids or () if place_id not in there]

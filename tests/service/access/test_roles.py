@@ -12,8 +12,9 @@ from service.access.roles import OPERATIONS, Role, Rule, covers
 from service.app.application import create_app
 from service.settings import Settings
 
-OPEN = {"check_liveness", "check_readiness", "read_version", "read_openapi", "read_documentation"} | {
-    "read_documentation_file"
+OPEN = {
+    *("check_liveness", "check_readiness", "read_version", "read_openapi"),
+    *("read_documentation", "read_documentation_file", "read_console", "find_console", "read_console_file"),
 }
 READING = {"GET", "HEAD"}
 

@@ -1,0 +1,132 @@
+"""The console's pages in a browser with a large map: first paint, the plan, panning, the comparison of two traverses.
+
+    python -m benchmarks.console_pages [--places 100000] [--frames 2000]
+
+A server of its own holds a map of made-up descriptors for the plan, and one with the default encoder whose two
+traverses of ``--frames`` places are compared.  The browser is the system's Chromium, without a window and without a
+graphics processor: ``first paint`` is its own figure of the page of maps, with nothing in its cache; ``plan`` and
+``matrix`` last from the address typed until the canvas is drawn; ``frames a second`` are those of 120 steps of panning,
+each of which draws the whole plan.  ``requests`` are those of the plan's page.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from benchmarks.console import fill
+from benchmarks.process import service
+from benchmarks.report import report, verdict
+from core.method.catalogue import EncoderCatalogue
+from core.places import PlaceFields, Pose
+from core.storage import Atlas, Enrolment, MapSettings
+
+STEPS = 120
+DRAWN = """selector => {
+  const canvas = document.querySelector(selector);
+  if (!canvas || !canvas.width || document.querySelector("main .loading")) return false;
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
+  copy.drawImage(canvas, 0, 0);
+  return copy.getImageData(0, 0, canvas.width, canvas.height).data.some((value) => value > 0);
+}"""
+PAN = """steps => new Promise((done) => {
+  const canvas = document.querySelector(".plan-canvas canvas[tabindex]");
+  const began = performance.now();
+  let step = 0;
+  const next = () => {
+    if (step === steps) return done(1000 * steps / (performance.now() - began));
+    const key = Math.floor(step / 10) % 2 ? "ArrowLeft" : "ArrowRight";
+    canvas.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+    step += 1;
+    requestAnimationFrame(next);
+  };
+  requestAnimationFrame(next);
+})"""
+
+
+def fill_traverses(folder: Path, frames: int) -> None:
+    """A map of the default encoder with two traverses, the second along the first; descriptors are made up."""
+    random = np.random.default_rng(1)
+    encoder = next(one for one in EncoderCatalogue(folder / "models").describe() if one.default)
+    atlas = Atlas(folder)
+    two = atlas.create("two", encoder.identity, encoder.dimension, MapSettings(verification=False))
+    first = random.standard_normal((frames, encoder.dimension), dtype=np.float32)
+    for name in ("monday", "tuesday"):
+        noise = random.standard_normal(first.shape, dtype=np.float32) if name == "tuesday" else 0.0
+        rows = first + 0.7 * noise
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        items = [
+            Enrolment(
+                f"{name}-{number}",
+                PlaceFields(pose=Pose(x=float(number), y=0.0), sequence=name),
+                row,
+                600,
+                random.bytes(32),
+            )
+            for number, row in enumerate(rows)
+        ]
+        for start in range(0, frames, 500):
+            two.enrol(items[start : start + 500])
+    atlas.close()
+
+
+def drawn(browser: Browser, url: str, selector: str) -> tuple[float, Page, int]:
+    """Seconds until a canvas is drawn, the page, and how many requests it took."""
+    page = browser.new_context(viewport={"width": 1600, "height": 1000}, bypass_csp=True).new_page()
+    requests: list[str] = []
+    page.on("request", lambda request: requests.append(request.url))
+    began = time.perf_counter()
+    page.goto(url)
+    page.wait_for_function(DRAWN, arg=selector)
+    return time.perf_counter() - began, page, len(requests)
+
+
+def first_paint(browser: Browser, url: str) -> float:
+    """Seconds until something of the page of maps is painted."""
+    page = browser.new_context().new_page()
+    page.goto(url)
+    page.locator("main h1").wait_for()
+    entry = page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime")
+    return float(entry) / 1000
+
+
+def main(
+    places: Annotated[int, typer.Option(help="Places of the map whose plan is drawn.")] = 100_000,
+    frames: Annotated[int, typer.Option(help="Places of each of the traverses that are compared.")] = 2000,
+) -> None:
+    """Measure, print a table and write JSON."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        raise typer.BadParameter("no Chromium is installed")
+    with tempfile.TemporaryDirectory() as text, sync_playwright() as playwright:
+        folder = Path(text)
+        fill(folder / "data", places)
+        fill_traverses(folder / "data", frames)
+        with service(folder / "data") as server:
+            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            console = f"{server.client.base_url}/console"
+            paint = first_paint(browser, f"{console}#/maps")
+            plan, page, requests = drawn(browser, f"{console}#/maps/lab/plan", ".plan-canvas canvas")
+            rate = float(page.evaluate(PAN, STEPS))
+            matrix, *_ = drawn(browser, f"{console}#/maps/two/traverses", ".matrix canvas")
+            browser.close()
+    found = {"first paint": paint, "plan": plan, "requests": requests, "frames a second": rate, "matrix": matrix}
+    rows = [
+        ("first paint (s)", paint, verdict(paint, 1.0)),
+        (f"plan of {places} places (s)", plan, verdict(plan, 2.0)),
+        ("requests of that page", requests, ""),
+        ("panning (frames a second)", rate, verdict(rate, 30.0, at_least=True)),
+        (f"matrix of {frames} × {frames} (s)", matrix, verdict(matrix, 3.0)),
+    ]
+    report("console_pages", "The console in a browser", ["", "", ""], rows, {"found": found})
+
+
+if __name__ == "__main__":
+    typer.run(main)

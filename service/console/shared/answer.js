@@ -1,0 +1,178 @@
+// The answer to one frame: the verdict, the matches beside the frame, why the best one matches, and what took how long.
+import { Facts, Verdict } from "./elements.js";
+import { decimal, encoderName, integer, metres, milliseconds, percent, poseText } from "./formats.js";
+import { Picture, Thumbnail, thumbnailPath } from "./pictures.js";
+import { href } from "./router.js";
+import { html, useState } from "./view.js";
+
+const REASONS = {
+  "no-regions": "The frame shows nothing to compare, as a blank wall does.",
+  "empty-map": "The map has no places.",
+  "no-place-allowed": "No place fits the filters.",
+};
+
+/** frame: {url, ratio} of the picture that was sent. */
+export function Answer({ map, answer, frame }) {
+  const [rank, setRank] = useState(1);
+  const match = answer.matches.find((one) => one.rank === rank) || answer.matches[0] || null;
+  return html`
+    <div class="answer">
+      <section class="panel" aria-label="Answer">
+        <${Summary} map=${map} answer=${answer} />
+        ${match && html`<${Pair} map=${map} frame=${frame} match=${match} why=${match.rank === 1 ? answer.explanation : null} />`}
+        ${!match && html`<div class="pair alone"><img src=${frame.url} alt="The frame" /></div>`}
+      </section>
+      ${answer.matches.length > 0 && html`
+        <section class="panel" aria-label="Matches">
+          <h2>Matches</h2>
+          <ol class="matches">
+            ${answer.matches.map((one) => html`<${MatchTile} key=${one.place.id} map=${map} match=${one} chosen=${one === match} choose=${setRank} />`)}
+          </ol>
+        </section>
+      `}
+      <div class="columns">
+        <section class="panel"><h2>Why</h2><${Why} answer=${answer} /></section>
+        <section class="panel"><h2>Time</h2><${Timings} milliseconds=${answer.milliseconds} /></section>
+      </div>
+    </div>
+  `;
+}
+
+function Summary({ map, answer }) {
+  const { verdict, probability, place, reason, rivals = [], pose } = answer;
+  return html`
+    <div class="spread">
+      <p class="large"><${Verdict} verdict=${verdict} />${place && html` as <a href=${href("maps", map, "places", place.id)}>${place.id}</a>`}</p>
+      <p class="large">${probability !== null && probability !== undefined && html`${percent(probability, 1)} <span class="faint small">probable</span>`}</p>
+    </div>
+    ${reason && html`<p>${REASONS[reason] || reason}</p>`}
+    ${rivals.length > 0 && html`
+      <p>
+        Rivals: ${rivals.map((rival, one) => html`${one > 0 && "; "}${rival.places.slice(0, 3).map((id, two) => html`${two > 0 && ", "}<a href=${href("maps", map, "places", id)}>${id}</a>`)}
+        <span class="faint"> ${rival.same_place ? "the same place" : "another place"}, ${decimal(rival.score)}</span>`)}
+      </p>
+    `}
+    ${pose && html`<p class="faint">Pose ${poseText(pose)} ± ${metres(pose.spread)}</p>`}
+  `;
+}
+
+const LAYERS = [
+  ["inliers", "Inliers", (why) => why.inliers.length],
+  ["cells", "Cells", (why) => why.cells.length],
+  ["regions", "Regions", (why) => why.regions.length],
+];
+
+/** The frame beside a match; with an explanation, what connects them is drawn over both. */
+function Pair({ map, frame, match, why }) {
+  const kinds = why ? LAYERS.filter(([, , count]) => count(why) > 0) : [];
+  const [kind, setKind] = useState(null);
+  const shown = kinds.some(([id]) => id === kind) || kind === "" ? kind : kinds[0]?.[0];
+  return html`
+    ${kinds.length > 0 && html`
+      <div class="row">
+        <div class="segments" role="group" aria-label="Drawn over the frames">
+          ${kinds.map(([id, name, count]) => html`<button type="button" aria-pressed=${shown === id} onClick=${() => setKind(id)}>${name} <span class="faint">${integer(count(why))}</span></button>`)}
+          <button type="button" aria-pressed=${shown === ""} onClick=${() => setKind("")}>Nothing</button>
+        </div>
+      </div>
+    `}
+    <figure class="stack">
+      <div class="pair" style=${{ "--ratio": frame.ratio || 4 / 3 }}>
+        <img src=${frame.url} alt="The frame" />
+        <${Picture} path=${thumbnailPath(map, match.place.id)} version=${match.place.updated_at} alt=${`Place ${match.place.id}`} />
+        ${why && shown && html`<${Overlay} why=${why} kind=${shown} />`}
+      </div>
+      <figcaption class="spread small faint"><span>the frame</span><span>${match.place.id}, rank ${match.rank}</span></figcaption>
+    </figure>
+  `;
+}
+
+/** Lines and boxes over both frames; each frame is one unit wide. */
+function Overlay({ why, kind }) {
+  return html`
+    <svg viewBox="0 0 2 1" preserveAspectRatio="none" aria-hidden="true" class=${`overlay ${kind}`}>
+      ${kind === "regions" ? why.regions.map((pair) => html`<${RegionPair} why=${why} pair=${pair} />`) : linesOf(why, kind).map(([x1, y1, x2, y2, strength]) => html`
+        <line x1=${x1} y1=${y1} x2=${1 + x2} y2=${y2} opacity=${strength} vector-effect="non-scaling-stroke" />
+      `)}
+    </svg>
+  `;
+}
+
+function linesOf(why, kind) {
+  if (kind === "inliers") return why.inliers.map(({ query, match }) => [...query, ...match, Math.min(0.8, 0.2 + 40 / why.inliers.length)]);
+  const [rows, columns] = why.grid;
+  const most = Math.max(...why.cells.map((cell) => cell.gain), 1e-9);
+  const centre = ([row, column]) => [(column + 0.5) / columns, (row + 0.5) / rows];
+  return why.cells.map(({ query, match, gain }) => [...centre(query), ...centre(match), 0.15 + 0.8 * Math.max(0, gain / most)]);
+}
+
+function RegionPair({ why, pair }) {
+  const boxes = [[why.query_regions[pair.query].box, 0], [why.match_regions?.[pair.match].box, 1]];
+  return boxes.map(([box, aside]) => box && html`
+    <rect x=${box.left + aside} y=${box.top} width=${box.right - box.left} height=${box.bottom - box.top} vector-effect="non-scaling-stroke" />
+  `);
+}
+
+function MatchTile({ map, match, chosen, choose }) {
+  const { place, rank, score, parts } = match;
+  return html`
+    <li class=${chosen ? "thumb chosen" : "thumb"}>
+      <button type="button" class="cover" aria-pressed=${chosen} aria-label=${`Show match ${rank}, ${place.id}`} onClick=${() => choose(rank)}>
+        <${Thumbnail} map=${map} place=${place.id} version=${place.updated_at} />
+      </button>
+      <span class="under"><a class="name" href=${href("maps", map, "places", place.id)}>${place.id}</a><span>${decimal(score)}</span></span>
+      ${parts && html`<span class="faint small">${decimal(parts.similarity)} + ${decimal(parts.agreement)}${parts.inliers !== null && `, ${parts.inliers} inliers`}</span>`}
+      ${place.sequence && html`<span class="faint small clip">${place.sequence}</span>`}
+    </li>
+  `;
+}
+
+function Why({ answer }) {
+  const { score, margin, decision, threshold, matches, explanation, verification, encoder } = answer;
+  const parts = matches[0]?.parts;
+  const checked = verification && (verification.state ?? verification.verified ?? null);
+  return html`
+    <${Facts} rows=${[
+      ["Score", decimal(score)],
+      parts && ["Similarity + agreement", `${decimal(parts.similarity)} + ${decimal(parts.agreement)}`],
+      ["Margin to the best rival", decimal(margin)],
+      ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],
+      parts && parts.inliers !== null && ["Inliers", `${integer(parts.inliers)} of ${integer(parts.keypoints)}`],
+      parts && parts.evidence !== null && parts.evidence !== undefined && ["Evidence", decimal(parts.evidence, 1)],
+      checked !== null && checked !== undefined && ["Geometry", String(checked)],
+      ["Encoder", encoderName(encoder), encoder],
+    ]} />
+    ${explanation && explanation.words.length > 0 && html`
+      <h3>What each word adds</h3>
+      <${Words} words=${explanation.words} />
+    `}
+  `;
+}
+
+function Words({ words }) {
+  const most = Math.max(...words.map(Math.abs), 1e-9);
+  const total = words.reduce((sum, one) => sum + Math.max(0, one), 0) || 1;
+  const best = words.map((value, word) => [value, word]).sort((a, b) => b[0] - a[0]).slice(0, 5);
+  const text = best.map(([value, word]) => `word ${word} ${percent(value / total)}`).join(", ");
+  return html`
+    <div class="words" role="img" aria-label=${`Shares of the words; the largest: ${text}`}>
+      ${words.map((value, word) => html`<span class=${value < 0 ? "negative" : ""} title=${`word ${word}: ${decimal(value, 4)}`} style=${{ height: `${(100 * Math.abs(value)) / most}%` }}></span>`)}
+    </div>
+    <p class="faint small">The largest shares: ${text}.</p>
+  `;
+}
+
+/** Stages of the work as a bar and as a list. */
+export function Timings({ milliseconds: told }) {
+  const stages = Object.entries(told).filter(([name]) => name !== "total");
+  const sum = stages.reduce((all, [, value]) => all + value, 0) || 1;
+  return html`
+    <div class="timings" aria-hidden="true">
+      ${stages.map(([name, value], one) => html`<span class=${`tint-${one % 8}`} title=${`${name} ${milliseconds(value)}`} style=${{ flexGrow: value / sum }}></span>`)}
+    </div>
+    <ul class="stages">
+      ${stages.map(([name, value], one) => html`<li><span class=${`swatch square tint-${one % 8}`}></span><span>${name}</span><span class="number">${milliseconds(value)}</span></li>`)}
+      <li><span></span><strong>total</strong><strong class="number">${milliseconds(told.total)}</strong></li>
+    </ul>
+  `;
+}

@@ -1,0 +1,218 @@
+// The pieces that views are made of.  Everything that a user may have written is put in as text.
+import { Problem } from "./api.js";
+import { exact, percent, relative } from "./formats.js";
+import { html, signal, useEffect, useId, useRef, useState } from "./view.js";
+
+// States
+
+export function Loading({ what = "Loading" }) {
+  return html`<p class="loading" role="status"><span class="spinner" aria-hidden="true"></span>${what} …</p>`;
+}
+
+export function Nothing({ title, children }) {
+  return html`<div class="nothing"><strong>${title}</strong>${children && html`<p>${children}</p>`}</div>`;
+}
+
+/** What went wrong: a problem's title, detail and request id. */
+export function Trouble({ error, again, close }) {
+  const isProblem = error instanceof Problem;
+  return html`
+    <div class="trouble" role="alert">
+      <div>
+        <strong>${error.title || "Something went wrong"}</strong>
+        <p>${error.detail || error.message}</p>
+        ${isProblem && error.errors.length > 0 && html`<ul>${error.errors.map((one) => html`<li>${errorText(one)}</li>`)}</ul>`}
+        ${isProblem && error.requestId && html`<p class="faint small">Request <code>${error.requestId}</code></p>`}
+      </div>
+      ${again && html`<button type="button" onClick=${again}>Try again</button>`}
+      ${close && html`<button type="button" onClick=${close}>Close</button>`}
+    </div>
+  `;
+}
+
+function errorText(one) {
+  if (typeof one === "string") return one;
+  const where = one.parameter || (one.loc || []).join(".") || one.name || one.field;
+  const what = one.detail || one.message || one.msg || JSON.stringify(one);
+  return where ? `${where}: ${what}` : what;
+}
+
+// Times and figures
+
+const now = signal(Date.now());
+setInterval(() => {
+  now.value = Date.now();
+}, 15_000);
+
+/** A moment relative to now, with the exact one as its title. */
+export function Moment({ at }) {
+  if (!at) return html`<span class="faint">–</span>`;
+  return html`<time datetime=${at} title=${exact(at)}>${relative(at, Math.max(now.value, Date.now()))}</time>`;
+}
+
+const SIGNS = { recognized: "●", ambiguous: "◐", unknown: "○" };
+
+export function Verdict({ verdict }) {
+  return html`<span class=${`verdict ${verdict}`}><span aria-hidden="true">${SIGNS[verdict]}</span> ${verdict}</span>`;
+}
+
+const VERDICTS = ["recognized", "ambiguous", "unknown"];
+
+/** Shares of the verdicts as a bar. */
+export function VerdictMix({ counts }) {
+  const total = counts ? VERDICTS.reduce((sum, name) => sum + counts[name], 0) : 0;
+  if (!total) return html`<span class="faint">no answers</span>`;
+  const text = VERDICTS.map((name) => `${counts[name]} ${name}`).join(", ");
+  return html`
+    <span class="mix" role="img" aria-label=${text} title=${text}>
+      ${VERDICTS.map((name) => counts[name] > 0 && html`<span class=${name} style=${{ flexGrow: counts[name] }}></span>`)}
+    </span>
+    <span class="faint small">${percent(counts.recognized / total)}</span>
+  `;
+}
+
+/** A bar of a share from 0 to 1. */
+export function Bar({ share, label, tone = "" }) {
+  const width = `${Math.min(100, Math.max(0, 100 * share))}%`;
+  return html`<span class=${`bar ${tone}`} role="img" aria-label=${label}><span style=${{ width }}></span></span>`;
+}
+
+export function Progress({ done, total, label }) {
+  return html`<progress class="progress" aria-label=${label} max=${total || 1} value=${total ? done : undefined}></progress>`;
+}
+
+export function Pill({ tone = "", title, children }) {
+  return html`<span class=${`pill ${tone}`} title=${title}>${children}</span>`;
+}
+
+export function Facts({ rows }) {
+  return html`
+    <dl class="facts">
+      ${rows.filter(Boolean).map(([name, value, title]) => html`<div><dt>${name}</dt><dd title=${title}>${value}</dd></div>`)}
+    </dl>
+  `;
+}
+
+// Head of a view
+
+export function Head({ title, note, children }) {
+  useEffect(() => {
+    document.title = `${title} · placerec console`;
+  }, [title]);
+  return html`
+    <header class="head">
+      <div><h1 tabindex="-1">${title}</h1>${note && html`<p class="faint">${note}</p>`}</div>
+      <div class="actions">${children}</div>
+    </header>
+  `;
+}
+
+// Forms
+
+export function Field({ label, hint, children, inline = false }) {
+  return html`
+    <label class=${inline ? "field inline" : "field"}>
+      <span class="label">${label}</span>
+      ${children}
+      ${hint && html`<span class="hint">${hint}</span>`}
+    </label>
+  `;
+}
+
+/** A dialog; it closes with Esc, and gives the focus back. */
+export function Dialog({ title, close, wide = false, children }) {
+  const element = useRef(null);
+  const id = useId();
+  useEffect(() => {
+    const before = document.activeElement;
+    element.current.showModal();
+    return () => before?.focus?.();
+  }, []);
+  const cancelled = (event) => {
+    event.preventDefault();
+    close();
+  };
+  return html`
+    <dialog ref=${element} class=${wide ? "wide" : ""} aria-labelledby=${id} onCancel=${cancelled}>
+      <header><h2 id=${id}>${title}</h2><button type="button" class="quiet" aria-label="Close" onClick=${close}>✕</button></header>
+      <div class="body">${children}</div>
+    </dialog>
+  `;
+}
+
+/** A form in a dialog: it is sent once at a time, and shows what went wrong; with `stay` it does not close by itself. */
+export function FormDialog({ title, action, danger = false, ready = true, stay = false, close, send, wide, children }) {
+  const [error, setError] = useState(null);
+  const [busy, setBusy] = useState(false);
+  const submit = async (event) => {
+    event.preventDefault();
+    if (busy || !ready) return;
+    setBusy(true);
+    setError(null);
+    try {
+      await send();
+      if (!stay) close();
+    } catch (problem) {
+      setError(problem);
+    }
+    setBusy(false);
+  };
+  return html`
+    <${Dialog} title=${title} close=${close} wide=${wide}>
+      <form onSubmit=${submit}>
+        ${children}
+        ${error && html`<${Trouble} error=${error} />`}
+        <footer>
+          <button type="button" onClick=${close}>Cancel</button>
+          <button type="submit" class=${danger ? "danger" : "primary"} disabled=${!ready || busy}>${busy ? "…" : action}</button>
+        </footer>
+      </form>
+    <//>
+  `;
+}
+
+/** Ask for the name of what is going to be destroyed. */
+export function ByName({ title, name, action, close, send, children }) {
+  const [typed, setTyped] = useState("");
+  return html`
+    <${FormDialog} title=${title} action=${action} danger ready=${typed === name} close=${close} send=${send}>
+      ${children}
+      <${Field} label=${html`Type <code>${name}</code> to confirm`}>
+        <input value=${typed} onInput=${(event) => setTyped(event.target.value)} autocomplete="off" spellcheck=${false} autofocus />
+      <//>
+    <//>
+  `;
+}
+
+export function Copy({ text, label = "Copy" }) {
+  const [done, setDone] = useState(false);
+  const copy = async () => {
+    await navigator.clipboard.writeText(text);
+    setDone(true);
+    setTimeout(() => setDone(false), 2000);
+  };
+  return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done ? "Copied" : label}</button>`;
+}
+
+// Messages that go by themselves
+
+export const messages = signal([]);
+let number = 0;
+
+/** Say something at the edge of the page; undo, if given, is offered with it. */
+export function say(text, undo) {
+  const id = (number += 1);
+  messages.value = [...messages.value.slice(-3), { id, text, undo }];
+  setTimeout(() => unsay(id), undo ? 12_000 : 5000);
+}
+
+export function unsay(id) {
+  messages.value = messages.value.filter((one) => one.id !== id);
+}
+
+/** Say what went wrong with an action. */
+export function complain(error) {
+  if (error.name === "AbortError") return;
+  const id = (number += 1);
+  messages.value = [...messages.value.slice(-3), { id, error }];
+}

@@ -1,0 +1,87 @@
+// Who changed what: the audit trail, the newest first.
+import { get } from "../shared/api.js";
+import { Dialog, Field, Head, Moment, Nothing } from "../shared/elements.js";
+import { Result } from "../shared/result.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { href, restate } from "../shared/router.js";
+import { html, useEffect, useState } from "../shared/view.js";
+
+const FILTERS = { map: "Map", key: "Key", operation: "Operation", after: "From (UTC)", before: "To (UTC)" };
+const ENOUGH = 50;
+const MOST_PAGES = 20;
+
+export default function Audit({ query }) {
+  const filter = Object.fromEntries(Object.keys(FILTERS).filter((name) => query[name]).map((name) => [name, query[name]]));
+  const present = JSON.stringify(filter);
+  const [cursors, setCursors] = useState([""]);
+  const [open, setOpen] = useState(null);
+  useEffect(() => setCursors([""]), [present]);
+  const cursor = cursors.at(-1);
+  const lines = useResource((signal) => read(filter, cursor, signal), [filter, cursor]);
+  const kind = (name) => (["after", "before"].includes(name) ? "datetime-local" : "text");
+  return html`
+    <${Head} title="Audit" note=${lines.data?.source === "memory" ? "The last lines of this process; with PLACEREC_AUDIT_FILE all of them are kept." : "Who changed what, and who was refused."}>
+      <button type="button" onClick=${lines.reload}>Refresh</button>
+    <//>
+    <div class="filters" role="search" aria-label="Filters">
+      ${Object.entries(FILTERS).map(([name, label]) => html`
+        <${Field} label=${label}><input type=${kind(name)} step="1" value=${filter[name] || ""} onChange=${(event) => restate({ [name]: event.target.value.trim() })} spellcheck=${false} /><//>
+      `)}
+    </div>
+    <${Shown} resource=${lines}>
+      ${({ items, next }) => html`
+        ${items.length === 0 ? html`<${Nothing} title="No lines" />` : html`<${Table} items=${items} open=${setOpen} />`}
+        ${(cursors.length > 1 || next) && html`
+          <nav class="pager" aria-label="Pages">
+            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Newer</button>
+            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Older →</button>
+          </nav>
+        `}
+      `}
+    <//>
+    ${open && html`<${Dialog} title=${open.operation || open.event} close=${() => setOpen(null)} wide><${Result} value=${open} /><//>`}
+  `;
+}
+
+/** A page of lines; the service reads a bounded part of the trail at a time, which may hold few that fit. */
+async function read(filter, cursor, signal) {
+  const items = [];
+  let next = cursor;
+  let source = null;
+  for (let page = 0; page < MOST_PAGES && items.length < ENOUGH; page += 1) {
+    const told = await get("/audit", { ...filter, limit: 100, cursor: next }, { signal });
+    items.push(...told.items);
+    next = told.next_cursor;
+    source = told.source;
+    if (!next) break;
+  }
+  return { items, next, source };
+}
+
+function tone(line) {
+  if (line.event === "refused") return "bad";
+  return line.status !== null && line.status >= 400 ? "warn" : "";
+}
+
+function Table({ items, open }) {
+  return html`
+    <div class="table" tabindex="0" role="region" aria-label="Audit trail">
+      <table>
+        <thead><tr><th>When</th><th>Who</th><th>What</th><th>On</th><th class="number">Status</th><th>From</th><th><span class="hidden">More</span></th></tr></thead>
+        <tbody>
+          ${items.map((line) => html`
+            <tr>
+              <td class="nowrap"><${Moment} at=${line.time} /></td>
+              <td>${line.principal || "–"}</td>
+              <td>${line.event !== "change" && html`<span class=${`pill ${tone(line)}`}>${line.event}</span> `}${(line.operation || "").replaceAll("_", " ")}${line.change && html` <span class="faint small">${line.change}</span>`}</td>
+              <td class="long">${line.map && html`<a href=${href("maps", line.map, "plan")}>${line.map}</a>`} ${line.place || line.sequence || line.camera || line.changed_key_name || ""}</td>
+              <td class="number">${line.status === null || line.status === undefined ? "–" : html`<span class=${line.status >= 400 ? "pill warn" : ""}>${line.status}</span>`}</td>
+              <td>${line.client || "–"}</td>
+              <td class="actions-cell"><button type="button" class="small" aria-label=${`All of the line of ${line.time}`} onClick=${() => open(line)}>More</button></td>
+            </tr>
+          `)}
+        </tbody>
+      </table>
+    </div>
+  `;
+}

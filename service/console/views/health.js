@@ -1,0 +1,256 @@
+// The health of a map: what never matches, what matches everything, where to drive again; pruning and merging with
+// what they would cost.
+import { all, get, may, post } from "../shared/api.js";
+import { Chart } from "../shared/chart.js";
+import { ByName, Facts, Field, Head, Loading, Moment, Pill, Trouble, VerdictMix } from "../shared/elements.js";
+import { decimal, integer, metres, percent } from "../shared/formats.js";
+import { JobProgress } from "../shared/jobs.js";
+import { mapPath } from "../shared/map_path.js";
+import { Thumbnail } from "../shared/pictures.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { Result } from "../shared/result.js";
+import { href } from "../shared/router.js";
+import { html, useMemo, useState } from "../shared/view.js";
+
+export default function Health({ map }) {
+  const report = useResource((signal) => get(mapPath(map, "health"), {}, { signal }), [map]);
+  return html`
+    <${Head} title="Health" note=${`How ${map} serves, judged by its own frames and by its answers.`}>
+      <button type="button" disabled=${report.loading} onClick=${report.reload}>Examine again</button>
+    <//>
+    ${report.loading && html`<${Loading} what="Comparing the map's frames with one another" />`}
+    ${(report.data || report.error) && html`<${Shown} resource=${report}>${(data) => html`<${Report} map=${map} data=${data} />`}<//>`}
+    ${may("admin") && html`<div class="columns"><${Prune} map=${map} /><${Merge} map=${map} /></div>`}
+  `;
+}
+
+function Report({ map, data }) {
+  const { answers, never_matched: silent, aliasing, gaps, gap_count: gapCount, retraverse, complete } = data;
+  return html`
+    ${!complete && html`<p class="notice">The map is large: a sample of ${integer(aliasing.examined)} of its ${integer(aliasing.of)} places was examined in the time there was.</p>`}
+    <div class="columns">
+      <section class="panel">
+        <h2>Answers</h2>
+        <p><${VerdictMix} counts=${answers} /> of ${integer(answers.queries)} queries${answers.since && html` since <${Moment} at=${answers.since} />`}</p>
+        <${Drift} answers=${answers} />
+      </section>
+      <section class="panel">
+        <h2>Never matched</h2>
+        <${Silent} map=${map} silent=${silent} places=${data.places} />
+      </section>
+    </div>
+    <div class="columns">
+      <section class="panel">
+        <h2>Match everything</h2>
+        <p class="faint">Places that are among the most alike of unusually many others, such as a bare wall.</p>
+        <${Hubs} map=${map} items=${aliasing.hubs} unit="times, expected" />
+        ${aliasing.unsure.length > 0 && html`<h3>Often the best match of what was not recognized</h3><${Hubs} map=${map} items=${aliasing.unsure} unit="times, expected" />`}
+      </section>
+      <section class="panel">
+        <h2>Look like other places <span class="faint">${integer(aliasing.alias_count)}</span></h2>
+        <${Aliases} map=${map} items=${aliasing.aliases} />
+      </section>
+    </div>
+    <div class="columns">
+      <section class="panel"><h2>Where to drive again</h2><${Stretches} map=${map} items=${retraverse} /></section>
+      <section class="panel"><h2>Gaps <span class="faint">${integer(gapCount)}</span></h2><${Gaps} map=${map} items=${gaps} /></section>
+    </div>
+  `;
+}
+
+function Drift({ answers }) {
+  const weeks = answers.weeks.filter((week) => week.queries > 0);
+  const data = useMemo(() => [weeks.map((week) => new Date(week.monday).getTime() / 1000), weeks.map((week) => week.unknown_rate), weeks.map((week) => week.mean_score)], [answers]);
+  const trends = [["unknown answers", answers.unknown_trend, (one) => percent(one, 1)], ["scores", answers.score_trend, (one) => decimal(one, 4)]];
+  return html`
+    ${weeks.length > 1
+      ? html`<${Chart} data=${data} height=${200} series=${[{ label: "share of unknown", tint: "ambiguous" }, { label: "mean score" }]} axes=${[{ label: "week", time: true }, { label: "" }]} scales=${{ y: [0, 1] }} label="Share of unknown answers and mean score by week" />`
+      : html`<p class="faint">Drift is shown once there are two weeks of answers.</p>`}
+    ${trends.map(([name, trend, written]) => trend && html`
+      <p>${name}: ${trend.per_week > 0 ? "+" : ""}${written(trend.per_week)} a week ${trend.significant ? html`<${Pill} tone="warn">drifting<//>` : html`<span class="faint">within chance</span>`}</p>
+    `)}
+  `;
+}
+
+function PlaceLinks({ map, ids, most = 8 }) {
+  return html`
+    <ul class="thumbs narrow">
+      ${ids.slice(0, most).map((id) => html`<li class="thumb" key=${id}><a href=${href("maps", map, "places", id)}><${Thumbnail} map=${map} place=${id} /><span class="name small">${id}</span></a></li>`)}
+    </ul>
+    ${ids.length > most && html`<p class="faint small">and ${integer(ids.length - most)} more</p>`}
+  `;
+}
+
+function Silent({ map, silent, places }) {
+  if (!silent) return html`<p class="faint">The map has not been queried yet.</p>`;
+  return html`
+    <p>${integer(silent.count)} of ${integer(places)} places were never the best match; ${integer(Math.round(silent.by_chance))} would be by chance.</p>
+    <${PlaceLinks} map=${map} ids=${silent.places} />
+  `;
+}
+
+function Hubs({ map, items, unit }) {
+  if (items.length === 0) return html`<p>None.</p>`;
+  return html`
+    <ul class="thumbs narrow">
+      ${items.slice(0, 8).map((one) => html`
+        <li class="thumb" key=${one.place}><a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="name small">${one.place}</span></a>
+        <span class="faint small">${integer(one.count)} ${unit} ${decimal(one.expected, 1)}</span></li>
+      `)}
+    </ul>
+  `;
+}
+
+function Aliases({ map, items }) {
+  if (items.length === 0) return html`<p>None.</p>`;
+  return html`
+    <ul class="stack">
+      ${items.slice(0, 6).map((one) => html`
+        <li class="alias">
+          <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small">${one.place}</span></a>
+          <a href=${href("maps", map, "places", one.other)}><${Thumbnail} map=${map} place=${one.other} /><span class="small">${one.other}</span></a>
+          <span class="small">${decimal(one.score)} <span class="faint">own ${decimal(one.own)}</span></span>
+        </li>
+      `)}
+    </ul>
+  `;
+}
+
+function Stretches({ map, items }) {
+  if (items.length === 0) return html`<p>Nowhere: no stretch is weak.</p>`;
+  return html`
+    <div class="table" tabindex="0" role="region" aria-label="Stretches">
+      <table>
+        <thead><tr><th>Traverse</th><th>From</th><th>To</th><th>Why</th><th class="number">Weight</th></tr></thead>
+        <tbody>
+          ${items.slice(0, 20).map((one) => html`
+            <tr>
+              <td>${one.sequence}</td>
+              <td><a href=${href("maps", map, "plan", { place: one.first })}>${one.first}</a></td>
+              <td><a href=${href("maps", map, "plan", { place: one.last })}>${one.last}</a></td>
+              <td class="small">${one.reasons.map((reason) => reason.replaceAll("-", " ")).join(", ")}</td>
+              <td class="number">${decimal(one.weight, 1)}</td>
+            </tr>
+          `)}
+        </tbody>
+      </table>
+    </div>
+  `;
+}
+
+const MEASURES = { distance: metres, time: (value) => `${decimal(value, 1)} s`, similarity: (value) => decimal(value) };
+
+function Gaps({ map, items }) {
+  if (items.length === 0) return html`<p>None.</p>`;
+  return html`
+    <div class="table" tabindex="0" role="region" aria-label="Gaps">
+      <table>
+        <thead><tr><th>Between</th><th>Measure</th><th class="number">Step</th><th class="number">Usual</th><th class="number">Times</th></tr></thead>
+        <tbody>
+          ${items.slice(0, 20).map((one) => html`
+            <tr>
+              <td><a href=${href("maps", map, "plan", { place: one.before })}>${one.before}</a> and ${one.after}</td>
+              <td>${one.measure}</td>
+              <td class="number">${(MEASURES[one.measure] || decimal)(one.value)}</td>
+              <td class="number">${(MEASURES[one.measure] || decimal)(one.median)}</td>
+              <td class="number">${decimal(one.severity, 1)}</td>
+            </tr>
+          `)}
+        </tbody>
+      </table>
+    </div>
+  `;
+}
+
+// Pruning and merging: a dry run first, whose report says what it would cost; then the same for good
+
+function useTrial(path) {
+  const [state, setState] = useState({ order: null, job: null, report: null, error: null });
+  const start = async (order) => {
+    setState({ order, job: null, report: null, error: null });
+    try {
+      setState({ order, job: await post(path, order), report: null, error: null });
+    } catch (error) {
+      setState({ order, job: null, report: null, error });
+    }
+  };
+  const ended = (job) => setState((old) => ({ ...old, report: job.state === "succeeded" ? job.result : null }));
+  return { ...state, start, ended };
+}
+
+function Prune({ map }) {
+  const [loss, setLoss] = useState(1);
+  const [dialog, setDialog] = useState(null);
+  const trial = useTrial(mapPath(map, "prune"));
+  const { report, job, order } = trial;
+  const apply = () => trial.start({ ...order, dry_run: false });
+  const removed = report?.removed ?? 0;
+  return html`
+    <section class="panel" aria-label="Prune">
+      <h2>Prune</h2>
+      <p class="faint">Removes places whose neighbours can stand in for them.</p>
+      <${Field} label=${html`Recall that may be lost: <strong>${decimal(loss, 1)} %</strong>`}>
+        <input type="range" min="0" max="10" step="0.5" value=${loss} onInput=${(event) => setLoss(event.target.valueAsNumber)} />
+      <//>
+      <div class="row"><button type="button" onClick=${() => trial.start({ dry_run: true, max_recall_loss: loss / 100 })}>What would it cost?</button></div>
+      ${trial.error && html`<${Trouble} error=${trial.error} />`}
+      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Pruning"} />`}
+      ${report && html`
+        <${Facts} rows=${[
+          [order.dry_run ? "Would go" : "Gone", `${integer(removed)} of ${integer(report.places)} places`],
+          ["Recall before", shareText(report.recall_before)],
+          ["Recall after", shareText(report.recall_after)],
+          ["Measured on", `${report.measured_on}, ${integer(report.queries)} queries`],
+        ]} />
+        ${removed > 0 && order.dry_run && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Remove ${integer(removed)} places</button></div>`}
+      `}
+      ${dialog && report && html`<${ByName} title=${`Prune ${map}`} name=${map} action="Remove the places" close=${() => setDialog(null)} send=${apply}>
+        <p>${integer(removed)} places go, with their pictures. This cannot be undone; export the map first if they may be wanted again.</p>
+      <//>`}
+    </section>
+  `;
+}
+
+function shareText({ value, low, high }) {
+  return html`${percent(value, 1)} <span class="faint">${percent(low)} to ${percent(high)}</span>`;
+}
+
+function Merge({ map }) {
+  const maps = useResource((signal) => all("/maps", {}, { signal }), [map]);
+  const [from, setFrom] = useState("");
+  const [conflict, setConflict] = useState("refuse");
+  const [dialog, setDialog] = useState(null);
+  const trial = useTrial(mapPath(map, "merge"));
+  const { report, job, order } = trial;
+  const own = maps.data?.find((one) => one.id === map);
+  const others = (maps.data || []).filter((one) => one.id !== map && one.encoder === own?.encoder);
+  const apply = () => trial.start({ ...order, dry_run: false });
+  return html`
+    <section class="panel" aria-label="Merge">
+      <h2>Merge</h2>
+      <p class="faint">Copies the places of another map of the same encoder into this one; the other stays as it is.</p>
+      ${others.length === 0 ? html`<p>There is no other map of this encoder.</p>` : html`
+        <div class="fields">
+          <${Field} label="From"><select value=${from} onChange=${(event) => setFrom(event.target.value)}><option value="">choose …</option>${others.map((one) => html`<option value=${one.id}>${one.id} (${integer(one.places)})</option>`)}</select><//>
+          <${Field} label="Where names conflict"><select value=${conflict} onChange=${(event) => setConflict(event.target.value)}><option value="refuse">refuse</option><option value="rename">rename what comes</option><option value="skip">skip it</option></select><//>
+        </div>
+        <div class="row"><button type="button" disabled=${!from} onClick=${() => trial.start({ from, dry_run: true, on_conflict: conflict })}>What would come?</button></div>
+      `}
+      ${trial.error && html`<${Trouble} error=${trial.error} />`}
+      ${job && html`<${JobProgress} key=${job.id} job=${job} onEnd=${trial.ended} what=${order.dry_run ? "Dry run" : "Merging"} />`}
+      ${report && html`
+        <${Facts} rows=${[
+          [order.dry_run ? "Would come" : "Came", `${integer(report.coming)} places`],
+          ["Known here already", integer(report.known)],
+          ["Skipped", integer(report.skipped.count)],
+          report.conflicts.length > 0 && ["Conflicts", html`<ul>${report.conflicts.map((one) => html`<li>${one}</li>`)}</ul>`],
+          report.overlap && ["Overlap", html`<${Result} value=${report.overlap} />`],
+        ]} />
+        ${report.coming > 0 && order.dry_run && report.conflicts.length === 0 && html`<div class="row"><button type="button" class="danger" onClick=${() => setDialog(true)}>Copy ${integer(report.coming)} places</button></div>`}
+      `}
+      ${dialog && report && html`<${ByName} title=${`Merge into ${map}`} name=${map} action="Copy the places" close=${() => setDialog(null)} send=${apply}>
+        <p>${integer(report.coming)} places of ${order.from} come into ${map}.</p>
+      <//>`}
+    </section>
+  `;
+}

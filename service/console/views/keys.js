@@ -1,0 +1,173 @@
+// Keys: who may do what.  A new one is shown once; one in force can be narrowed or revoked.
+import { all, identify, send, useKey } from "../shared/api.js";
+import { ByName, Copy, Dialog, Field, FormDialog, Head, Moment, Nothing, Pill, say } from "../shared/elements.js";
+import { MapsField } from "../shared/maps_field.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { html, useState } from "../shared/view.js";
+
+const ROLES = ["query", "enrol", "admin"];
+const TONES = { "in force": "good", revoked: "bad", expired: "warn" };
+
+export default function Keys() {
+  const keys = useResource((signal) => all("/keys", {}, { signal }), [], { every: 30_000 });
+  const [ended, setEnded] = useState(false);
+  const [dialog, setDialog] = useState(null);
+  const close = () => setDialog(null);
+  const tools = { open: setDialog, close, changed: keys.reload };
+  const create = () => setDialog(html`<${Create} first=${keys.data?.length === 0} ...${tools} />`);
+  return html`
+    <${Head} title="Keys" note="Each caller has a key of its own, so that one can be revoked alone.">
+      <label class="row"><input type="checkbox" checked=${ended} onChange=${() => setEnded(!ended)} /> also ended ones</label>
+      <button type="button" class="primary" onClick=${create}>Create a key</button>
+    <//>
+    <${Shown} resource=${keys}>
+      ${(items) => {
+        const shown = items.filter((one) => ended || one.state === "in force").reverse();
+        return shown.length === 0
+          ? html`<${Nothing} title=${items.length === 0 ? "There are no keys" : "No key is in force"}>${items.length === 0 && "Everybody on this machine may do everything. The first key ends that."}<//>`
+          : html`<${Table} items=${shown} ...${tools} />`;
+      }}
+    <//>
+    ${dialog}
+  `;
+}
+
+function Table({ items, open, close, changed }) {
+  return html`
+    <div class="table" tabindex="0" role="region" aria-label="Keys">
+      <table>
+        <thead><tr><th>Name</th><th>Role</th><th>Maps</th><th>State</th><th>Created</th><th>Last used</th><th>Expires</th><th><span class="hidden">Actions</span></th></tr></thead>
+        <tbody>
+          ${items.map((key) => html`
+            <tr key=${key.id}>
+              <td><strong>${key.name}</strong>${key.own && html` <${Pill} tone="on">yours<//>`} <code class="faint small">${key.id}</code></td>
+              <td>${key.role}</td>
+              <td class="long">${key.maps === null ? "all" : key.maps.join(", ")}</td>
+              <td><${Pill} tone=${TONES[key.state]}>${key.state}<//></td>
+              <td class="nowrap"><${Moment} at=${key.created_at} /></td>
+              <td class="nowrap"><${Moment} at=${key.last_used_at} /></td>
+              <td class="nowrap">${key.expires_at ? html`<${Moment} at=${key.expires_at} />` : html`<span class="faint">never</span>`}</td>
+              <td class="actions-cell">
+                ${key.state === "in force" && html`
+                  <button type="button" class="small" aria-label=${`Narrow ${key.name}`} onClick=${() => open(html`<${Narrow} key_=${key} close=${close} changed=${changed} />`)}>Narrow</button>
+                  <button type="button" class="small danger" aria-label=${`Revoke ${key.name}`} onClick=${() => open(html`<${Revoke} key_=${key} close=${close} changed=${changed} />`)}>Revoke</button>
+                `}
+              </td>
+            </tr>
+          `)}
+        </tbody>
+      </table>
+    </div>
+  `;
+}
+
+function Locking({ shown, value, change }) {
+  return shown && html`
+    <label class="field check"><input type="checkbox" checked=${value} onChange=${() => change(!value)} /><span>Do it although no admin key for all maps is left; only the command line on the machine helps then.</span></label>
+  `;
+}
+
+/** For changes of keys: where one would lock all admins out, it has to be meant. */
+function useLocking() {
+  const [asked, setAsked] = useState(false);
+  const [value, change] = useState(false);
+  const guarded = (call) => async () => {
+    try {
+      await call(value ? { lock_out: true } : {});
+    } catch (error) {
+      if (error.slug === "last-admin-key") setAsked(true);
+      throw error;
+    }
+  };
+  return { guarded, box: html`<${Locking} shown=${asked} value=${value} change=${change} />` };
+}
+
+function Create({ first, close, changed }) {
+  const [fields, setFields] = useState({ name: "", role: first ? "admin" : "query", maps: null, expires: "" });
+  const change = (changes) => setFields((old) => ({ ...old, ...changes }));
+  const { guarded, box } = useLocking();
+  const [made, setMade] = useState(null);
+  const create = guarded(async (query) => {
+    const { name, role, maps, expires } = fields;
+    const body = { name, role, maps, expires_at: expires ? new Date(`${expires}Z`).toISOString() : null };
+    setMade(await (await send("POST", "/keys", { query, json: body })).json());
+    if (!first) changed();
+  });
+  if (made) return html`<${Secret} made=${made} first=${first} close=${close} changed=${changed} />`;
+  return html`
+    <${FormDialog} title="Create a key" action="Create" ready=${fields.name !== "" && fields.maps?.length !== 0} close=${close} stay send=${create}>
+      ${first && html`<p class="notice">With the first key everybody needs one, you too. Make it an admin key for all maps; it is used here at once.</p>`}
+      <${Field} label="Name"><input required maxlength="64" value=${fields.name} onInput=${(event) => change({ name: event.target.value })} autofocus autocomplete="off" spellcheck=${false} /><//>
+      <${RoleField} roles=${ROLES} value=${fields.role} change=${(role) => change({ role })} />
+      <${MapsField} value=${fields.maps} change=${(maps) => change({ maps })} />
+      <${Field} label="Expires (UTC)" hint="Never, if left out."><input type="datetime-local" value=${fields.expires} onInput=${(event) => change({ expires: event.target.value })} /><//>
+      ${box}
+    <//>
+  `;
+}
+
+const MEANING = { query: "asks and reads", enrol: "also changes places", admin: "may do everything" };
+
+function RoleField({ roles, value, change }) {
+  return html`
+    <${Field} label="Role">
+      <select value=${value} onChange=${(event) => change(event.target.value)}>${roles.map((one) => html`<option value=${one}>${one}: ${MEANING[one]}</option>`)}</select>
+    <//>
+  `;
+}
+
+function Secret({ made, first, close, changed }) {
+  const finish = async () => {
+    if (first) await useKey(made.key);
+    changed();
+    close();
+  };
+  return html`
+    <${Dialog} title=${`The key ${made.name}`} close=${finish}>
+      <p><strong>Copy it now.</strong> It is shown this once; the service keeps only its hash.</p>
+      <pre tabindex="0" class="secret" aria-label="The key">${made.key}</pre>
+      <footer class="row"><${Copy} text=${made.key} label="Copy the key" /><button type="button" class="primary" onClick=${finish}>Done</button></footer>
+    <//>
+  `;
+}
+
+function Narrow({ key_: key, close, changed }) {
+  const [role, setRole] = useState(key.role);
+  const [maps, setMaps] = useState(key.maps);
+  const [expires, setExpires] = useState(key.expires_at ? key.expires_at.slice(0, 16) : "");
+  const { guarded, box } = useLocking();
+  const save = guarded(async (query) => {
+    const changes = {};
+    if (role !== key.role) changes.role = role;
+    if (JSON.stringify(maps) !== JSON.stringify(key.maps)) changes.maps = maps;
+    if (expires && expires !== key.expires_at?.slice(0, 16)) changes.expires_at = new Date(`${expires}Z`).toISOString();
+    await send("PATCH", `/keys/${key.id}`, { query, json: changes });
+    say(`The key ${key.name} was narrowed.`);
+    if (key.own) await identify();
+    changed();
+  });
+  return html`
+    <${FormDialog} title=${`Narrow ${key.name}`} action="Narrow" ready=${maps?.length !== 0} close=${close} send=${save}>
+      <p class="faint">A key can only be narrowed: to a lower role, fewer maps, an earlier end.</p>
+      <${RoleField} roles=${ROLES.slice(0, ROLES.indexOf(key.role) + 1)} value=${role} change=${setRole} />
+      <${MapsField} value=${maps} among=${key.maps} change=${setMaps} />
+      <${Field} label="Expires (UTC)"><input type="datetime-local" value=${expires} max=${key.expires_at?.slice(0, 16)} onInput=${(event) => setExpires(event.target.value)} /><//>
+      ${box}
+    <//>
+  `;
+}
+
+function Revoke({ key_: key, close, changed }) {
+  const { guarded, box } = useLocking();
+  const revoke = guarded(async (query) => {
+    await send("DELETE", `/keys/${key.id}`, { query });
+    say(`The key ${key.name} was revoked.`);
+    changed();
+  });
+  return html`
+    <${ByName} title=${`Revoke ${key.name}`} name=${key.name} action="Revoke the key" close=${close} send=${revoke}>
+      <p>Whoever uses it is refused from the next request on. This cannot be undone.${key.own && html` <strong>It is the key that you use now.</strong>`}</p>
+      ${box}
+    <//>
+  `;
+}

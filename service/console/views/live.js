@@ -1,0 +1,149 @@
+// The queries of a map as they are answered: verdict, probability, who asked, and why.
+import { epoch, follow, get, may } from "../shared/api.js";
+import { Bar, Dialog, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
+import { decimal, integer, metres, percent, poseText } from "../shared/formats.js";
+import { blobOf, handedOver } from "../shared/frames.js";
+import { mapPath } from "../shared/map_path.js";
+import { Picture, Thumbnail } from "../shared/pictures.js";
+import { Timings } from "../shared/answer.js";
+import { useResource } from "../shared/resource.js";
+import { go, href } from "../shared/router.js";
+import { html, useEffect, useRef, useState } from "../shared/view.js";
+
+const MOST = 300;
+const VERDICTS = ["recognized", "ambiguous", "unknown"];
+
+export default function Live({ map }) {
+  const about = useResource((signal) => get(mapPath(map), {}, { signal }), [map]);
+  const [wanted, setWanted] = useState(VERDICTS);
+  const [text, setText] = useState("");
+  const [pictures, setPictures] = useState(false);
+  const [paused, setPaused] = useState(false);
+  const [open, setOpen] = useState(null);
+  const stream = useStream(map, { wanted, pictures, paused });
+  const allowed = may("enrol") && about.data && about.data.keep !== "none";
+  const shown = stream.items.filter((one) => matches(one, text));
+  const toggle = (verdict) => setWanted((old) => (old.includes(verdict) ? old.filter((one) => one !== verdict) : [...old, verdict]));
+  return html`
+    <${Head} title="Live" note=${`The answers of ${map} as they are given.`}>
+      <${Pill} tone=${stream.open ? "good" : "warn"}>${paused ? "paused" : stream.open ? "listening" : "connecting"}<//>
+      <button type="button" aria-pressed=${paused} onClick=${() => setPaused(!paused)}>${paused ? `Go on (${integer(stream.held)} new)` : "Pause"}</button>
+      <button type="button" onClick=${stream.clear}>Clear</button>
+    <//>
+    <div class="filters" role="search" aria-label="Filters">
+      <div class="segments" role="group" aria-label="Verdicts">
+        ${VERDICTS.map((one) => html`<button type="button" aria-pressed=${wanted.includes(one)} onClick=${() => toggle(one)}>${one}</button>`)}
+      </div>
+      <${Field} label="Who, camera, place" inline><input value=${text} onInput=${(event) => setText(event.target.value)} spellcheck=${false} /><//>
+      ${allowed && html`<label class="row"><input type="checkbox" checked=${pictures} onChange=${() => setPictures(!pictures)} /> frames as thumbnails</label>`}
+    </div>
+    ${stream.error && html`<${Trouble} error=${stream.error} again=${stream.again} />`}
+    ${stream.missed > 0 && html`<p class="notice">${integer(stream.missed)} events came faster than they could be sent, and are missing here.</p>`}
+    ${shown.length === 0
+      ? html`<${Nothing} title="Nothing was asked yet">Answers appear here as robots, cameras and this console ask.<//>`
+      : html`
+        <ol class="stream" aria-label="Answers">
+          ${shown.map((one) => html`<${Line} key=${one.number} map=${map} event=${one} open=${setOpen} />`)}
+        </ol>
+      `}
+    ${open && html`<${Details} map=${map} event=${open} close=${() => setOpen(null)} />`}
+  `;
+}
+
+function matches({ key, camera, place, best, session, operation }, text) {
+  const wanted = text.trim().toLowerCase();
+  return !wanted || [key, camera, place, best, session, operation].some((one) => one?.toLowerCase().includes(wanted));
+}
+
+/** The events of a map, the newest first; while it is paused they are held back. */
+function useStream(map, { wanted, pictures, paused }) {
+  const [state, setState] = useState({ items: [], open: false, missed: 0, error: null, held: 0 });
+  const [attempt, setAttempt] = useState(0);
+  const held = useRef([]);
+  const stopped = useRef(paused);
+  const number = useRef(0);
+  stopped.current = paused;
+  const change = (changes) => setState((old) => ({ ...old, ...(typeof changes === "function" ? changes(old) : changes) }));
+  useEffect(() => {
+    if (paused) return;
+    const waiting = held.current.splice(0);
+    change((old) => ({ items: [...waiting, ...old.items].slice(0, MOST), held: 0 }));
+  }, [paused]);
+  useEffect(() => {
+    const controller = new AbortController();
+    const onEvent = (name, event) => {
+      if (name === "missed") return change((old) => ({ missed: old.missed + (event.count || 1) }));
+      if (name !== "query") return undefined;
+      const one = { ...event, number: (number.current += 1) };
+      if (stopped.current) {
+        held.current = [one, ...held.current].slice(0, MOST);
+        return change({ held: held.current.length });
+      }
+      return change((old) => ({ items: [one, ...old.items].slice(0, MOST) }));
+    };
+    const query = { kinds: "query", pictures: pictures ? "true" : "" };
+    if (wanted.length < VERDICTS.length) query.verdicts = wanted.join(",");
+    change({ error: null, open: false });
+    if (wanted.length > 0) {
+      follow(mapPath(map, "events"), { query, onEvent, onState: (open) => change({ open }), signal: controller.signal }).catch((error) => change({ error, open: false }));
+    }
+    return () => controller.abort();
+  }, [map, wanted.join(), pictures, attempt, epoch.value]);
+  const clear = () => {
+    held.current = [];
+    change({ items: [], missed: 0, held: 0 });
+  };
+  return { ...state, clear, again: () => setAttempt((one) => one + 1) };
+}
+
+function Line({ map, event, open }) {
+  const { verdict, probability, place, best, key, camera, session, picture } = event;
+  const shown = place || best;
+  return html`
+    <li>
+      <${Moment} at=${event.at} />
+      <${Verdict} verdict=${verdict} />
+      <span class="probability"><${Bar} share=${probability ?? 0} tone=${verdict} label=${`Probability ${percent(probability)}`} /> <span class="small">${percent(probability)}</span></span>
+      <span class="what">
+        ${picture && html`<span class="picture"><img src=${picture} alt="The frame" /></span>`}
+        ${shown && html`<${Thumbnail} map=${map} place=${shown} /><span>${place ? html`<a href=${href("maps", map, "places", place)}>${place}</a>` : html`<span class="faint">best ${best}</span>`}</span>`}
+      </span>
+      <span class="small faint">${[key, camera, session].filter(Boolean).join(" · ") || "–"}</span>
+      <span class="number"><button type="button" class="small" aria-label=${`Why ${verdict}`} onClick=${() => open(event)}>Why</button></span>
+    </li>
+  `;
+}
+
+function Details({ map, event, close }) {
+  const { verdict, probability, place, best, pose, score, decision, threshold, reason, picture, explanation } = event;
+  const again = () => {
+    handedOver.value = blobOf(picture);
+    go("maps", map, "try");
+  };
+  return html`
+    <${Dialog} title="An answer" close=${close} wide>
+      <div class="spread"><p class="large"><${Verdict} verdict=${verdict} /> ${place || ""}</p><p class="large">${percent(probability, 1)}</p></div>
+      <div class="pair">
+        ${picture ? html`<img src=${picture} alt="The frame" />` : html`<span class="picture"><span class="faint">the frame was not sent here</span></span>`}
+        ${best ? html`<${Thumbnail} map=${map} place=${best} />` : html`<span class="picture"><span class="faint">no match</span></span>`}
+      </div>
+      <div class="columns">
+        <${Facts} rows=${[
+          ["Best match", best ? html`<a href=${href("maps", map, "places", best)}>${best}</a>` : "–"],
+          ["Score", decimal(score)],
+          ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],
+          reason && ["Reason", reason],
+          ["Pose", pose ? `${poseText(pose)} ± ${metres(pose.spread)}` : "–"],
+          ["Asked by", event.key || "–"],
+          event.camera && ["Camera", event.camera],
+          event.session && ["Session", `${event.session}${event.frame !== null && event.frame !== undefined ? `, frame ${event.frame}` : ""}`],
+          ["Operation", (event.operation || "").replaceAll("_", " ")],
+          ["Request", html`<code>${event.request_id}</code>`],
+        ]} />
+        <${Timings} milliseconds=${event.milliseconds} />
+      </div>
+      ${explanation && html`<${Picture} path=${explanation.replace(/^.*?\/v1/, "")} alt="The frame beside its best match, with what connects them" />`}
+      ${picture && html`<footer class="row"><button type="button" onClick=${again}>Ask again with this thumbnail, and explain</button></footer>`}
+    <//>
+  `;
+}

@@ -1,0 +1,281 @@
+// The plan of a map: where its places lie, coloured by traverse, and where robots are now.  Without poses the traverses
+// lie below one another as strips.
+import { epoch, follow, get, may } from "../shared/api.js";
+import { complain, Facts, Head, Loading, Nothing } from "../shared/elements.js";
+import { colour, isDark, onTheme, traverseColour } from "../shared/colours.js";
+import { counted, exact, integer, metres, poseText } from "../shared/formats.js";
+import { mapPath } from "../shared/map_path.js";
+import { Thumbnail } from "../shared/pictures.js";
+import { PlanCanvas } from "../shared/plan_canvas.js";
+import { readPlan, stripsOf } from "../shared/plan_data.js";
+import { Robots } from "../shared/robots.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { href, restate } from "../shared/router.js";
+import { html, useEffect, useMemo, useRef, useState } from "../shared/view.js";
+
+export default function Plan({ map, query }) {
+  const plan = useResource((signal) => readPlan(map, signal), [map], { every: 60_000 });
+  return html`
+    <${Head} title=${map} note=${plan.data && planNote(plan.data)} />
+    <${Shown} resource=${plan}>
+      ${(data) => data.count === 0
+        ? html`<${Nothing} title="The map is empty">Enrol a traverse, and it is drawn here.<//>`
+        : html`<${Drawing} map=${map} plan=${data} query=${query} />`}
+    <//>
+  `;
+}
+
+function planNote({ places, posed, count, gaps }) {
+  const parts = [counted(places, "place")];
+  if (count < places) parts.push(`${integer(count)} of them drawn`);
+  if (posed === 0) parts.push("no poses: each traverse is a strip");
+  else if (posed < count) parts.push(`${integer(count - posed)} without a pose`);
+  if (gaps.length) parts.push(counted(gaps.length, "gap"));
+  return parts.join(" · ");
+}
+
+function Drawing({ map, plan, query }) {
+  const [strips, setStrips] = useState(plan.posed === 0);
+  const [off, setOff] = useState(new Set());
+  const [showGaps, setShowGaps] = useState(true);
+  const [misleading, setMisleading] = useState(null);
+  const [live, setLive] = useState(plan.posed > 0);
+  const [theme, setTheme] = useState(isDark());
+  const [hovered, setHovered] = useState(null);
+  const [view, setView] = useState(null);
+  const drawing = useRef(null);
+  const [places, above] = [useRef(null), useRef(null)];
+  const chosen = query.place !== undefined ? plan.index.get(query.place) ?? null : null;
+  const choose = (number) => restate({ place: number === null ? "" : plan.ids[number] });
+  const latest = useRef({});
+  latest.current = { choose, chosen, plan };
+
+  useEffect(() => onTheme(() => setTheme(isDark())), []);
+  useEffect(() => {
+    drawing.current = new PlanCanvas(places.current, above.current, {
+      onChoose: (number) => latest.current.choose(number),
+      onHover: setHovered,
+      onView: setView,
+      onStep: (step) => stepOn(latest.current, step, drawing.current),
+    });
+    return () => drawing.current.close();
+  }, []);
+  const groups = plan.traverses;
+  const content = useMemo(() => contentOf(plan, strips, off, showGaps), [plan, strips, off, showGaps, theme]);
+  const shape = `${strips} ${map}`;
+  const fitted = useRef(null);
+  useEffect(() => {
+    const tints = Object.fromEntries(["text", "surface", "accent", "danger", "ambiguous", "recognized", "unknown"].map((name) => [name, colour(name)]));
+    drawing.current.mark({ tints });
+    drawing.current.show(content, fitted.current !== shape);
+    if (fitted.current !== shape && chosen !== null) drawing.current.centre(chosen);
+    fitted.current = shape;
+  }, [content]);
+  useEffect(() => drawing.current.mark({ chosen, hovered, misleading: misleading || [] }), [chosen, hovered, misleading]);
+  const robots = useRobots(map, plan, live && !strips, drawing);
+
+  const told = hovered ?? null;
+  return html`
+    <div class="plan">
+      <div class="stack">
+        <div class="plan-canvas">
+          <canvas ref=${places} aria-hidden="true"></canvas>
+          <canvas ref=${above} tabindex="0" role="img" aria-label=${`Plan of ${map}: ${integer(plan.count)} places. Arrow keys move, plus and minus zoom, 0 shows all, n and p go along the traverse.`}></canvas>
+          <div class="plan-tools">
+            <button type="button" aria-label="Zoom in" onClick=${() => drawing.current.zoom(1.4)}>+</button>
+            <button type="button" aria-label="Zoom out" onClick=${() => drawing.current.zoom(1 / 1.4)}>−</button>
+            <button type="button" aria-label="Show all" title="Show all" onClick=${() => drawing.current.fit()}>⤢</button>
+          </div>
+          <div class="plan-read">
+            ${view && html`<${ScaleBar} scale=${view.scale} strips=${strips} />`}
+            ${told !== null && html`<span>${plan.ids[told]}</span>`}
+          </div>
+        </div>
+        <div class="filters">
+          ${plan.posed > 0 && html`
+            <div class="segments" role="group" aria-label="Drawing">
+              <button type="button" aria-pressed=${!strips} onClick=${() => setStrips(false)}>Plan</button>
+              <button type="button" aria-pressed=${strips} onClick=${() => setStrips(true)}>Strips</button>
+            </div>
+          `}
+          <${Find} plan=${plan} choose=${(number) => { choose(number); drawing.current.centre(number); }} />
+        </div>
+      </div>
+      <div class="stack">
+        ${chosen !== null && html`<${Chosen} map=${map} plan=${plan} number=${chosen} close=${() => choose(null)} />`}
+        <section class="panel">
+          <h2>Traverses</h2>
+          <${Legend} groups=${groups} off=${off} setOff=${setOff} />
+        </section>
+        <section class="panel">
+          <h2>Also shown</h2>
+          ${plan.gaps.length > 0 && html`<label class="row"><input type="checkbox" checked=${showGaps} onChange=${() => setShowGaps(!showGaps)} /> Gaps (${integer(plan.gaps.length)})</label>`}
+          ${plan.posed > 0 && html`<label class="row"><input type="checkbox" checked=${live} onChange=${() => setLive(!live)} /> Robots and answers, live</label>`}
+          ${may("enrol") && html`<${Misleading} map=${map} plan=${plan} found=${misleading} setFound=${setMisleading} />`}
+          <${RobotList} robots=${robots} />
+        </section>
+      </div>
+    </div>
+  `;
+}
+
+/** What the canvas draws: positions, colours by traverse, and which traverses are seen. */
+function contentOf(plan, strips, off, showGaps) {
+  const { x, y } = strips ? stripsOf(plan) : { x: plan.px, y: plan.py };
+  const last = plan.sequences.length;
+  const group = Int32Array.from(plan.sequence, (one) => (one < 0 ? last : one));
+  const names = [...plan.sequences, null];
+  const colours = names.map((_, one) => traverseColour(one < last ? one : -1));
+  const lines = names.map((name) => (name === null ? [] : plan.traverses.find((one) => one.name === name)?.places || []));
+  const gaps = showGaps && !strips ? plan.gaps : [];
+  const visible = names.map((name) => !off.has(name));
+  return { x, y, group, colours, numbers: colours.map(pixelOf), visible, lines, gaps, angle: strips ? null : plan.angle };
+}
+
+/** A colour as a pixel of a little-endian Uint32Array. */
+function pixelOf(text) {
+  const context = new OffscreenCanvas(1, 1).getContext("2d");
+  context.fillStyle = text;
+  context.fillRect(0, 0, 1, 1);
+  return new Uint32Array(context.getImageData(0, 0, 1, 1).data.buffer)[0];
+}
+
+function stepOn({ chosen, plan, choose }, step, drawing) {
+  const { places } = chosen === null ? plan.traverses[0] : plan.traverses.find((one) => one.places.includes(chosen));
+  const next = chosen === null ? places[0] : places[places.indexOf(chosen) + step];
+  if (next === undefined) return;
+  choose(next);
+  drawing.centre(next);
+}
+
+function ScaleBar({ scale, strips }) {
+  const wanted = 120 / scale;
+  const power = 10 ** Math.floor(Math.log10(wanted));
+  const length = [5, 2, 1].map((one) => one * power).find((one) => one <= wanted);
+  const text = strips ? `${integer(Math.max(1, length))} frames` : metres(length).replace(/\.0+ /, " ");
+  return html`<span><span>${text}</span><div class="scale-bar" style=${{ width: `${length * scale}px` }}></div></span>`;
+}
+
+function Find({ plan, choose }) {
+  const [text, setText] = useState("");
+  const [missing, setMissing] = useState(false);
+  const find = (event) => {
+    event.preventDefault();
+    const wanted = text.trim();
+    const number = plan.index.get(wanted) ?? plan.ids.findIndex((id) => id.startsWith(wanted));
+    setMissing(number === -1);
+    if (wanted && number !== -1) choose(number);
+  };
+  return html`
+    <form class="row" role="search" onSubmit=${find}>
+      <input aria-label="Find a place" placeholder="Find a place" value=${text} onInput=${(event) => setText(event.target.value)} spellcheck=${false} />
+      <button type="submit">Find</button>
+      <span role="status" class="faint">${missing && "no such place"}</span>
+    </form>
+  `;
+}
+
+function Legend({ groups, off, setOff }) {
+  const toggle = (name) => {
+    const made = new Set(off);
+    if (!made.delete(name)) made.add(name);
+    setOff(made);
+  };
+  return html`
+    <div class="legend">
+      ${groups.map((one, number) => html`
+        <label>
+          <input type="checkbox" checked=${!off.has(one.name)} onChange=${() => toggle(one.name)} />
+          <span class="swatch" style=${{ background: traverseColour(one.name === null ? -1 : number) }}></span>
+          <span class="name" title=${one.name || ""}>${one.name ?? html`<em>no traverse</em>`}</span>
+          <span class="faint">${integer(one.places.length)}</span>
+        </label>
+      `)}
+    </div>
+    ${groups.length > 4 && html`
+      <div class="row">
+        <button type="button" class="small" onClick=${() => setOff(new Set())}>All</button>
+        <button type="button" class="small" onClick=${() => setOff(new Set(groups.map((one) => one.name)))}>None</button>
+      </div>
+    `}
+  `;
+}
+
+function Chosen({ map, plan, number, close }) {
+  const id = plan.ids[number];
+  const pose = Object.fromEntries(["x", "y", "z", "latitude", "longitude", "heading"].filter((name) => plan[name] && plan[name][number] !== null).map((name) => [name, plan[name][number]]));
+  const taken = plan.timestamp?.[number];
+  return html`
+    <section class="panel" aria-label="Chosen place">
+      <div class="spread"><h2><a href=${href("maps", map, "places", id)}>${id}</a></h2><button type="button" class="quiet" aria-label="Choose none" onClick=${close}>✕</button></div>
+      <${Thumbnail} map=${map} place=${id} />
+      <${Facts} rows=${[
+        ["Traverse", plan.sequence[number] < 0 ? "–" : plan.sequences[plan.sequence[number]]],
+        ["Pose", poseText(Object.keys(pose).length > 1 ? pose : null)],
+        taken && ["Taken", exact(taken)],
+        (plan.flags[number] & 1) > 0 && ["Note", "The pose comes from an alignment."],
+      ]} />
+    </section>
+  `;
+}
+
+/** Places that the health report finds misleading; it is a long search, so it is asked for. */
+function Misleading({ map, plan, found, setFound }) {
+  const [busy, setBusy] = useState(false);
+  const look = async () => {
+    setBusy(true);
+    try {
+      const { aliasing } = await get(mapPath(map, "health"));
+      const ids = [...aliasing.hubs, ...aliasing.aliases, ...aliasing.unsure].map((one) => one.place);
+      setFound([...new Set(ids)].map((id) => plan.index.get(id)).filter((number) => number !== undefined));
+    } catch (error) {
+      complain(error);
+    }
+    setBusy(false);
+  };
+  if (busy) return html`<${Loading} what="Comparing all places" />`;
+  if (found === null) return html`<button type="button" onClick=${look}>Find places that mislead</button>`;
+  return html`
+    <div class="spread">
+      <span>${found.length === 0 ? "No place misleads" : `${integer(found.length)} places mislead (ringed)`}</span>
+      <button type="button" class="small" onClick=${() => setFound(null)}>Hide</button>
+    </div>
+  `;
+}
+
+/** Robots as the map's events tell of them, drawn as they move. */
+function useRobots(map, plan, live, drawing) {
+  const [robots, setRobots] = useState([]);
+  useEffect(() => {
+    if (!live) {
+      drawing.current.mark({ robots: [], dots: [] });
+      setRobots([]);
+      return undefined;
+    }
+    const controller = new AbortController();
+    const fleet = new Robots(plan.projection);
+    const draw = () => {
+      const told = fleet.now();
+      drawing.current?.mark(told);
+      setRobots(told.robots);
+    };
+    fleet.begin(map, controller.signal).then(draw, () => {});
+    const onEvent = (name, event) => fleet.take(name, event) && draw();
+    follow(mapPath(map, "events"), { query: { kinds: "query,session" }, onEvent, signal: controller.signal }).catch(() => {});
+    const timer = setInterval(draw, 2000);
+    return () => {
+      controller.abort();
+      clearInterval(timer);
+    };
+  }, [map, plan, live, epoch.value]);
+  return robots;
+}
+
+function RobotList({ robots }) {
+  if (robots.length === 0) return null;
+  return html`
+    <ul aria-label="Robots">
+      ${robots.map((robot) => html`<li class="spread"><span>${robot.label}</span><span class=${`verdict ${robot.verdict}`}>${robot.verdict}</span></li>`)}
+    </ul>
+  `;
+}

@@ -1,0 +1,245 @@
+// Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
+import { get, getTagged, may, patch, post, save } from "../shared/api.js";
+import { complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Verdict } from "../shared/elements.js";
+import { bytes, counted, decimal, percent } from "../shared/formats.js";
+import { mapPath } from "../shared/map_path.js";
+import { Picture, Thumbnail } from "../shared/pictures.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { href } from "../shared/router.js";
+import { html, useEffect, useRef, useState } from "../shared/view.js";
+
+const PAGE = 30;
+const REGRET = 8000;
+
+export default function Review({ map }) {
+  const about = useResource((signal) => getTagged(mapPath(map), {}, signal), [map]);
+  const [labelled, setLabelled] = useState(false);
+  const [dialog, setDialog] = useState(null);
+  const close = () => setDialog(null);
+  const settings = about.data?.data.review;
+  const keep = () => setDialog(html`<${Keeping} map=${map} read=${about.data} close=${close} changed=${about.reload} />`);
+  const write = async () => {
+    const told = await get(mapPath(map, "review", "labels")).catch(complain);
+    if (told) save(new Blob([JSON.stringify(told, null, 2)], { type: "application/json" }), `${map}-labels.json`);
+  };
+  return html`
+    <${Head} title="Review" note=${`Frames that ${map} was not sure of.`}>
+      <button type="button" onClick=${write}>Export the labels</button>
+      ${may("admin") && about.data && html`<button type="button" onClick=${keep}>What is kept</button>`}
+    <//>
+    <${Shown} resource=${about}>
+      ${() => html`
+        ${settings === null && html`<p class="notice">This map keeps no frames for review now. ${may("admin") ? "Say under What is kept which answers it should keep." : "Somebody with an admin key can turn that on."}</p>`}
+        <div class="segments" role="group" aria-label="Which frames">
+          <button type="button" aria-pressed=${!labelled} onClick=${() => setLabelled(false)}>To be looked at</button>
+          <button type="button" aria-pressed=${labelled} onClick=${() => setLabelled(true)}>Labelled</button>
+        </div>
+        <${Frames} key=${labelled} map=${map} labelled=${labelled} keeps=${settings !== null} />
+      `}
+    <//>
+    ${dialog}
+  `;
+}
+
+function Frames({ map, labelled, keeps }) {
+  const [cursors, setCursors] = useState([""]);
+  const cursor = cursors.at(-1);
+  const page = useResource((signal) => get(mapPath(map, "review"), { labelled, limit: PAGE, cursor }, { signal }), [map, labelled, cursor], { every: 15_000 });
+  const [done, setDone] = useState(new Map());
+  const [open, setOpen] = useState(null);
+  const discards = useDiscards(map, setDone);
+  const items = (page.data?.items || []).filter((one) => done.get(one.id) !== "gone");
+  const current = items.find((one) => one.id === open) || items[0];
+  const label = async (frame, body) => {
+    const told = await post(mapPath(map, "review", String(frame.id)), body);
+    const next = items[items.indexOf(frame) + 1];
+    if (!labelled) setDone((old) => new Map(old).set(frame.id, "gone"));
+    setOpen(next ? next.id : null);
+    say(labelText(told.frame.label));
+    page.reload();
+  };
+  const discard = (frame) => {
+    const next = items[items.indexOf(frame) + 1];
+    setOpen(next ? next.id : null);
+    discards.put(frame.id);
+  };
+  return html`
+    <${Shown} resource=${page}>
+      ${({ frames, bytes: size, next_cursor: next }) => html`
+        <p class="faint">${counted(frames, "frame")}, ${bytes(size)}.</p>
+        ${items.length === 0
+          ? html`<${Nothing} title=${labelled ? "No labels yet" : "Nothing to be looked at"}>${!labelled && keeps && "Frames appear here as they are answered with the verdicts that are kept."}<//>`
+          : html`
+            <div class="review">
+              <ul class="queue" aria-label="Frames">
+                ${items.map((one) => html`<${Tile} key=${one.id} map=${map} frame=${one} chosen=${one === current} choose=${setOpen} />`)}
+              </ul>
+              ${current && html`<${Labelling} key=${current.id} map=${map} frame=${current} label=${label} discard=${discard} />`}
+            </div>
+          `}
+        ${(cursors.length > 1 || next) && html`
+          <nav class="pager" aria-label="Pages">
+            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Newer</button>
+            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Older →</button>
+          </nav>
+        `}
+      `}
+    <//>
+  `;
+}
+
+/** Frames to throw away: they go after a while in which it can be undone, or when the view is left. */
+function useDiscards(map, setDone) {
+  const waiting = useRef(new Map());
+  const send = (id) => {
+    clearTimeout(waiting.current.get(id));
+    waiting.current.delete(id);
+    post(mapPath(map, "review", String(id)), { discard: true }).catch(complain);
+  };
+  useEffect(() => () => [...waiting.current.keys()].forEach(send), []);
+  const put = (id) => {
+    setDone((old) => new Map(old).set(id, "gone"));
+    waiting.current.set(id, setTimeout(() => send(id), REGRET));
+    say("The frame is thrown away.", () => {
+      if (!waiting.current.has(id)) return say("It was too late: the frame is gone.");
+      clearTimeout(waiting.current.get(id));
+      waiting.current.delete(id);
+      setDone((old) => new Map([...old].filter(([one]) => one !== id)));
+      return undefined;
+    });
+  };
+  return { put };
+}
+
+function labelText(label) {
+  if (label?.stranger) return "Labelled: no place of this map.";
+  const id = label?.place || label?.new?.id || label?.new || "";
+  return label?.new ? `Enrolled as ${id}.` : `Labelled as ${id}.`;
+}
+
+function Kept({ map, frame, alt = "The frame" }) {
+  return html`<${Picture} path=${mapPath(map, "review", String(frame.id), "picture")} version=${frame.sha256} alt=${alt} />`;
+}
+
+function Tile({ map, frame, chosen, choose }) {
+  return html`
+    <li class=${chosen ? "thumb chosen" : "thumb"}>
+      <button type="button" class="cover" aria-pressed=${chosen} aria-label=${`Frame ${frame.id}`} onClick=${() => choose(frame.id)}>
+        <${Kept} map=${map} frame=${frame} alt="" />
+      </button>
+      <span class="under small"><${Verdict} verdict=${frame.answer.verdict} /><${Moment} at=${frame.at} /></span>
+    </li>
+  `;
+}
+
+function Labelling({ map, frame, label, discard }) {
+  const { answer } = frame;
+  const candidates = answer.matches.map((one) => one.place);
+  const [against, setAgainst] = useState(candidates[0] || null);
+  const [busy, setBusy] = useState(false);
+  const [dialog, setDialog] = useState(null);
+  const send = async (body) => {
+    setBusy(true);
+    await label(frame, body).catch(complain);
+    setBusy(false);
+  };
+  return html`
+    <section class="panel" aria-label="Frame to be labelled">
+      <div class="spread">
+        <p class="large"><${Verdict} verdict=${answer.verdict} /> <span class="faint small">${answer.probability !== null && percent(answer.probability, 1)}</span></p>
+        ${frame.label && html`<${Pill} tone="on">${labelText(frame.label)}<//>`}
+      </div>
+      <div class="pair">
+        <${Kept} map=${map} frame=${frame} />
+        ${against ? html`<${Thumbnail} map=${map} place=${against} />` : html`<span class="picture"><span class="faint">no match</span></span>`}
+      </div>
+      <h2>Which place is it?</h2>
+      <ol class="matches">
+        ${answer.matches.map((one) => html`
+          <li class=${one.place === against ? "thumb chosen" : "thumb"} key=${one.place}>
+            <button type="button" class="cover" aria-pressed=${one.place === against} aria-label=${`Compare with ${one.place}`} onClick=${() => setAgainst(one.place)}><${Thumbnail} map=${map} place=${one.place} /></button>
+            <span class="under small"><a class="name" href=${href("maps", map, "places", one.place)}>${one.place}</a><span>${decimal(one.score)}</span></span>
+            <button type="button" class="small" disabled=${busy} onClick=${() => send({ place: one.place })}>It is ${one.place}</button>
+          </li>
+        `)}
+      </ol>
+      <div class="row">
+        <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Other} close=${() => setDialog(null)} send=${(place) => label(frame, { place })} />`)}>Another place …</button>
+        <button type="button" disabled=${busy} onClick=${() => setDialog(html`<${Enrol} frame=${frame} close=${() => setDialog(null)} send=${(fields) => label(frame, { new: fields })} />`)}>Enrol it …</button>
+        <button type="button" disabled=${busy} onClick=${() => send({ stranger: true })}>No place of this map</button>
+        <button type="button" class="danger" disabled=${busy} onClick=${() => discard(frame)}>Throw away</button>
+      </div>
+      <${Facts} rows=${[
+        ["Asked", html`<${Moment} at=${frame.at} />`],
+        answer.key && ["By", answer.key],
+        ["Decision value", html`${decimal(answer.decision)} <span class="faint">threshold ${decimal(answer.threshold)}</span>`],
+        answer.reason && ["Reason", answer.reason],
+        answer.camera && ["Camera", answer.camera],
+        answer.session && ["Session", answer.session],
+        frame.labelled_at && ["Labelled", html`<${Moment} at=${frame.labelled_at} /> ${frame.labelled_by && `by ${frame.labelled_by}`}`],
+        ["Request", html`<code>${answer.request_id}</code>`],
+      ]} />
+      ${dialog}
+    </section>
+  `;
+}
+
+function Other({ close, send }) {
+  const [id, setId] = useState("");
+  return html`
+    <${FormDialog} title="Another place" action="Label" ready=${id !== ""} close=${close} send=${() => send(id.trim())}>
+      <${Field} label="Id of the place"><input required value=${id} onInput=${(event) => setId(event.target.value)} autofocus autocomplete="off" spellcheck=${false} /><//>
+    <//>
+  `;
+}
+
+const POSE = ["x", "y", "heading", "latitude", "longitude"];
+
+function Enrol({ frame, close, send }) {
+  const [fields, setFields] = useState({ id: `review-${frame.id}`, sequence: "", ...Object.fromEntries(POSE.map((name) => [name, ""])) });
+  const change = (name) => (event) => setFields({ ...fields, [name]: event.target.value });
+  const enrol = () => {
+    const { id, sequence } = fields;
+    const pose = POSE.filter((name) => fields[name] !== "").map((name) => [name, Number(fields[name])]);
+    return send({ id: id.trim(), ...(sequence && { sequence }), ...Object.fromEntries(pose) });
+  };
+  return html`
+    <${FormDialog} title="Enrol the frame" action="Enrol" ready=${fields.id !== ""} close=${close} send=${enrol}>
+      <div class="fields">
+        <${Field} label="Id"><input required value=${fields.id} onInput=${change("id")} autocomplete="off" spellcheck=${false} autofocus /><//>
+        <${Field} label="Traverse"><input maxlength="128" value=${fields.sequence} onInput=${change("sequence")} /><//>
+      </div>
+      <div class="fields narrow">${POSE.map((name) => html`<${Field} label=${name}><input type="number" step="any" value=${fields[name]} onInput=${change(name)} /><//>`)}</div>
+    <//>
+  `;
+}
+
+const VERDICTS = ["ambiguous", "unknown", "recognized"];
+const MIB = 2 ** 20;
+
+function Keeping({ map, read, close, changed }) {
+  const present = read.data.review;
+  const [verdicts, setVerdicts] = useState(present?.verdicts || []);
+  const [frames, setFrames] = useState(present?.most_frames ?? 500);
+  const [size, setSize] = useState(present ? Math.round(present.most_bytes / MIB) : 256);
+  const toggle = (name) => setVerdicts((old) => (old.includes(name) ? old.filter((one) => one !== name) : [...old, name]));
+  const keep = async () => {
+    const review = verdicts.length ? { verdicts, most_frames: frames, most_bytes: size * MIB } : null;
+    await patch(mapPath(map), { review }, read.tag);
+    say(review ? "Such frames are kept from now on." : "No further frames are kept.");
+    changed();
+  };
+  return html`
+    <${FormDialog} title="What is kept for review" action="Save" close=${close} send=${keep}>
+      <p class="faint">Frames as they were sent, with their answers. The oldest go first. Tell those who are in the pictures.</p>
+      <fieldset class="stack">
+        <legend class="label">Frames that were answered</legend>
+        ${VERDICTS.map((one) => html`<label class="row"><input type="checkbox" checked=${verdicts.includes(one)} onChange=${() => toggle(one)} /> ${one}</label>`)}
+      </fieldset>
+      <div class="fields">
+        <${Field} label="At most, frames"><input type="number" min="1" step="1" value=${frames} onInput=${(event) => setFrames(event.target.valueAsNumber)} /><//>
+        <${Field} label="At most, MiB"><input type="number" min="1" step="1" value=${size} onInput=${(event) => setSize(event.target.valueAsNumber)} /><//>
+      </div>
+    <//>
+  `;
+}

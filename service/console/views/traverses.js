@@ -1,0 +1,191 @@
+// The traverses of a map, and two of them compared: how alike all their frames look, the path that alignment finds, and
+// the truth where poses give it.
+import { get, may, post, remove, send } from "../shared/api.js";
+import { ByName, Facts, Field, Head, Loading, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
+import { decimal, integer, milliseconds } from "../shared/formats.js";
+import { JobProgress } from "../shared/jobs.js";
+import { mapPath } from "../shared/map_path.js";
+import { Matrix } from "../shared/matrix.js";
+import { Thumbnail } from "../shared/pictures.js";
+import { Shown, useResource } from "../shared/resource.js";
+import { href, restate } from "../shared/router.js";
+import { html, useState } from "../shared/view.js";
+
+export default function Traverses({ map, query }) {
+  const traverses = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
+  return html`
+    <${Head} title="Traverses" note=${`What ${map} was made of, and how two of them fit.`} />
+    <${Shown} resource=${traverses}>
+      ${({ items }) => items.length === 0
+        ? html`<${Nothing} title="No traverses">Places with a traverse appear here once they are enrolled.<//>`
+        : html`
+          <${Table} map=${map} items=${items} changed=${traverses.reload} />
+          ${items.length > 1 && html`<${Compare} map=${map} items=${items} query=${query} />`}
+        `}
+    <//>
+  `;
+}
+
+function Table({ map, items, changed }) {
+  const [dialog, setDialog] = useState(null);
+  const close = () => setDialog(null);
+  const destroy = (name) => async () => {
+    await remove(mapPath(map, "sequences", name));
+    say(`The traverse ${name} was deleted.`);
+    changed();
+  };
+  const ask = (one) => setDialog(html`
+    <${ByName} title=${`Delete ${one.name}`} name=${one.name} action="Delete the traverse" close=${close} send=${destroy(one.name)}>
+      <p>Its ${integer(one.places)} places go at once. This cannot be undone.</p>
+    <//>
+  `);
+  return html`
+    <div class="table limited" tabindex="0" role="region" aria-label="Traverses">
+      <table>
+        <thead><tr><th>Traverse</th><th class="number">Places</th><th>First frame</th><th>Last frame</th><th><span class="hidden">Actions</span></th></tr></thead>
+        <tbody>
+          ${items.map((one) => html`
+            <tr key=${one.name}>
+              <td class="long"><a href=${href("maps", map, "places", { sequence: one.name })}>${one.name}</a></td>
+              <td class="number">${integer(one.places)}</td>
+              <td><${Moment} at=${one.first_at} /></td>
+              <td><${Moment} at=${one.last_at} /></td>
+              <td class="actions-cell">${may("enrol") && html`<button type="button" class="small danger" aria-label=${`Delete ${one.name}`} onClick=${() => ask(one)}>Delete</button>`}</td>
+            </tr>
+          `)}
+        </tbody>
+      </table>
+    </div>
+    ${dialog}
+  `;
+}
+
+function Compare({ map, items, query }) {
+  const names = items.map((one) => one.name);
+  const asked = names.includes(query.query) ? query.query : names[1];
+  const reference = names.includes(query.reference) ? query.reference : names.find((name) => name !== asked);
+  const [job, setJob] = useState(null);
+  const compared = useResource((signal) => compare(map, asked, reference, signal), [map, asked, reference]);
+  const choice = (name, value) => html`
+    <select value=${value} onChange=${(event) => restate({ query: asked, reference, [name]: event.target.value })}>
+      ${names.map((one) => html`<option value=${one}>${one}</option>`)}
+    </select>
+  `;
+  const align = (dry) => post(mapPath(map, "align"), { sequence: asked, with: [reference], dry_run: dry }).then(setJob, (error) => setJob({ error }));
+  return html`
+    <section class="stack" aria-label="Comparison">
+      <div class="filters">
+        <${Field} label="Frames of">${choice("query", asked)}<//>
+        <${Field} label="against">${choice("reference", reference)}<//>
+        ${compared.data && html`<${Pill} tone=${compared.data.aligned ? "good" : ""}>${compared.data.aligned ? "aligned" : "not aligned"}<//>`}
+        ${may("enrol") && html`
+          <button type="button" onClick=${() => align(true)}>What would alignment find?</button>
+          <button type="button" onClick=${() => align(false)}>Align</button>
+        `}
+      </div>
+      ${job?.error && html`<${Trouble} error=${job.error} />`}
+      ${job?.id && html`<section class="panel"><${Alignment} key=${job.id} job=${job} changed=${compared.reload} /></section>`}
+      ${compared.loading && html`<${Loading} what="Comparing all frames" />`}
+      ${compared.error && html`<${Trouble} error=${compared.error} again=${compared.reload} />`}
+      ${compared.data && html`<${Comparison} key=${`${asked}/${reference}`} map=${map} data=${compared.data} />`}
+    </section>
+  `;
+}
+
+/** The comparison, with its scores as bytes. */
+async function compare(map, query, reference, signal) {
+  const path = mapPath(map, "similarity");
+  const told = await get(path, { query, reference }, { signal });
+  const headers = { Accept: "application/octet-stream" };
+  const answer = await send("GET", path, { query: { query, reference }, headers, signal });
+  return { ...told, bytes: new Uint8Array(await answer.arrayBuffer()) };
+}
+
+function Alignment({ job, changed }) {
+  const [result, setResult] = useState(null);
+  const ended = (told) => {
+    setResult(told.result);
+    if (told.state === "succeeded" && told.result?.stored) changed();
+  };
+  return html`
+    <${JobProgress} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Alignment, a dry run" : "Alignment"} />
+    ${result && html`<${Facts} rows=${[
+      ["Frames with a counterpart", `${integer(result.paired)} of ${integer(result.frames)}`],
+      ["Poses handed over", integer(result.poses_handed_over)],
+      ["Stored", result.stored ? "yes" : "no, a dry run"],
+    ]} />`}
+  `;
+}
+
+const LAYERS = { path: "path found", truth: "truth by poses", counterparts: "as aligned" };
+
+function Comparison({ map, data }) {
+  const there = Object.keys(LAYERS).filter((name) => (name === "path" ? data.stretches.length > 0 : data[name] !== null));
+  const [layers, setLayers] = useState(["path", "truth"]);
+  const [pair, setPair] = useState(null);
+  const toggle = (name) => setLayers((old) => (old.includes(name) ? old.filter((one) => one !== name) : [...old, name]));
+  const [row, column] = pair || bestPair(data);
+  return html`
+    <div class="plan">
+      <div class="stack">
+        <${Matrix} data=${data} layers=${layers} chosen=${[row, column]} choose=${setPair} />
+        <div class="row">
+          ${there.map((name) => html`<label class=${`row layer ${name}`}><input type="checkbox" checked=${layers.includes(name)} onChange=${() => toggle(name)} /><span class="swatch"></span> ${LAYERS[name]}</label>`)}
+        </div>
+      </div>
+      <div class="stack">
+        <section class="panel" aria-label="Pair">
+          <${Frame} map=${map} id=${data.query.places[row]} note=${`frame ${integer(row + 1)} of ${data.query.sequence}`} />
+          <${Frame} map=${map} id=${data.reference.places[column]} note=${`frame ${integer(column + 1)} of ${data.reference.sequence}`} />
+          <${Facts} rows=${[
+            ["Score", decimal(scoreAt(data, row, column))],
+            data.truth && ["Truth", data.truth[row] === null ? "no place near" : `frame ${integer(data.truth[row] + 1)}`],
+            data.counterparts && ["Counterpart", data.counterparts[row] === null ? "none" : `frame ${integer(data.counterparts[row] + 1)}`],
+          ]} />
+        </section>
+        <section class="panel">
+          <${Facts} rows=${[
+            ["Size", `${integer(data.rows)} × ${integer(data.columns)}`],
+            ["Scores", `${decimal(data.scale.low)} to ${decimal(data.scale.high)}`],
+            ["Stretches found", integer(data.stretches.length)],
+            data.truth && ["On the truth", truthText(data)],
+            ["Took", milliseconds(data.milliseconds.total)],
+          ]} />
+        </section>
+      </div>
+    </div>
+  `;
+}
+
+function Frame({ map, id, note }) {
+  return html`
+    <div>
+      <${Thumbnail} map=${map} place=${id} />
+      <div class="spread small"><a href=${href("maps", map, "places", id)}>${id}</a><span class="faint">${note}</span></div>
+    </div>
+  `;
+}
+
+function scoreAt({ bytes, columns, scale }, row, column) {
+  return scale.low + (bytes[row * columns + column] / 255) * (scale.high - scale.low);
+}
+
+function bestPair({ stretches, rows, columns }) {
+  const [first] = stretches;
+  if (!first) return [Math.floor(rows / 2), Math.floor(columns / 2)];
+  const middle = Math.floor(first.query.length / 2);
+  return [first.query[middle], first.reference[middle]];
+}
+
+/** How many frames of the path lie where poses say. */
+function truthText({ stretches, truth }) {
+  let [right, all] = [0, 0];
+  for (const { query, reference } of stretches) {
+    query.forEach((row, one) => {
+      if (truth[row] === null) return;
+      all += 1;
+      right += Math.abs(truth[row] - reference[one]) <= 3;
+    });
+  }
+  return `${integer(right)} of ${integer(all)} within 3 frames`;
+}

@@ -1,0 +1,150 @@
+"""A browser, a service with keys and a drawn map, and pages that fail where a browser complains."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Response, expect, sync_playwright
+
+from service.access.keys import KeyStore
+from tests.service.console import world
+from tests.service.server import Server
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+SIZES = {"phone": (390, 844), "laptop": (1280, 800), "wall": (3840, 2160)}
+
+
+@dataclass
+class Operator:
+    """Somebody in front of the console.
+
+    Args:
+        page: their browser's page.
+        root: the address of the service.
+        complaints: what the browser said on its console, what it refused, and answers of 5xx.
+    """
+
+    page: Page
+    root: str
+    complaints: list[str] = field(default_factory=list)
+    foreseen: tuple[str, ...] = ()
+
+    def go(self, view: str) -> Page:
+        """Open a view, such as ``maps/lab/places``, and wait until it has read what it shows."""
+        self.page.goto(f"{self.root}/console#/{view}")
+        self.settle(view)
+        return self.page
+
+    def settle(self, view: str | None = None) -> None:
+        """Wait until the view is there and nothing is being read."""
+        path = "" if view is None else f"[data-view='{view.partition('?')[0]}']"
+        self.page.locator(f"main .view{path} h1").wait_for()
+        expect(self.page.locator("main .loading")).to_have_count(0, timeout=15_000)
+
+    def foresee(self, *texts: str) -> None:
+        """Complaints that contain one of these are part of the test."""
+        self.foreseen += texts
+
+    def unforeseen(self) -> list[str]:
+        return [one for one in self.complaints if not any(text in one for text in self.foreseen)]
+
+    def watch(self) -> None:
+        def said(message: ConsoleMessage) -> None:
+            if message.type in ("error", "warning"):
+                self.complaints.append(f"{message.type}: {message.text} {message.location}")
+
+        def answered(response: Response) -> None:
+            if response.status >= 500:
+                self.complaints.append(f"{response.status} {response.request.method} {response.url}")
+            if not response.url.startswith((self.root, "blob:", "data:")):
+                self.complaints.append(f"a request to elsewhere: {response.url}")
+
+        self.page.on("console", said)
+        self.page.on("pageerror", lambda error: self.complaints.append(f"exception: {error}"))
+        self.page.on("response", answered)
+
+
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    """Chromium without a window; the tests are skipped where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed (Debian: apt-get install chromium)")
+    with sync_playwright() as playwright:
+        options = ["--no-sandbox", "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream"]
+        running = playwright.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield running
+        running.close()
+
+
+@pytest.fixture(scope="package")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the service with keys."""
+    return tmp_path_factory.mktemp("console")
+
+
+@pytest.fixture(scope="package")
+def keys(folder: Path) -> dict[str, str]:
+    """A key of each role for all maps, and one of the role query for a map that is not there."""
+    store = KeyStore(folder / "data")
+    made = {role: store.create(f"{role}-key", role)[1] for role in ("admin", "enrol", "query")}
+    return made | {"stranger": store.create("stranger-key", "query", ["elsewhere"])[1]}
+
+
+@pytest.fixture(scope="package")
+def keyed(folder: Path, keys: dict[str, str]) -> Iterator[Server]:
+    """A service with keys, an audit trail in a file, and the drawn map; its client has an admin key."""
+    server = Server(folder, {"audit_file": folder / "audit.jsonl"}, key=keys["admin"]).wait()
+    world.fill(server)
+    world.ask(server)
+    yield server
+    assert server.stop() == 0
+
+
+def given_key(key: str) -> str:
+    """A script by which a new tab has a key, as if it had been typed; one that is forgotten stays so."""
+    return f"sessionStorage.getItem('placerec.key') ?? sessionStorage.setItem('placerec.key', '{key}')"
+
+
+Visit = Callable[..., Operator]
+Theme = Literal["light", "dark"]
+
+
+@pytest.fixture
+def visit(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Visit]:
+    """Makes operators: ``visit("admin")``; at the end no page may have complained."""
+    contexts: list[BrowserContext] = []
+    made: list[Operator] = []
+
+    def open_page(
+        role: str | None = "admin", *, server: Server = keyed, size: str = "laptop", theme: Theme = "light"
+    ) -> Operator:
+        width, height = SIZES[size]
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=theme, permissions=["clipboard-write", "camera"]
+        )
+        context.set_default_timeout(15_000)
+        contexts.append(context)
+        page = context.new_page()
+        if role is not None:
+            page.add_init_script(given_key(keys[role]))
+        operator = Operator(page, f"http://127.0.0.1:{server.port}")
+        operator.watch()
+        made.append(operator)
+        return operator
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert [one for operator in made for one in operator.unforeseen()] == []
+
+
+@pytest.fixture
+def admin(visit: Visit) -> Operator:
+    """Somebody with an admin key."""
+    return visit("admin")

@@ -1,0 +1,188 @@
+"""Keys, the audit trail, jobs and the service's state in the console; keys that are needed, wrong or gone."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+from service.access.keys import KeyStore
+from tests.service.console.conftest import Operator, Visit
+from tests.service.console.world import LAB, frame
+from tests.service.server import Server
+
+
+def test_a_key_is_created_shown_once_narrowed_and_revoked(admin: Operator, keyed: Server) -> None:
+    page = admin.go("keys")
+    page.get_by_role("button", name="Create a key").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Name").fill("fleet-7")
+    dialog.get_by_label("Role").select_option("enrol")
+    dialog.get_by_role("button", name="Create").click()
+    secret = page.get_by_label("The key", exact=True).inner_text()
+    assert re.fullmatch(r"placerec_[0-9a-f]{12}_[A-Za-z0-9_-]{43}", secret)
+    page.get_by_role("button", name="Done").click()
+    row = page.get_by_role("row").filter(has_text="fleet-7")
+    row.wait_for()
+    assert secret not in page.content()
+
+    def may_list(method: str, path: str) -> int:
+        return keyed.client.request(method, path, headers={"Authorization": f"Bearer {secret}"}).status_code
+
+    assert may_list("GET", "/v1/maps") == 200 and may_list("DELETE", "/v1/maps/none/places/p") == 404
+    row.get_by_role("button", name="Narrow fleet-7").click()
+    dialog.get_by_label("Role").select_option("query")
+    dialog.get_by_label("only these").check()
+    dialog.get_by_label(LAB, exact=True).check()
+    dialog.get_by_role("button", name="Narrow").click()
+    dialog.wait_for(state="detached")
+    assert may_list("GET", f"/v1/maps/{LAB}") == 200 and may_list("GET", "/v1/maps/none") == 403
+    row.get_by_role("button", name="Revoke fleet-7").click()
+    dialog.get_by_role("textbox").fill("fleet-7")
+    dialog.get_by_role("button", name="Revoke the key").click()
+    row.wait_for(state="detached")
+    assert may_list("GET", "/v1/maps") == 401
+    page.get_by_label("also ended ones").check()
+    row.get_by_text("revoked").wait_for()
+
+
+def test_nobody_locks_all_admins_out_by_accident(admin: Operator) -> None:
+    page = admin.go("keys")
+    page.get_by_role("button", name="Revoke admin-key").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_text("It is the key that you use now.").wait_for()
+    dialog.get_by_role("textbox").fill("admin-key")
+    admin.foresee("409")
+    dialog.get_by_role("button", name="Revoke the key").click()
+    dialog.get_by_role("alert").wait_for()
+    dialog.get_by_label("Do it although", exact=False).wait_for()
+    page.keyboard.press("Escape")
+    page.get_by_role("row").filter(has_text="admin-key").get_by_text("in force").wait_for()
+
+
+def test_the_first_key_is_used_at_once(visit: Visit, tmp_path_factory: pytest.TempPathFactory) -> None:
+    server = Server(tmp_path_factory.mktemp("open")).wait("/livez")
+    try:
+        operator = visit(None, server=server)
+        page = operator.go("keys")
+        page.get_by_role("button", name="Create a key").click()
+        page.get_by_role("dialog").get_by_label("Name").fill("ann")
+        page.get_by_role("dialog").get_by_role("button", name="Create").click()
+        page.get_by_role("button", name="Done").click()
+        page.locator(".identity").get_by_text("ann").wait_for()
+        page.get_by_role("row").filter(has_text="yours").wait_for()
+        assert server.client.get("/v1/maps").status_code == 401
+        page.evaluate("sessionStorage.clear()")
+        operator.foresee("401")
+        page.reload()
+        page.get_by_text("The service asks for a key.").wait_for()
+    finally:
+        assert server.stop() == 0
+
+
+def test_a_key_is_asked_for_and_a_wrong_one_refused(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
+    operator = visit(None)
+    operator.foresee("401")
+    page = operator.page
+    page.goto(f"{operator.root}/console#/maps")
+    page.get_by_label("Key").fill("placerec_000000000000_" + "x" * 43)
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("alert").get_by_text("The key is not valid").wait_for()
+    page.get_by_label("Key").fill(keys["query"])
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("link", name=LAB, exact=True).wait_for()
+    assert keys["query"] not in page.url
+    page.get_by_role("button", name="Change key").click()
+    page.get_by_role("button", name="Forget the key").click()
+    page.get_by_text("The service asks for a key.").wait_for()
+
+
+def test_a_key_that_is_revoked_meanwhile_is_asked_for_again(visit: Visit, keyed: Server) -> None:
+    key, text = KeyStore(keyed.data_dir).create("soon-gone", "query")
+    operator = visit(None)
+    operator.foresee("401")
+    page = operator.page
+    page.goto(f"{operator.root}/console#/maps")
+    page.get_by_label("Key").fill(text)
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("link", name=LAB, exact=True).wait_for()
+    KeyStore(keyed.data_dir).revoke(key.id)
+    time.sleep(1.5)  # the service looks at the file of keys once a second
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("alert").get_by_text("The key is not valid").wait_for()
+
+
+def test_a_key_for_other_maps_sees_none(visit: Visit) -> None:
+    operator = visit("stranger")
+    page = operator.go("maps")
+    page.get_by_text("There are no maps").wait_for()
+    operator.foresee("403")
+    page.goto(f"{operator.root}/console#/maps/{LAB}/places")
+    page.get_by_role("alert").first.get_by_text("limited to certain maps", exact=False).wait_for()
+
+
+def test_who_changed_what_is_listed_and_filtered(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("audited")
+    keyed.client.patch("/v1/maps/audited", json={"description": "by day"})
+    page = admin.go("audit")
+    page.get_by_label("Map").last.fill("audited")
+    page.get_by_label("Map").last.press("Enter")
+    rows = page.get_by_role("region", name="Audit trail").get_by_role("row")
+    rows.nth(2).wait_for()
+    told = rows.all_inner_texts()[1:]
+    assert "edit map" in told[0] and "create map" in told[1] and all("admin-key" in one for one in told)
+    rows.nth(1).get_by_role("button").click()
+    page.get_by_role("dialog").get_by_text("request id").wait_for()
+
+
+def test_jobs_are_listed_with_their_results_and_cancelled(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("working")
+    keyed.enrol("working", "p0", frame(0))
+    done = keyed.client.post("/v1/maps/working/verify?background=true").json()["id"]
+    assert keyed.client.get(f"/v1/jobs/{done}?wait=30").json()["state"] == "succeeded"
+    page = admin.go("jobs")
+    row = page.get_by_role("row").filter(has_text=done)
+    row.get_by_text("succeeded").wait_for()
+    row.get_by_role("button", name="verify").click()
+    page.get_by_role("dialog").get_by_text("checked bytes").wait_for()
+    page.keyboard.press("Escape")
+    waiting = [keyed.client.post(f"/v1/maps/{LAB}/verify?background=true").json()["id"] for _ in range(6)]
+    row = page.get_by_role("row").filter(has_text=waiting[-1])
+    row.wait_for()
+    cancel = row.get_by_role("button", name="Cancel")
+    if cancel.count():  # it may have run already
+        admin.foresee("409")
+        cancel.click()
+    for one in waiting:
+        state = keyed.client.get(f"/v1/jobs/{one}?wait=30").json()["state"]
+        assert state in ("succeeded", "cancelled")
+
+
+def test_the_state_of_the_service_is_shown(admin: Operator, visit: Visit) -> None:
+    page = admin.go("service")
+    page.get_by_text("ready", exact=True).wait_for()
+    page.get_by_text("Encoder's queue").wait_for()
+    page.get_by_text("Memory of the process").wait_for()
+    page.get_by_role("button", name="Limits").click()
+    page.get_by_text("max image bytes").wait_for()
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_text("data dir").wait_for()
+    other = visit("query").go("service")
+    other.get_by_text("Encoder's queue").wait_for()
+    assert other.get_by_text("Memory of the process").count() == 0
+    assert other.get_by_role("button", name="Settings").count() == 0
+
+
+def test_no_key_and_no_secret_is_in_the_logs(
+    admin: Operator, keyed: Server, keys: dict[str, str], folder: Path
+) -> None:
+    admin.go(f"maps/{LAB}/places")
+    written = keyed.log_file.read_text() + (folder / "audit.jsonl").read_text()
+    assert not [role for role, key in keys.items() if key in written]
+    paths = {
+        json.loads(line).get("path", "") for line in keyed.log_file.read_text().splitlines() if line.startswith("{")
+    }
+    assert not [path for path in paths if "placerec_" in path]

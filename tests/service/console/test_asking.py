@@ -1,0 +1,144 @@
+"""Asking in the console: pictures, the webcam, live answers and robots on the plan."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.service.console.conftest import Operator, Visit
+from tests.service.console.world import LAB, foreign_frame, frame_again
+from tests.service.scenes import encoded, scene, seen_again
+from tests.service.server import Server
+
+
+@pytest.fixture
+def pictures(tmp_path: Path) -> Path:
+    """A folder of frames: one of a known place, one of an unknown one, one of a kind that the service does not take."""
+    (tmp_path / "known.jpg").write_bytes(encoded(seen_again(scene(3), seed=70)))
+    (tmp_path / "foreign.jpg").write_bytes(foreign_frame())
+    cv2.imwrite(str(tmp_path / "known.bmp"), seen_again(scene(5), seed=71))
+    (tmp_path / "text.jpg").write_text("no picture")
+    return tmp_path
+
+
+def test_a_picture_is_asked_and_the_answer_explained(visit: Visit, pictures: Path) -> None:
+    page = visit("query").go(f"maps/{LAB}/try")
+    page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
+    answer = page.get_by_role("region", name="Answer")
+    answer.get_by_text("recognized").wait_for()
+    assert re.search(r"(mon|tues)day-03", answer.inner_text()) and "probable" in answer.inner_text()
+    assert answer.locator("svg line").count() > 8, "inliers are drawn over both frames"
+    answer.get_by_role("button", name="Cells").click()
+    assert answer.locator("svg.cells line").count() > 0
+    answer.get_by_role("button", name="Nothing").click()
+    assert answer.locator("svg").count() == 0
+    matches = page.get_by_role("region", name="Matches").get_by_role("listitem")
+    assert matches.count() == 5
+    matches.nth(4).get_by_role("button").click()
+    answer.get_by_text("rank 5").wait_for()
+    page.get_by_role("img", name=re.compile("Shares of the words")).wait_for()
+    assert "total" in page.locator(".stages").inner_text()
+
+
+def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alone(
+    admin: Operator, pictures: Path
+) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    names = ["known.jpg", "foreign.jpg", "known.bmp", "text.jpg"]
+    page.get_by_label("Pictures").set_input_files([pictures / name for name in names])
+    rows = page.get_by_role("region", name="Frames", exact=True).get_by_role("row")
+    page.get_by_text("Not a picture").wait_for()
+    told = {row.split("\t")[0]: row for row in rows.all_inner_texts()[1:]}
+    assert "recognized" in told["known.jpg"] and "recognized" in told["known.bmp"]
+    assert "recognized" not in told["foreign.jpg"]
+
+
+def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str], pictures: Path) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    page.get_by_label("Pictures").set_input_files(pictures / "known.jpg")
+    page.get_by_role("region", name="Answer").wait_for()
+    text = page.get_by_label("The same request", exact=True).inner_text()
+    assert keys["admin"] not in text
+    if not Path("/usr/bin/curl").exists():
+        pytest.skip("no curl is installed")
+    environment = {"PLACEREC_KEY": keys["admin"], "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(
+        ["bash", "-c", text], cwd=pictures, env=environment, capture_output=True, text=True, check=True
+    )
+    assert '"verdict":"recognized"' in done.stdout
+    assert shlex.split(text.replace("\\\n", ""))[0] == "curl"
+
+
+def test_the_webcam_is_asked(admin: Operator) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    page.get_by_role("button", name="Use the webcam").click()
+    page.get_by_role("button", name="Ask with this frame").click()
+    page.get_by_role("region", name="Answer").locator(".verdict").wait_for()
+    page.get_by_role("button", name="Stop").click()
+    page.get_by_text("Drop pictures here").wait_for()
+
+
+def test_live_answers_appear_and_are_explained_by_one_click(admin: Operator, keyed: Server) -> None:
+    page = admin.go(f"maps/{LAB}/live")
+    page.get_by_label("frames as thumbnails").check()
+    page.get_by_text("listening").wait_for()
+    keyed.query(LAB, frame_again(4))
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    lines.first.get_by_text("recognized").wait_for()
+    assert re.search(r"(mon|tues)day-04", lines.first.inner_text()) and "admin-key" in lines.first.inner_text()
+    lines.first.get_by_role("img", name="The frame").wait_for()
+    lines.first.get_by_role("button", name="Why").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_text("Decision value").wait_for()
+    dialog.get_by_role("button", name=re.compile("Ask again")).click()
+    page.get_by_role("region", name="Answer").get_by_text("recognized").wait_for()
+
+
+def test_live_answers_are_paused_and_filtered(admin: Operator, keyed: Server) -> None:
+    page = admin.go(f"maps/{LAB}/live")
+    page.get_by_text("listening").wait_for()
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    page.get_by_role("button", name="Pause").click()
+    keyed.query(LAB, frame_again(5))
+    page.get_by_role("button", name="Go on (1 new)").wait_for()
+    assert lines.count() == 0
+    page.get_by_role("button", name="Go on").click()
+    lines.first.wait_for()
+    page.get_by_label("Who, camera, place").fill("nobody")
+    page.get_by_text("Nothing was asked yet").wait_for()
+    page.get_by_label("Who, camera, place").fill("ADMIN")
+    lines.first.wait_for()
+    page.get_by_role("button", name="recognized", exact=True).click()
+    page.get_by_text("listening").wait_for()
+    keyed.query(LAB, frame_again(6))
+    answer = keyed.query(LAB, foreign_frame(2000))
+    page.get_by_role("list", name="Answers").get_by_text(answer["verdict"]).first.wait_for()
+    assert lines.count() == 2
+
+
+def test_a_query_key_sees_live_answers_without_frames_and_names(visit: Visit, keyed: Server) -> None:
+    page = visit("query").go(f"maps/{LAB}/live")
+    page.get_by_text("listening").wait_for()
+    keyed.query(LAB, frame_again(7))
+    line = page.get_by_role("list", name="Answers").get_by_role("listitem").first
+    line.get_by_text("recognized").wait_for()
+    assert "admin-key" not in line.inner_text()
+    assert page.get_by_label("frames as thumbnails").count() == 0
+
+
+def test_a_robot_is_drawn_where_its_session_is(admin: Operator, keyed: Server) -> None:
+    page = admin.go(f"maps/{LAB}/plan")
+    session = keyed.client.post(f"/v1/maps/{LAB}/sessions", json={}).json()["id"]
+    for number in (2, 3, 4):
+        frame = encoded(seen_again(scene(number), seed=80 + number))
+        path = f"/v1/maps/{LAB}/sessions/{session}/frames"
+        assert keyed.client.post(path, content=frame, headers={"Content-Type": "image/jpeg"}).status_code == 200
+    robots = page.get_by_role("list", name="Robots")
+    robots.get_by_text(session).wait_for()
+    keyed.client.delete(f"/v1/maps/{LAB}/sessions/{session}")
+    robots.wait_for(state="detached")

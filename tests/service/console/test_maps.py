@@ -1,0 +1,269 @@
+"""What is done with maps and places in the console, and what the service then has."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.service.console.conftest import Operator, Visit
+from tests.service.console.world import LAB, PLACES, frame, pose_of
+from tests.service.server import Server
+
+_numbers = itertools.count()
+
+
+@pytest.fixture
+def spare(keyed: Server) -> str:
+    """A map of four places that a test may spoil."""
+    name = f"spare-{next(_numbers)}"
+    keyed.create_map(name)
+    for number in range(4):
+        keyed.enrol(
+            name, f"p{number}", frame(number), **pose_of(number), sequence="walk", metadata={"floor": number % 2}
+        )
+    return name
+
+
+def test_the_list_tells_how_large_a_map_is_and_how_it_answers(admin: Operator) -> None:
+    page = admin.go("maps")
+    row = page.get_by_role("row").filter(has=page.get_by_role("link", name=LAB, exact=True))
+    assert str(2 * PLACES) in row.inner_text() and "m-region-vlad" in row.inner_text()
+    assert re.search(
+        r"\d+ recognized, \d+ ambiguous, \d+ unknown", row.locator(".mix").get_attribute("aria-label") or ""
+    )
+    assert row.locator("time").get_attribute("title", timeout=1000).endswith("UTC")  # type: ignore[union-attr]
+
+
+def test_a_map_is_created_edited_and_deleted(admin: Operator, keyed: Server) -> None:
+    page = admin.go("maps")
+    page.get_by_role("button", name="Create a map").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Id").fill("made-here")
+    dialog.get_by_label("Description").fill("by night")
+    dialog.get_by_label("Same place, metres").fill("2.5")
+    dialog.get_by_role("button", name="Create").click()
+    page.get_by_role("link", name="made-here").wait_for()
+    made = keyed.client.get("/v1/maps/made-here").json()
+    assert (made["description"], made["same_place_radius"]) == ("by night", 2.5)
+
+    page.get_by_role("button", name="Edit made-here").click()
+    page.get_by_role("dialog").get_by_label("Kept of each frame").select_option("none")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_role("dialog").wait_for(state="detached")
+    edited = keyed.client.get("/v1/maps/made-here").json()
+    assert (edited["keep"], edited["description"], edited["revision"]) == ("none", "by night", made["revision"] + 1)
+
+    page.get_by_role("button", name="Delete made-here").click()
+    button = page.get_by_role("dialog").get_by_role("button", name="Delete the map")
+    assert button.is_disabled()
+    page.get_by_role("dialog").get_by_role("textbox").fill("made-her")
+    assert button.is_disabled()
+    page.get_by_role("dialog").get_by_role("textbox").fill("made-here")
+    button.click()
+    page.get_by_role("link", name="made-here").wait_for(state="detached")
+    assert keyed.client.get("/v1/maps/made-here").status_code == 404
+
+
+def test_an_edit_of_what_somebody_else_changed_is_refused_and_told(admin: Operator, keyed: Server, spare: str) -> None:
+    page = admin.go("maps")
+    page.get_by_role("button", name=f"Edit {spare}").click()
+    page.get_by_role("dialog").get_by_label("Description").fill("mine")
+    keyed.client.patch(f"/v1/maps/{spare}", json={"description": "theirs"})
+    admin.foresee("412")
+    page.get_by_role("button", name="Save").click()
+    told = page.get_by_role("dialog").get_by_role("alert")
+    told.get_by_text("The map has changed", exact=False).first.wait_for()
+    assert re.search(r"Request [0-9a-f]{32}", told.inner_text())
+    assert keyed.client.get(f"/v1/maps/{spare}").json()["description"] == "theirs"
+
+
+def test_a_map_is_exported_and_imported_again(admin: Operator, keyed: Server, spare: str, tmp_path: Path) -> None:
+    page = admin.go("maps")
+    page.get_by_role("button", name=f"Export {spare}").click()
+    with page.expect_download() as saved:
+        page.get_by_role("dialog").get_by_role("button", name="Export").click()
+    file = tmp_path / saved.value.suggested_filename
+    saved.value.save_as(file)
+    assert file.name == f"{spare}.tar"
+
+    page.get_by_role("button", name="Import").click()
+    dialog = page.get_by_role("dialog")
+    dialog.locator("input[type=file]").set_input_files(file)
+    dialog.get_by_label("Id").fill(f"{spare}-again")
+    dialog.get_by_role("button", name="Import").click()
+    dialog.wait_for(state="detached")
+    page.get_by_role("link", name=f"{spare}-again").wait_for()
+    assert keyed.places(f"{spare}-again").keys() == keyed.places(spare).keys()
+
+
+def test_a_file_that_is_no_map_is_refused_in_the_dialog(admin: Operator, tmp_path: Path) -> None:
+    (tmp_path / "no-map.tar").write_bytes(b"no map" * 1000)
+    page = admin.go("maps")
+    page.get_by_role("button", name="Import").click()
+    page.locator("input[type=file]").set_input_files(tmp_path / "no-map.tar")
+    admin.foresee("422", "400")
+    page.get_by_role("dialog").get_by_role("button", name="Import").click()
+    page.get_by_role("dialog").get_by_role("alert").get_by_text("Request", exact=False).wait_for()
+
+
+def test_places_are_filtered(admin: Operator) -> None:
+    page = admin.go(f"maps/{LAB}/places")
+    tiles = page.get_by_role("list", name="Places").get_by_role("listitem")
+    assert tiles.count() == 2 * PLACES
+    page.get_by_label("Traverse").select_option("monday")
+    page.wait_for_url("**sequence=monday")
+    admin.settle()
+    assert tiles.count() == PLACES
+    page.get_by_label("Traverse").select_option("")
+    page.get_by_label("Metadata").fill("light = dusk, floor = 2")
+    page.get_by_label("Metadata").press("Enter")
+    page.wait_for_url("**where=**")
+    admin.settle()
+    assert tiles.count() == PLACES and all(name.startswith("tuesday") for name in tiles.all_inner_texts())
+    page.get_by_label("Metadata").fill("floor = 3")
+    page.get_by_label("Metadata").press("Enter")
+    page.get_by_text("No place fits the filters.").wait_for()
+    page.get_by_role("button", name="Clear").click()
+    page.get_by_label("Taken from (UTC)").fill("2026-11-17T10:00:06")
+    page.wait_for_url("**after=**")
+    admin.settle()
+    assert tiles.count() == PLACES - 6
+
+
+def test_places_come_in_pages(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("paged", verification=False)
+    for number in range(61):
+        assert keyed.enrol("paged", f"q{number:02d}", frame(number % 3)).status_code == 201
+    page = admin.go("maps/paged/places")
+    tiles = page.get_by_role("list", name="Places").get_by_role("listitem")
+    assert tiles.count() == 60
+    page.get_by_role("button", name="Next").click()
+    page.get_by_role("link", name="q60").wait_for()
+    assert tiles.count() == 1
+    page.get_by_role("button", name="Before").click()
+    page.get_by_role("link", name="q00").wait_for()
+
+
+def test_a_place_is_shown_with_its_picture_neighbours_and_what_matched_it(admin: Operator) -> None:
+    page = admin.go(f"maps/{LAB}/places/monday-03")
+    page.get_by_role("img", name="Place monday-03").first.wait_for()
+    assert page.get_by_role("img", name="Place monday-03").first.evaluate("one => one.naturalWidth") > 100
+    along = page.locator("section").filter(has=page.get_by_role("heading", name="Along the traverse"))
+    assert [one.split("\n")[0] for one in along.get_by_role("listitem").all_inner_texts()] == [
+        f"monday-{number:02d}" for number in range(7)
+    ]
+    near = page.locator("section").filter(has=page.get_by_role("heading", name="Nearest by pose"))
+    assert near.get_by_role("listitem").first.inner_text().startswith("tuesday-03")
+    page.get_by_role("heading", name="What matched it lately").wait_for()
+    page.get_by_role("region", name="Answers").get_by_role("row").nth(1).wait_for()
+
+
+def test_a_place_is_edited_and_the_edit_undone(admin: Operator, keyed: Server, spare: str) -> None:
+    before = keyed.client.get(f"/v1/maps/{spare}/places/p1").json()
+    page = admin.go(f"maps/{spare}/places/p1")
+    page.get_by_role("button", name="Edit").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("x", exact=True).fill("4.25")
+    dialog.get_by_label("Traverse").fill("drive")
+    dialog.get_by_label("Metadata").fill('{"door": "open"}')
+    dialog.get_by_role("button", name="Save").click()
+    dialog.wait_for(state="detached")
+    edited = keyed.client.get(f"/v1/maps/{spare}/places/p1").json()
+    assert (edited["pose"]["x"], edited["sequence"], edited["metadata"]) == (4.25, "drive", {"door": "open"})
+    page.get_by_role("button", name="Undo").click()
+    page.get_by_role("link", name="walk").first.wait_for()
+    after = keyed.client.get(f"/v1/maps/{spare}/places/p1").json()
+    assert {**after, "updated_at": None} == {**before, "updated_at": None}
+
+
+def test_metadata_that_is_no_json_is_told_before_it_is_sent(admin: Operator, spare: str) -> None:
+    page = admin.go(f"maps/{spare}/places/p1")
+    page.get_by_role("button", name="Edit").click()
+    page.get_by_label("Metadata").fill("{floor: 2")
+    page.get_by_role("button", name="Save").click()
+    page.get_by_role("dialog").get_by_text("Write the metadata as a JSON object.").wait_for()
+
+
+def test_one_place_is_forgotten_by_its_name(admin: Operator, keyed: Server, spare: str) -> None:
+    page = admin.go(f"maps/{spare}/places/p2")
+    page.get_by_role("button", name="Forget").click()
+    page.get_by_role("dialog").get_by_role("textbox").fill("p2")
+    page.get_by_role("button", name="Forget the place").click()
+    page.wait_for_url("**/places")
+    assert "p2" not in keyed.places(spare)
+
+
+@pytest.mark.parametrize("way", ["chosen", "filtered"])
+def test_many_places_are_forgotten_together(visit: Visit, keyed: Server, spare: str, way: str) -> None:
+    operator = visit("enrol")
+    page = operator.go(f"maps/{spare}/places")
+    if way == "chosen":
+        page.get_by_label("Choose p1").check()
+        page.get_by_label("Choose p3").check()
+        page.get_by_role("button", name="Forget 2 chosen").click()
+    else:
+        page.get_by_label("Metadata").fill("floor = 1")
+        page.get_by_label("Metadata").press("Enter")
+        page.get_by_role("button", name="Forget all of these").click()
+    dialog = page.get_by_role("dialog", name="Forget 2 places")
+    assert "p1" in dialog.inner_text() and "p3" in dialog.inner_text() and len(keyed.places(spare)) == 4
+    dialog.get_by_role("textbox").fill(spare)
+    dialog.get_by_role("button", name="Forget", exact=True).click()
+    dialog.wait_for(state="detached")
+    assert keyed.places(spare).keys() == {"p0", "p2"}
+
+
+def test_the_plan_chooses_what_is_clicked_and_goes_along_the_traverse(admin: Operator) -> None:
+    page = admin.go(f"maps/{LAB}/plan")
+    canvas = page.get_by_role("img", name=re.compile(f"Plan of {LAB}"))
+    page.get_by_label("Find a place").fill("monday-04")
+    page.get_by_role("button", name="Find", exact=True).click()
+    chosen = page.get_by_role("region", name="Chosen place")
+    chosen.get_by_role("link", name="monday-04").wait_for()
+    canvas.focus()
+    page.keyboard.press("n")
+    chosen.get_by_role("link", name="monday-05").wait_for()
+    box = canvas.bounding_box()
+    assert box is not None
+    for _ in range(5):
+        page.keyboard.press("+")
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + 30)
+    page.get_by_role("region", name="Chosen place").wait_for(state="detached")
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    chosen.get_by_role("link", name="monday-05").wait_for()
+
+
+def test_traverses_are_drawn_in_their_colours_and_can_be_left_out(admin: Operator) -> None:
+    page = admin.go(f"maps/{LAB}/plan")
+    count = """canvas => {
+      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext('2d', { willReadFrequently: true });
+      copy.drawImage(canvas, 0, 0);
+      const { data } = copy.getImageData(0, 0, canvas.width, canvas.height);
+      let painted = 0;
+      for (let one = 3; one < data.length; one += 4) painted += data[one] > 200;
+      return painted;
+    }"""
+    canvas = page.locator(".plan-canvas canvas").first
+    page.wait_for_timeout(200)
+    both = canvas.evaluate(count)
+    page.get_by_label("monday").uncheck()
+    page.wait_for_timeout(200)
+    one = canvas.evaluate(count)
+    page.get_by_label("tuesday").uncheck()
+    page.wait_for_timeout(200)
+    assert both > one > 100 and canvas.evaluate(count) == 0
+
+
+def test_without_poses_the_traverses_are_strips(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("unposed")
+    for number in range(3):
+        keyed.enrol("unposed", f"u{number}", frame(number), sequence="walk")
+    page = admin.go("maps/unposed/plan")
+    page.get_by_text("no poses: each traverse is a strip").wait_for()
+    page.get_by_text("frames", exact=False).first.wait_for()
+    page.get_by_label("Find a place").fill("u2")
+    page.get_by_role("button", name="Find", exact=True).click()
+    page.get_by_role("region", name="Chosen place").get_by_role("link", name="u2").wait_for()

@@ -1,0 +1,118 @@
+"""Whatever somebody wrote into the service is shown as they wrote it, and never becomes markup."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.service.console.conftest import Operator
+from tests.service.console.world import LAB, frame
+from tests.service.scenes import jpeg
+from tests.service.server import Server
+
+MARKUP = "<img src=x onerror=\"window.pwned=1\"><b id='pwned'>&amp;</b>"
+
+
+def check_plain(operator: Operator, text: str = MARKUP) -> None:
+    """The text stands in the page as it is, and made no element."""
+    operator.page.get_by_text(text, exact=False).first.wait_for(state="attached")
+    assert operator.page.locator("#pwned").count() == 0
+    assert operator.page.evaluate("window.pwned") is None
+
+
+@pytest.fixture(scope="module")
+def hostile(keyed: Server) -> Iterator[str]:
+    """A map whose every text is markup."""
+    keyed.create_map("hostile", description=MARKUP)
+    for number in range(2):
+        name = MARKUP.replace("/", "|") + str(number)
+        answer = keyed.enrol(
+            "hostile",
+            f"p{number}",
+            frame(number),
+            sequence=name,
+            x=number,
+            y=0,
+            metadata={MARKUP: MARKUP, "n": [MARKUP]},
+        )
+        assert answer.status_code == 201, answer.text
+    yield "hostile"
+    keyed.client.delete("/v1/maps/hostile")
+
+
+def test_descriptions(admin: Operator, hostile: str) -> None:
+    page = admin.go("maps")
+    check_plain(admin)
+    page.get_by_role("button", name=f"Edit {hostile}").click()
+    assert page.get_by_role("dialog").get_by_label("Description").input_value() == MARKUP
+
+
+def test_names_and_values_of_metadata(admin: Operator, hostile: str) -> None:
+    page = admin.go(f"maps/{hostile}/places/p0")
+    check_plain(admin)
+    page.get_by_role("button", name="Edit").click()
+    assert MARKUP.replace('"', '\\"') in page.get_by_role("dialog").get_by_label("Metadata").input_value()
+
+
+@pytest.mark.parametrize("view", ["plan", "places", "traverses", "try", "calibration", "health"])
+def test_names_of_traverses(admin: Operator, hostile: str, view: str) -> None:
+    admin.go(f"maps/{hostile}/{view}")
+    if view in ("plan", "places", "traverses"):
+        check_plain(admin, MARKUP.replace("/", "|"))
+    assert admin.page.locator("#pwned").count() == 0 and admin.page.evaluate("window.pwned") is None
+
+
+def test_names_of_files(admin: Operator, tmp_path: Path) -> None:
+    name = "<b id='pwned'>1.jpg"
+    (tmp_path / name).write_bytes(jpeg(1))
+    (tmp_path / "2.jpg").write_text("no picture")
+    page = admin.go(f"maps/{LAB}/try")
+    page.get_by_label("Pictures").set_input_files([tmp_path / "2.jpg", tmp_path / name])
+    page.get_by_role("region", name="Frames", exact=True).locator(".verdict").first.wait_for()
+    check_plain(admin, name)
+    page.get_by_role("button", name=name).click()
+    assert "<b id=" in page.get_by_label("The same request", exact=True).inner_text()
+
+
+def test_texts_of_problems_and_of_addresses(admin: Operator) -> None:
+    admin.foresee("404", "422")
+    page = admin.page
+    page.goto(f"{admin.root}/console#/maps/{LAB}/places/%3Cb%20id='pwned'%3Ex")
+    page.get_by_role("alert").first.wait_for()
+    check_plain(admin, "<b id='pwned'>x")
+    page.goto(f"{admin.root}/console#/%3Cb%20id='pwned'%3E")
+    page.get_by_text("There is no such view").wait_for()
+    assert page.locator("#pwned").count() == 0
+
+
+def test_reasons_that_the_service_gives(admin: Operator, keyed: Server) -> None:
+    problem = {
+        "type": "urn:placerec:problem:x",
+        "title": MARKUP,
+        "detail": MARKUP,
+        "request_id": MARKUP,
+        "errors": [MARKUP],
+    }
+    admin.foresee("418")
+    admin.page.route("**/v1/jobs*", lambda route: route.fulfill(status=418, json=problem))
+    admin.page.goto(f"{admin.root}/console#/jobs")
+    check_plain(admin)
+    assert admin.page.get_by_role("alert").inner_text().count(MARKUP) >= 4
+
+
+def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
+    # The service refuses such names of keys, cameras and places; a page that trusted it would be one fault from ruin.
+    key = {"id": MARKUP, "name": MARKUP, "role": "query", "maps": [MARKUP], "state": "in force", "own": False}
+    key |= {"created_at": "2026-11-20T10:00:00Z", "expires_at": None, "revoked_at": None, "last_used_at": None}
+    admin.page.route("**/v1/keys*", lambda route: route.fulfill(json={"items": [key], "next_cursor": None}))
+    line = {"time": "2026-11-20T10:00:00Z", "event": MARKUP, "operation": MARKUP, "principal": MARKUP, "map": MARKUP}
+    admin.page.route(
+        "**/v1/audit*",
+        lambda route: route.fulfill(json={"items": [{**line, "status": 200}], "next_cursor": None, "source": "file"}),
+    )
+    admin.go("keys")
+    check_plain(admin)
+    admin.go("audit")
+    check_plain(admin)

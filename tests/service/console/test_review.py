@@ -1,0 +1,177 @@
+"""Frames kept for review in the console, and an operator's day from a doubtful answer to a better calibration."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.service.console import world
+from tests.service.console.conftest import Operator, Visit
+from tests.service.scenes import encoded, jpeg, scene, seen_again
+from tests.service.server import Server
+
+KEPT = {"verdicts": ["recognized", "ambiguous", "unknown"], "most_frames": 500, "most_bytes": 2**28}
+
+
+def wait_for_kept(server: Server, map_id: str, count: int) -> None:
+    """Frames are written a moment after their answers."""
+    for _ in range(200):
+        if server.client.get(f"/v1/maps/{map_id}/review").json()["frames"] >= count:
+            return
+    raise AssertionError("the frames were not kept")
+
+
+@pytest.fixture
+def doubtful(keyed: Server, request: pytest.FixtureRequest) -> str:
+    """A map of four places that keeps every frame, and has three: of places 0 and 1, and of none."""
+    name = f"doubtful-{re.sub('[^a-z]+', '-', request.node.name.lower())[-30:]}".strip("-")
+    keyed.create_map(name)
+    for number in range(4):
+        keyed.enrol(name, f"p{number}", world.frame(number), sequence="walk", **world.pose_of(number))
+    keyed.client.patch(f"/v1/maps/{name}", json={"review": KEPT})
+    for data in (world.frame_again(0), world.frame_again(1), jpeg(500)):
+        keyed.query(name, data)
+    wait_for_kept(keyed, name, 3)
+    return name
+
+
+def test_an_admin_says_which_frames_are_kept(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("keeping")
+    page = admin.go("maps/keeping/review")
+    page.get_by_text("This map keeps no frames for review now.").wait_for()
+    page.get_by_role("button", name="What is kept").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("ambiguous").check()
+    dialog.get_by_label("unknown").check()
+    dialog.get_by_label("At most, frames").fill("50")
+    dialog.get_by_role("button", name="Save").click()
+    page.get_by_text("This map keeps no frames for review now.").wait_for(state="detached")
+    kept = keyed.client.get("/v1/maps/keeping").json()["review"]
+    assert sorted(kept["verdicts"]) == ["ambiguous", "unknown"] and kept["most_frames"] == 50
+
+
+def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful: str, tmp_path: Path) -> None:
+    operator = visit("enrol")
+    page = operator.go(f"maps/{doubtful}/review")
+    queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
+    assert queue.count() == 3
+    panel = page.get_by_role("region", name="Frame to be labelled")
+    assert (
+        panel.get_by_role("img", name="The frame").evaluate("one => one.decode().then(() => one.naturalWidth)") == 320
+    )
+
+    panel.get_by_role("button", name="Enrol it").click()  # the newest first: the frame of no place
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Id").fill("p9")
+    dialog.get_by_label("x", exact=True).fill("30")
+    dialog.get_by_label("y", exact=True).fill("4")
+    dialog.get_by_role("button", name="Enrol").click()
+    page.get_by_text("Enrolled as p9.").wait_for()
+    assert keyed.client.get(f"/v1/maps/{doubtful}/places/p9").json()["pose"]["x"] == 30
+    panel.get_by_role("button", name="It is p1").click()
+    page.get_by_text("Labelled as p1.").wait_for()
+    panel.get_by_role("button", name="Another place").click()
+    page.get_by_role("dialog").get_by_label("Id of the place").fill("p0")
+    page.get_by_role("dialog").get_by_role("button", name="Label").click()
+    page.get_by_text("Nothing to be looked at").wait_for()
+
+    with page.expect_download() as saved:
+        page.get_by_role("button", name="Export the labels").click()
+    saved.value.save_as(tmp_path / "labels.json")
+    labels = json.loads((tmp_path / "labels.json").read_text())["items"]
+    assert sorted(one["place"] for one in labels) == ["p0", "p1", "p9"]
+
+    page.get_by_role("button", name="Labelled").click()
+    page.get_by_role("button", name="No place of this map").click()  # a label can be replaced
+    page.get_by_text("Labelled: no place of this map.").first.wait_for()
+    again = keyed.client.get(f"/v1/maps/{doubtful}/review/labels").json()["items"]
+    assert sum(one["place"] is None for one in again) == 1
+
+
+def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
+    admin: Operator, keyed: Server, doubtful: str
+) -> None:
+    page = admin.go(f"maps/{doubtful}/review")
+    queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
+    page.get_by_role("button", name="Throw away").click()
+    page.get_by_text("The frame is thrown away.").wait_for()
+    assert queue.count() == 2
+    page.get_by_role("button", name="Undo").click()
+    page.get_by_text("The frame is thrown away.").wait_for(state="detached")
+    assert queue.count() == 3
+    page.get_by_role("button", name="Throw away").click()
+    page.get_by_role("link", name="Places").click()  # whoever goes on means it
+    page.get_by_role("heading", name="Places").wait_for()
+    admin.settle()
+    for _ in range(100):
+        left = keyed.client.get(f"/v1/maps/{doubtful}/review").json()["frames"]
+        if left == 2:
+            break
+    assert left == 2
+
+
+def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> None:
+    # A map comes from elsewhere: imported in the console.
+    exported = keyed.client.get(f"/v1/maps/{world.LAB}/export").content
+    (tmp_path / "day.tar").write_bytes(exported)
+    page = admin.go("maps")
+    page.get_by_role("button", name="Import").click()
+    dialog = page.get_by_role("dialog")
+    dialog.locator("input[type=file]").set_input_files(tmp_path / "day.tar")
+    dialog.get_by_label("Id").fill("day")
+    dialog.get_by_role("button", name="Import").click()
+    dialog.wait_for(state="detached")
+
+    # It is told to keep what it is not sure of; robots ask.
+    keyed.client.patch("/v1/maps/day", json={"review": KEPT})
+    asked = [encoded(seen_again(scene(number), seed=200 + number)) for number in range(world.PLACES)]
+    asked += [world.foreign_frame(3000 + number) for number in range(world.PLACES)]
+    for data in asked:
+        keyed.query("day", data)
+    wait_for_kept(keyed, "day", len(asked))
+
+    # Each frame is labelled: by its best match where that is right, as a stranger otherwise.
+    page = admin.go("maps/day/review")
+    frames = keyed.client.get("/v1/maps/day/review?limit=100").json()["items"]
+    first = frames[0]
+    page.get_by_role("button", name=f"Frame {first['id']}").click()
+    page.get_by_role("button", name="No place of this map").click()
+    page.get_by_text("Labelled: no place of this map.").wait_for()
+    for position, frame in enumerate(frames[1:], start=1):
+        number = len(asked) - 1 - position
+        label = {"place": frame["answer"]["best"]} if number < world.PLACES else {"stranger": True}
+        assert keyed.client.post(f"/v1/maps/day/review/{frame['id']}", json=label).status_code == 200
+
+    # The labels calibrate the map.
+    page = admin.go("maps/day/calibration")
+    before = page.get_by_text("encoder-default")
+    before.wait_for()
+    page.get_by_role("button", name="Calibrate", exact=True).click()
+    dialog.get_by_label("Ask").select_option("labels")
+    dialog.get_by_label("Only the labelled frames").check()
+    dialog.get_by_label("Share").fill("0.8")
+    dialog.get_by_label("Dry run").uncheck()
+    dialog.get_by_role("button", name="Calibrate", exact=True).click()
+    dialog.wait_for(state="detached")
+    page.get_by_text("labels: ", exact=False).wait_for()
+    before.wait_for(state="detached")
+    page.get_by_role("img", name=re.compile("Reliability diagram")).wait_for()
+    assert keyed.client.get("/v1/maps/day").json()["calibration"]["source"] == "labels"
+
+    # It is pruned, and saved.
+    page = admin.go("maps/day/health")
+    prune = page.get_by_role("region", name="Prune")
+    prune.get_by_role("slider").fill("10")
+    prune.get_by_role("button", name="What would it cost?").click()
+    prune.get_by_role("button", name=re.compile(r"Remove \d+ places")).click()
+    dialog.get_by_role("textbox").fill("day")
+    dialog.get_by_role("button", name="Remove the places").click()
+    prune.get_by_text("Gone").wait_for()
+    page = admin.go("maps")
+    page.get_by_role("button", name="Export day").click()
+    with page.expect_download() as saved:
+        dialog.get_by_role("button", name="Export").click()
+    assert Path(saved.value.path()).stat().st_size > 10_000

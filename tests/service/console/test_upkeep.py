@@ -1,0 +1,156 @@
+"""Calibration, traverses and health in the console, and what the map then is."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from tests.service.console import world
+from tests.service.console.conftest import Operator, Visit
+from tests.service.server import Server
+
+
+@pytest.fixture(scope="module")
+def yard(keyed: Server) -> Iterator[str]:
+    """Another map of the drawn world, which these tests calibrate and align."""
+    world.fill(keyed, "yard")
+    yield "yard"
+    keyed.client.delete("/v1/maps/yard")
+
+
+def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, keyed: Server, yard: str) -> None:
+    page = admin.go(f"maps/{yard}/calibration")
+    page.get_by_text("Nothing was measured yet").wait_for()
+
+    def calibrate(action: str) -> None:
+        page.get_by_role("button", name="Calibrate", exact=True).click()
+        dialog = page.get_by_role("dialog")
+        dialog.get_by_label("Ask").select_option("sequence")
+        dialog.get_by_role("combobox", name="Traverse", exact=True).select_option("tuesday")
+        dialog.get_by_label("Share").fill("0.8")
+        if action == "Calibrate":
+            dialog.get_by_label("Dry run").uncheck()
+        dialog.get_by_role("button", name=action, exact=True).click()
+        dialog.wait_for(state="detached")
+
+    calibrate("Try it")
+    page.get_by_role("img", name=re.compile("Reliability diagram")).wait_for()
+    page.get_by_text("a dry run", exact=False).first.wait_for()
+    assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
+    calibrate("Calibrate")
+    page.get_by_text("sequence:tuesday").wait_for()
+    assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "sequence:tuesday"
+
+
+def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
+    admin: Operator, keyed: Server, yard: str
+) -> None:
+    order = {"method": "sequence", "sequence": "tuesday", "target": {"rule": "precision", "value": 0.8}}
+    assert keyed.client.post(f"/v1/maps/{yard}/calibrate", json=order).status_code == 200
+    before = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
+    page = admin.go(f"maps/{yard}/calibration")
+    slider = page.get_by_role("slider", name=re.compile("Threshold"))
+    slider.focus()
+    page.keyboard.press("End")
+    table = page.get_by_role("table", name="What would change")
+    table.get_by_role("row", name=re.compile("^recognized")).get_by_text("−").wait_for()
+    assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"] == before, "nothing is changed by looking"
+    page.get_by_role("button", name="Apply").click()
+    page.get_by_text("manual").wait_for()
+    applied = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
+    assert applied["threshold"] > before["threshold"] and applied["source"] == "manual"
+    page.get_by_role("button", name="Undo").click()
+    page.get_by_role("status").get_by_role("button", name="Undo").wait_for(state="detached")
+    page.get_by_label("Threshold", exact=True).get_by_text("0").first.wait_for()
+    admin.settle()
+    after = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
+    assert after["threshold"] == pytest.approx(before["threshold"])
+
+
+def test_a_threshold_is_not_applied_over_somebody_elses(admin: Operator, keyed: Server, yard: str) -> None:
+    order = {
+        "method": "sequence",
+        "sequence": "tuesday",
+        "target": {"rule": "precision", "value": 0.8},
+        "dry_run": True,
+    }
+    assert keyed.client.post(f"/v1/maps/{yard}/calibrate", json=order).status_code == 200
+    page = admin.go(f"maps/{yard}/calibration")
+    keyed.client.patch(f"/v1/maps/{yard}", json={"description": "changed meanwhile"})
+    page.get_by_role("slider", name=re.compile("Threshold")).focus()
+    page.keyboard.press("Home")
+    admin.foresee("412")
+    page.get_by_role("button", name="Apply").click()
+    told = page.get_by_role("region", name="Threshold").get_by_role("alert")
+    told.get_by_role("button", name="Try again").click()
+    told.wait_for(state="detached")
+
+
+def test_two_traverses_are_compared_and_aligned(visit: Visit, keyed: Server, yard: str) -> None:
+    operator = visit("enrol")
+    page = operator.go(f"maps/{yard}/traverses")
+    page.get_by_text("12 of 12 within 3 frames").wait_for()
+    page.get_by_text("not aligned").wait_for()
+    matrix = page.get_by_role("img", name=re.compile("Similarity of 12 frames"))
+    box = matrix.bounding_box()
+    assert box is not None
+    cell = box["width"] / 12
+    matrix.click(position={"x": 9.5 * cell, "y": 2.5 * cell})
+    pair = page.get_by_role("region", name="Pair")
+    pair.get_by_role("link", name="tuesday-02").wait_for()
+    pair.get_by_role("link", name="monday-09").wait_for()
+    matrix.focus()
+    page.keyboard.press("ArrowDown")
+    pair.get_by_role("link", name="tuesday-03").wait_for()
+    page.get_by_role("button", name="What would alignment find?").click()
+    page.get_by_text("no, a dry run").wait_for()
+    page.get_by_role("button", name="Align", exact=True).click()
+    page.get_by_text("aligned", exact=True).wait_for()
+    page.get_by_label("as aligned").check()
+    assert keyed.client.get(f"/v1/maps/{yard}/similarity?query=tuesday&reference=monday").json()["aligned"]
+
+
+def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> None:
+    keyed.create_map("short")
+    for number in range(2):
+        keyed.enrol("short", f"s{number}", world.frame(number), sequence=f"walk-{number}")
+    page = admin.go("maps/short/traverses")
+    page.get_by_role("button", name="Delete walk-0").click()
+    page.get_by_role("dialog").get_by_role("textbox").fill("walk-0")
+    page.get_by_role("button", name="Delete the traverse").click()
+    page.get_by_role("link", name="walk-0").wait_for(state="detached")
+    assert keyed.places("short").keys() == {"s1"}
+
+
+def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> None:
+    world.fill(keyed, "pruned")
+    page = admin.go("maps/pruned/health")
+    page.get_by_text("The map has not been queried yet.").wait_for()
+    prune = page.get_by_role("region", name="Prune")
+    prune.get_by_role("slider").fill("10")
+    prune.get_by_role("button", name="What would it cost?").click()
+    prune.get_by_text("Recall after").wait_for()
+    assert len(keyed.places("pruned")) == 2 * world.PLACES, "a dry run removes nothing"
+    prune.get_by_role("button", name=re.compile(r"Remove \d+ places")).click()
+    page.get_by_role("dialog").get_by_role("textbox").fill("pruned")
+    page.get_by_role("dialog").get_by_role("button", name="Remove the places").click()
+    prune.get_by_text("Gone").wait_for()
+    assert len(keyed.places("pruned")) < 2 * world.PLACES
+
+
+def test_another_map_is_merged_after_a_dry_run(admin: Operator, keyed: Server) -> None:
+    for name, numbers in (("target", (0, 1)), ("source", (2, 3))):
+        keyed.create_map(name)
+        for number in numbers:
+            keyed.enrol(name, f"{name}-{number}", world.frame(number), sequence=name)
+    page = admin.go("maps/target/health")
+    merge = page.get_by_role("region", name="Merge")
+    merge.get_by_label("From").select_option("source")
+    merge.get_by_role("button", name="What would come?").click()
+    merge.get_by_role("button", name="Copy 2 places").click()
+    page.get_by_role("dialog").get_by_role("textbox").fill("target")
+    page.get_by_role("dialog").get_by_role("button", name="Copy the places").click()
+    merge.get_by_text("Came").wait_for()
+    assert keyed.places("target").keys() == {"target-0", "target-1", "source-2", "source-3"}

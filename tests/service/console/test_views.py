@@ -1,0 +1,149 @@
+"""Every view for every role, in light and dark, at three sizes; axe finds nothing serious."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from tests.service.console.conftest import Operator, Theme, Visit
+from tests.service.console.world import LAB
+from tests.service.server import Server
+
+OF_MAP = {
+    "plan": (LAB, "query"),
+    "places": ("Places", "query"),
+    "places/monday-03": ("monday-03", "query"),
+    "try": ("Try", "query"),
+    "live": ("Live", "query"),
+    "traverses": ("Traverses", "query"),
+    "calibration": ("Calibration", "query"),
+    "review": ("Review", "enrol"),
+    "health": ("Health", "enrol"),
+}
+OF_SERVICE = {
+    "maps": ("Maps", "query"),
+    "jobs": ("Jobs", "query"),
+    "keys": ("Keys", "admin"),
+    "audit": ("Audit", "admin"),
+    "service": ("Service", "query"),
+}
+VIEWS = {f"maps/{LAB}/{name}": told for name, told in OF_MAP.items()} | OF_SERVICE
+TOO_WIDE = """[...document.querySelectorAll("body *")]
+  .filter((one) => one.getBoundingClientRect().right > innerWidth && !one.closest(".table"))
+  .map((one) => `${one.tagName}.${one.className} ${one.textContent.slice(0, 40)}`)"""
+LEVELS = ("query", "enrol", "admin")
+
+
+def open_to(role: str, needed: str) -> bool:
+    return LEVELS.index(role) >= LEVELS.index(needed)
+
+
+@pytest.mark.parametrize("role", LEVELS)
+def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) -> None:
+    operator = visit(role)
+    for view, (title, needed) in VIEWS.items():
+        page = operator.go(view)
+        heading = page.get_by_role("heading", level=1)
+        assert heading.inner_text() == (title if open_to(role, needed) else "Not for this key"), view
+    links = page.get_by_role("navigation", name="Views").get_by_role("link").all_inner_texts()
+    assert ("Keys" in links) == (role == "admin") and ("Health" in links) == (role != "query")
+    assert page.locator(".identity").inner_text().startswith(f"{role}-key")
+
+
+def test_a_query_key_is_offered_nothing_that_it_may_not_do(visit: Visit) -> None:
+    operator = visit("query")
+    for view in VIEWS:
+        page = operator.go(view)
+        names = page.locator("main").get_by_role("button").all_inner_texts()
+        refused = r"^(Create|Delete|Edit|Forget|Import|Export|Calibrate|Apply|Align|What would alignment)"
+        assert [name for name in names if re.match(refused, name)] == [], view
+        assert page.locator("main .danger").count() == 0, view
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("group", ["map", "service"])
+def test_axe_finds_nothing_serious(visit: Visit, theme: Theme, group: str) -> None:
+    operator = visit("admin", theme=theme)
+    for view in VIEWS:
+        if view.startswith(f"maps/{LAB}/") == (group == "map"):
+            operator.go(view)
+            check_with_axe(operator, view)
+
+
+def check_with_axe(operator: Operator, where: str) -> None:
+    """Fail for what axe calls serious or critical."""
+    found = Axe().run(operator.page, options={"resultTypes": ["violations"]}).response["violations"]
+    serious = [
+        (one["id"], one["nodes"][0]["html"][:200], one["nodes"][0].get("failureSummary", "")[:300])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+    ]
+    assert serious == [], where
+
+
+@pytest.mark.parametrize("size", ["phone", "laptop", "wall"])
+def test_no_view_is_wider_than_the_screen(visit: Visit, size: str) -> None:
+    operator = visit("admin", size=size)
+    for view in VIEWS:
+        page = operator.go(view)
+        wide, screen = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide <= screen, (view, page.evaluate(TOO_WIDE))
+
+
+def test_on_a_phone_the_views_are_behind_a_button(visit: Visit) -> None:
+    operator = visit("admin", size="phone")
+    page = operator.go("maps")
+    page.get_by_role("link", name="Jobs").wait_for(state="hidden")
+    page.get_by_role("button", name="Menu").click()
+    page.get_by_role("link", name="Jobs").click()
+    page.get_by_role("heading", name="Jobs").wait_for()
+    page.get_by_role("link", name="Audit").wait_for(state="hidden")
+
+
+def test_light_and_dark_follow_the_system_until_one_is_chosen(visit: Visit) -> None:
+    operator = visit("admin", theme="dark")
+    page = operator.go("maps")
+    ground = "getComputedStyle(document.documentElement).backgroundColor"
+    dark = page.evaluate(ground)
+    page.get_by_text("light", exact=True).click()
+    light = page.evaluate(ground)
+    assert dark != light
+    page.reload()
+    operator.settle()
+    assert page.evaluate(ground) == light
+    page.get_by_text("auto", exact=True).click()
+    assert page.evaluate(ground) == dark
+
+
+def test_everything_is_reached_by_keyboard(admin: Operator) -> None:
+    page = admin.go("maps")
+    page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
+    page.get_by_role("button", name=f"Edit {LAB}").focus()
+    page.keyboard.press("Enter")
+    dialog = page.get_by_role("dialog", name=f"Edit {LAB}")
+    dialog.get_by_label("Description").wait_for()
+    page.keyboard.press("Escape")
+    dialog.wait_for(state="detached")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')") == f"Edit {LAB}"
+
+
+def test_a_service_without_keys_needs_none(visit: Visit, server: Server, traverse: str) -> None:
+    operator = visit(None, server=server)
+    page = operator.go("maps")
+    page.get_by_role("link", name=traverse, exact=True).wait_for()
+    page.get_by_text("No keys: open to this machine").wait_for()
+    operator.go(f"maps/{traverse}/plan")
+    operator.go("keys")
+    page.get_by_text("There are no keys").wait_for()
+
+
+def test_a_view_that_is_not_there_says_so(admin: Operator) -> None:
+    page = admin.go("nowhere")
+    assert page.get_by_role("heading", level=1).inner_text() == "There is no such view"
+    admin.foresee("404")
+    page.goto(f"{admin.root}/console#/maps/gone/plan")
+    page.get_by_role("alert").get_by_text("There is no map 'gone'.").wait_for()
+    assert re.search(r"Request [0-9a-f]{32}", page.get_by_role("alert").inner_text())
