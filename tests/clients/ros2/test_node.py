@@ -150,13 +150,15 @@ def test_it_can_be_shut_down_from_every_state(site: Site) -> None:
     ways = {"one": [], "two": ["configure"], "three": ["configure", "activate"]}
     states = {"one": "unconfigured", "two": "inactive", "three": "active"}
     nodes = {name: Node(site.folder / name, {"url": site.url, "map": "walk"}, name=name) for name in ways}
-    for name, transitions in ways.items():
-        for transition in (*transitions, f"shutdown {states[name]}"):
-            assert site.peer.do("transition", name=transition, node=name)["success"], transition
-        assert site.peer.do("state", node=name)["state"] == "finalized"
-    for node in nodes.values():
-        assert node.stop() == 0, node.log()
-        assert "Traceback" not in node.log()
+    try:
+        for name, transitions in ways.items():
+            for transition in (*transitions, f"shutdown {states[name]}"):
+                assert site.peer.do("transition", name=transition, node=name)["success"], transition
+            assert site.peer.do("state", node=name)["state"] == "finalized"
+    finally:
+        ended = {name: node.stop() for name, node in nodes.items()}
+    assert ended == {"one": 0, "two": 0, "three": 0}
+    assert not any("Traceback" in node.log() for node in nodes.values())
 
 
 def test_a_node_that_starts_by_itself(image: Robot) -> None:
