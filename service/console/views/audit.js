@@ -49,7 +49,7 @@ async function read(filter, cursor, signal) {
   let next = cursor;
   let source = null;
   for (let page = 0; page < MOST_PAGES && items.length < ENOUGH; page += 1) {
-    const told = await get("/audit", { ...filter, limit: 100, cursor: next }, { signal });
+    const told = await get("/audit", { ...filter, limit: 50, cursor: next }, { signal });
     items.push(...told.items);
     next = told.next_cursor;
     source = told.source;

@@ -224,20 +224,26 @@ function Reliability({ reliability }) {
 const METHODS = { map: "all frames of the map", sequence: "one traverse against the others", labels: "frames that were labelled in the review" };
 const HINTS = {
   map: "The least reliable method: each frame is compared with its neighbours.",
-  labels: "Beside all frames of the map, where nothing else is said.",
+  labels: "They are few, and of the doubtful frames.",
+};
+const BESIDE = {
+  encoder: "the encoder's calibration, whose curve they move",
+  map: "all frames of the map",
+  none: "nothing",
 };
 
 function Order({ map, tag, started, close }) {
   const sequences = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
-  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true, alone: false });
+  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true, beside: "encoder" });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const names = (sequences.data?.items || []).map((one) => one.name);
+  const aimed = fields.method !== "labels" || fields.beside !== "encoder";
   const order = async () => {
-    const { method, sequence, rule, value, dry, alone } = fields;
+    const { method, sequence, rule, value, dry, beside } = fields;
     const target = rule === "mean_of_negatives" ? { rule } : { rule, value };
-    const body = { method, target, dry_run: dry, background: true };
+    const body = { method, dry_run: dry, background: true, ...(aimed && { target }) };
     if (method === "sequence") body.sequence = sequence || names[0];
-    if (method === "labels") body.beside = alone ? "none" : "map";
+    if (method === "labels") body.beside = beside;
     started(await post(mapPath(map, "calibrate"), body, { headers: tag && !dry ? { "If-Match": tag } : {} }));
   };
   return html`
@@ -250,8 +256,14 @@ function Order({ map, tag, started, close }) {
       ${fields.method === "sequence" && html`
         <${Field} label="Traverse"><select value=${fields.sequence} onChange=${(event) => change({ sequence: event.target.value })}>${names.map((one) => html`<option value=${one}>${one}</option>`)}</select><//>
       `}
-      ${fields.method === "labels" && html`<label class="field check"><input type="checkbox" checked=${fields.alone} onChange=${() => change({ alone: !fields.alone })} /><span>Only the labelled frames</span></label>`}
-      <div class="fields">
+      ${fields.method === "labels" && html`
+        <${Field} label="They join">
+          <select value=${fields.beside} onChange=${(event) => change({ beside: event.target.value })}>
+            ${Object.entries(BESIDE).map(([id, text]) => html`<option value=${id}>${text}</option>`)}
+          </select>
+        <//>
+      `}
+      ${aimed && html`<div class="fields">
         <${Field} label="Target">
           <select value=${fields.rule} onChange=${(event) => change({ rule: event.target.value, value: event.target.value === "precision" ? 0.95 : 0.01 })}>
             <option value="precision">so many of those believed are right</option>
@@ -260,7 +272,7 @@ function Order({ map, tag, started, close }) {
           </select>
         <//>
         ${fields.rule !== "mean_of_negatives" && html`<${Field} label="Share"><input type="number" min="0.001" max="0.999" step="any" value=${fields.value} onInput=${(event) => change({ value: event.target.valueAsNumber })} /><//>`}
-      </div>
+      </div>`}
       <label class="field check"><input type="checkbox" checked=${fields.dry} onChange=${() => change({ dry: !fields.dry })} /><span>Dry run: only measure, store nothing</span></label>
     <//>
   `;

@@ -151,8 +151,6 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     before.wait_for()
     page.get_by_role("button", name="Calibrate", exact=True).click()
     dialog.get_by_label("Ask").select_option("labels")
-    dialog.get_by_label("Only the labelled frames").check()
-    dialog.get_by_label("Share").fill("0.8")
     dialog.get_by_label("Dry run").uncheck()
     dialog.get_by_role("button", name="Calibrate", exact=True).click()
     dialog.wait_for(state="detached")
