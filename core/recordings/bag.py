@@ -103,7 +103,7 @@ class Bag:
         unpacked = Path(self._unpacked.name) / file.name.removesuffix(PACKED)
         try:
             with file.open("rb") as packed, unpacked.open("wb") as plain:
-                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed), plain)
+                shutil.copyfileobj(zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True), plain)
         except zstandard.ZstdError as error:
             self.remarks.append(f"{file.name} is cut short or damaged ({error}); what could be unpacked of it is read.")
         return unpacked

@@ -5,14 +5,18 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from core.errors import InvalidRecording
 from core.recordings.messages import Coding, stamp_of, type_name
-from core.recordings.storage import Entry, Key, Topic
+from core.recordings.storage import MOST_UNPACKED, Entry, Key, Topic
 
 MAGIC = b"\x89MCAP0\r\n"
+LATEST = 2**63 - 1
+"""The time of a message is not signed in the file; a later one, which no clock tells, counts as this."""
+
 CODINGS: dict[str, Coding] = {"cdr": "cdr", "ros1": "ros1"}
 
 
@@ -117,7 +121,7 @@ class McapStorage:
         from mcap.stream_reader import breakup_chunk
 
         try:
-            return breakup_chunk(chunk)
+            return breakup_chunk(_plain(chunk))
         except Exception as error:  # of zstandard, lz4, struct, the library itself
             self.problem = f"has a damaged chunk, whose messages are left out ({error})"
             return []
@@ -135,7 +139,7 @@ class McapStorage:
                 continue
             for number, record in enumerate(self._at(offset)):
                 if isinstance(record, Message) and (coding := wanted.get(record.channel_id)) is not None:
-                    yield Entry(record.log_time, stamp_of(record.data, coding), (offset, number))
+                    yield Entry(min(record.log_time, LATEST), stamp_of(record.data, coding), (offset, number))
 
     def read(self, key: Key) -> bytes:
         offset, number = key
@@ -156,3 +160,22 @@ class McapStorage:
 
     def close(self) -> None:
         self._file.close()
+
+
+def _plain(chunk: Any) -> Any:
+    """A chunk that is not packed, or whose unpacked size the library keeps to.
+
+    Raises:
+        InvalidRecording: it is larger than a chunk may be, or than it says.
+        Others: of lz4, if it is damaged.
+    """
+    import lz4.frame
+
+    if chunk.uncompressed_size > MOST_UNPACKED:
+        raise InvalidRecording(f"it would have {chunk.uncompressed_size} bytes")
+    if chunk.compression != "lz4":
+        return chunk
+    data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, chunk.uncompressed_size + 1)
+    if len(data) > chunk.uncompressed_size:
+        raise InvalidRecording("it has more bytes than it says")
+    return replace(chunk, data=data, compression="")

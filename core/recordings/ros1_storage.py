@@ -15,7 +15,7 @@ from pathlib import Path
 from core.errors import InvalidRecording
 from core.recordings.frame import NANOSECONDS
 from core.recordings.messages import stamp_of, type_name
-from core.recordings.storage import Entry, Key, Topic
+from core.recordings.storage import MOST_UNPACKED, Entry, Key, Topic
 
 MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _INDEX, _CHUNK, _CONNECTION = 2, 4, 5, 7
@@ -177,10 +177,13 @@ class Ros1Storage:
             raise InvalidRecording(f"Chunks packed by {packing.decode(errors='replace')!r} are not read.")
         unpacker = bz2.BZ2Decompressor() if packing == b"bz2" else lz4.frame.LZ4FrameDecompressor()
         try:
-            return bytes(unpacker.decompress(data))
+            unpacked = bytes(unpacker.decompress(data, MOST_UNPACKED))
         except (OSError, RuntimeError, EOFError) as error:
             self.problem = f"has a damaged chunk, whose messages are left out ({error})"
             return b""
+        if len(unpacked) == MOST_UNPACKED:
+            self.problem = "has a chunk that is too large, of which only the beginning is read"
+        return unpacked
 
     def close(self) -> None:
         self._file.close()

@@ -10,7 +10,7 @@ from typing import Any
 
 from core.errors import InvalidRecording
 from core.recordings.messages import STAMP_BYTES, Coding, stamp_of, type_name
-from core.recordings.storage import Entry, Key, Topic
+from core.recordings.storage import MOST_UNPACKED, Entry, Key, Topic
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """A message that the recorder has compressed begins so; one in CDR cannot."""
@@ -37,7 +37,8 @@ class SqliteStorage:
                 self._topics = {
                     row: (name, type_name(kind), CODINGS.get(coding))
                     for row, name, kind, coding in self._database.execute(
-                        "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+                        "SELECT id, coalesce(CAST(name AS TEXT), ''), coalesce(CAST(type AS TEXT), ''), "
+                        "serialization_format FROM topics ORDER BY id"
                     )
                 }
                 counts = Counter(topic for (topic,) in self._rows("SELECT topic_id FROM messages ORDER BY id"))
@@ -51,7 +52,11 @@ class SqliteStorage:
     def entries(self, topic: str) -> Iterator[Entry]:
         ids = {row: coding for row, (name, _, coding) in self._topics.items() if name == topic}
         # All topics are read, for there is no index by topic, and behind a damage no index helps.
-        rows = self._rows(f"SELECT topic_id, id, timestamp, substr(data, 1, {STAMP_BYTES}) FROM messages ORDER BY id")
+        # A column of SQLite may hold anything, whatever its type.
+        rows = self._rows(
+            "SELECT topic_id, id, coalesce(CAST(timestamp AS INTEGER), 0), "
+            f"coalesce(CAST(substr(data, 1, {STAMP_BYTES}) AS BLOB), x'') FROM messages ORDER BY id"
+        )
         for number, row, received, start in rows:
             coding = ids.get(number)
             if coding is not None:
@@ -73,10 +78,10 @@ class SqliteStorage:
 
     def read(self, key: Key) -> bytes:
         try:
-            found = self._database.execute("SELECT data FROM messages WHERE id = ?", key).fetchone()
+            found = self._database.execute("SELECT CAST(data AS BLOB) FROM messages WHERE id = ?", key).fetchone()
         except sqlite3.DatabaseError as error:
             raise InvalidRecording(f"A message cannot be read: {error}.") from error
-        data = bytes(found[0]) if found is not None else b""
+        data = bytes(found[0] or b"") if found is not None else b""
         return _unpacked(data) if data.startswith(ZSTD) else data
 
     def close(self) -> None:
@@ -87,6 +92,9 @@ def _unpacked(data: bytes) -> bytes:
     import zstandard
 
     try:
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+        unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MOST_UNPACKED + 1)
     except zstandard.ZstdError as error:
         raise InvalidRecording(f"A compressed message is damaged: {error}.") from error
+    if len(unpacked) > MOST_UNPACKED:
+        raise InvalidRecording("A compressed message is too large.")
+    return unpacked

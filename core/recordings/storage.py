@@ -11,6 +11,9 @@ from core.recordings.messages import Coding
 Key = tuple[int, ...]
 """Where a message is in its file; each kind of file has keys of its own."""
 
+MOST_UNPACKED = 1 << 30
+"""Bytes to which a chunk or a message is unpacked; more is not believed, since a few bytes can stand for any number."""
+
 
 @dataclass(frozen=True)
 class Topic:

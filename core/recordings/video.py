@@ -16,6 +16,9 @@ from core.recordings.pictures import png
 
 SUFFIXES = frozenset({".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".ogv", ".ts", ".webm", ".wmv"})
 
+LONGEST_STEM = 112
+"""Characters of a file's name in the ids of places, which leave room for the number of a frame."""
+
 
 class Video:
     """A video file that is decoded forward; to go back, it is opened again."""
@@ -57,7 +60,7 @@ class Video:
         if not times:
             raise InvalidRecording(f"{self.path} has no frame that can be decoded.")
         self._restart()
-        remarks = []
+        stem, remarks = self.path.stem[:LONGEST_STEM], []
         if len(times) < announced:
             remarks.append(
                 f"{self.path.name} announces {announced} frames and ends after {len(times)}, which are taken; it may "
@@ -65,7 +68,7 @@ class Video:
             )
         frames = [
             Frame(
-                make_id(f"{self.path.stem}-{number:06d}"),
+                make_id(f"{stem}-{number:06d}"),
                 f"{self.path.name}, frame {number} at {taken / NANOSECONDS:.3f} s",
                 partial(self._picture, number),
                 nanoseconds=taken,

@@ -24,6 +24,7 @@ from core.errors import UnknownSequence
 from core.recognition.selection import Conditions, Selection
 from core.recognition.stages import neighborhood_of
 from core.storage import Map, Snapshot
+from service.access.audit import ASKER
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NOBODY_ASKED, SessionEvent
@@ -42,6 +43,9 @@ REMEMBERED = 10_000
 
 GRAPH_REUSE = 20.0
 """The graph of a map that changes is used for so many times as long as it took to build, then built again."""
+
+REPEATED_SECONDS = 60.0
+"""For how long a session that has no frame is the answer to the request that began it, sent again."""
 
 CLOCKS_DIFFER = 1.0
 """Two clocks that differ by fewer seconds count as equal, so that the reported expiry of a session does not jitter."""
@@ -66,6 +70,7 @@ class Session:
     run: the belief; None after a restart, until the next frame.
     restored: whether the session was restored after a restart.
     streaming: whether a WebSocket streams into the session.
+    begun_by: who began it, and the id of that request; None after a restart.
     waiting: how many frames are being processed or wait for that.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
@@ -86,6 +91,7 @@ class Session:
     run: Run | None = None
     restored: bool = False
     streaming: bool = False
+    begun_by: tuple[str, str | None, str | None] | None = None
     waiting: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -195,6 +201,8 @@ class Sessions:
     def create(self, map_: Map, options: NewSession) -> Session:
         """Create a session; blocks, so call it in a thread.
 
+        The same request again, because its answer was lost, gets the session that it has begun, if no frame has come.
+
         Raises:
             TooManySessions: there are too many sessions, or they would need too much memory.
             UnknownSequence: the map has no sequence of one of the names.
@@ -203,6 +211,8 @@ class Sessions:
         names = options.sequences or []
         if absent := set(names) - set(map_.attributes.sequence_codes(names)):
             raise UnknownSequence(f"The map has no sequence {min(absent)!r}.")
+        if (begun := self._begun_before(map_, options)) is not None:
+            return begun
         graph = self.graph(map_, None if options.sequences is None else Selection(Conditions(sequences=tuple(names))))
         now, longest = time.time(), self._settings.session_expiry
         expires_after = min(options.expires_after or longest, longest)
@@ -231,8 +241,23 @@ class Sessions:
             with self._lock:
                 self._living.pop(session.id, None)
             raise
+        session.begun_by = _asking()
         self._tell(session, "begun")
         return session
+
+    def _begun_before(self, map_: Map, options: NewSession) -> Session | None:
+        """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
+        asking, oldest = _asking(), time.monotonic() - REPEATED_SECONDS
+        if asking is None:
+            return None
+        with self._lock:
+            self._sweep()
+            for one in self._living.values():
+                same = one.begun_by == asking and one.idle_since >= oldest and one.options == options
+                unused = one.number is None and one.answer is None and not one.waiting and not one.streaming
+                if same and unused and (one.map_id, one.map_created_at) == (map_.record.id, _creation_time(map_)):
+                    return one
+        return None
 
     def find(self, map_: Map, session_id: str) -> Session:
         """A session of a map that has not ended.
@@ -397,6 +422,12 @@ def alive_rows(map_: Map) -> NDArray[np.bool_]:
 
 def _creation_time(map_: Map) -> str:
     return map_.record.created_at.isoformat()
+
+
+def _asking() -> tuple[str, str | None, str | None] | None:
+    """Who asks now, and the id of the request; None if nothing tells one request from another."""
+    asker = ASKER.get()
+    return None if asker.request_id is None else (asker.principal, asker.key, asker.request_id)
 
 
 def _stored(session: Session) -> StoredSession:

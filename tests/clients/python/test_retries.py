@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
 import pytest
 
-from placerec_client import Client, ConnectionFailed, DeadlineExceeded, Problem, Retry, UnexpectedAnswer, problems
+from placerec_client import (
+    Client,
+    ConnectionFailed,
+    DeadlineExceeded,
+    PlacerecError,
+    Problem,
+    Retry,
+    UnexpectedAnswer,
+    problems,
+)
 from placerec_client.answers import problem_of
 from placerec_client.requests import path_of
 from tests.clients.python.fault_proxy import Fault, FaultProxy
@@ -182,6 +193,87 @@ def test_the_problem_of_the_service_is_a_deadline_too() -> None:
     assert isinstance(exceeded.value, problems.DeadlineExceededByService)
 
 
+def test_an_answer_in_many_pieces_keeps_to_the_deadline_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(1) as pool:
+        given = pool.submit(trickle, listening, 100, 0.1)
+        with Client(f"http://127.0.0.1:{listening.getsockname()[1]}") as client, pytest.raises(DeadlineExceeded):
+            client.maps["lab"].query(b"frame", deadline=0.5)
+        assert given.result() < 100, "the client has waited for the whole answer"
+
+
+def trickle(listening: socket.socket, pieces: int, pause: float) -> int:
+    """Answer one request by so many pieces; how many could be sent before the client hung up."""
+    connection, _ = listening.accept()
+    with connection:
+        connection.recv(65536)
+        connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % pieces)
+        for sent in range(pieces):
+            try:
+                connection.sendall(b" ")
+            except OSError:
+                return sent
+            time.sleep(pause)
+    return pieces
+
+
+# Keys and proxies
+
+
+@pytest.mark.parametrize("key", ["placerec_secret\n", "placerec_sécret", ""])
+def test_a_key_that_no_header_can_hold_is_refused_and_not_shown(key: str) -> None:
+    with pytest.raises(PlacerecError, match="characters that no key has") as refused:
+        Client("http://robot", key=key)
+    assert "placerec_s" not in str(refused.value)
+
+
+@pytest.mark.parametrize("variable", ["http_proxy", "ALL_PROXY"])
+@pytest.mark.parametrize("scheme", ["", "http://"])
+def test_the_proxy_of_the_environment_is_used(variable: str, scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening, ThreadPoolExecutor(1) as pool:
+        monkeypatch.setenv(variable, f"{scheme}127.0.0.1:{listening.getsockname()[1]}")
+        asked = pool.submit(refuse, listening)
+        with Client("http://robot.invalid", retry=Retry(0)) as client, pytest.raises(UnexpectedAnswer, match="418"):
+            client.liveness()
+        assert asked.result().startswith(b"GET http://robot.invalid/livez ")
+    monkeypatch.setenv("no_proxy", "robot.invalid")
+    with Client("http://robot.invalid", retry=Retry(0)) as client, pytest.raises(ConnectionFailed):
+        client.liveness()
+
+
+def refuse(listening: socket.socket) -> bytes:
+    """Refuse one request; its head."""
+    connection, _ = listening.accept()
+    with connection:
+        head = connection.recv(65536)
+        connection.sendall(b"HTTP/1.1 418 I'm a teapot\r\nContent-Length: 0\r\nConnection: close\r\n\r\n")
+        return head
+
+
+def test_a_proxy_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", "gopher://127.0.0.1:70")
+    with pytest.raises(ConnectionFailed, match="a proxy that is none"):
+        Client("http://robot.invalid")
+
+
+# Streams of events
+
+
+def test_a_stream_is_taken_up_again_behind_a_proxy_whose_service_restarts() -> None:
+    handle, asked = in_turn(
+        httpx.Response(502, content=b"a proxy"),
+        problem(429, "rate-exceeded", **{"Retry-After": "0"}),
+        httpx.Response(200, content=b"id: 1\nevent: map\ndata: {}\n\n"),
+        problem(404, "unknown-map"),
+    )
+    transport = httpx.MockTransport(handle)
+    with Client("http://robot", retry=Retry(10, first_pause=0.01), transport=transport) as client:
+        events = client.maps["lab"].events()
+        assert next(events).kind == "map"
+        with pytest.raises(problems.UnknownMap):
+            next(events)
+    assert len(asked) == 4
+
+
 # Answers that are lost
 
 
@@ -227,3 +319,14 @@ def test_a_job_whose_answer_was_lost_is_not_done_twice(server: Server) -> None:
         found = list(client.jobs.list(map="job-once", kind="rebuild"))
         assert sorted(one.state for one in found) in (["cancelled", "succeeded"], ["succeeded", "succeeded"])
         assert job.id == found[-1].id
+
+
+def test_a_session_whose_answer_was_lost_is_not_begun_twice(server: Server) -> None:
+    server.create_map("session-once")
+    with through(server, "POST /v1/maps/session-once/sessions ", "lose-answer") as way, Client(way.url) as client:
+        lab = client.maps["session-once"]
+        with lab.sessions.begin(filter="path") as session:
+            assert [one.id for one in lab.sessions] == [session.id]
+            with lab.sessions.begin(filter="path") as other:
+                assert other.id != session.id, "it is another request"
+        assert way.happened["lose-answer"] == 1

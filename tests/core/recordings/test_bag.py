@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -155,6 +156,46 @@ def test_a_bag_that_is_cut_short_gives_what_it_holds(writer: str, tmp_path: Path
         assert data == [jpeg(index) for index in range(len(data))]
         assert frames[-1].id.endswith(f"{1_700_000_000 + len(data) - 1}.000000000")
         assert "cut short" in remarks[0] and "what could be read of it is taken" in remarks[0], remarks
+
+
+@pytest.mark.parametrize(("column", "value"), [("data", None), ("data", 7), ("timestamp", "soon"), ("timestamp", None)])
+def test_a_row_with_something_else_in_it_spoils_no_other(column: str, value: object, tmp_path: Path) -> None:
+    bag = write_rosbag2(tmp_path / "walk", walk(3))
+    database = sqlite3.connect(next(bag.glob("*.db3")))
+    last = "SELECT max(messages.id) FROM messages JOIN topics ON topic_id = topics.id WHERE name = ?"
+    with database:
+        database.execute("CREATE TABLE loose AS SELECT * FROM messages")  # without the types of the columns
+        database.execute(f"UPDATE loose SET {column} = ? WHERE id = ({last})", (value, CAMERA))
+        database.execute("DROP TABLE messages")
+        database.execute("ALTER TABLE loose RENAME TO messages")
+    database.close()
+    with open_recording(bag) as recording:
+        frames = recording.frames
+        good = [frame for frame in frames if frame.nanoseconds and frame.nanoseconds >= START]
+        assert len(frames) == 3 and [frame.load() for frame in good[:2]] == [jpeg(0), jpeg(1)]
+        if column == "data":
+            with pytest.raises(InvalidRecording, match="A message is damaged"):
+                next(frame for frame in frames if frame not in good[:2]).load()
+
+
+def test_a_time_that_no_clock_tells_spoils_no_other(tmp_path: Path) -> None:
+    said = [compressed(0, jpeg(0), received=2**64 - 1), compressed(START, jpeg(1))]
+    with open_recording(write_mcap(tmp_path / "walk.mcap", said)) as recording:
+        assert [frame.load() for frame in recording.frames] == [jpeg(1), jpeg(0)]
+
+
+def test_no_more_is_unpacked_than_a_chunk_may_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("ros1_storage", "mcap_storage", "sqlite_storage"):
+        monkeypatch.setattr(f"core.recordings.{module}.MOST_UNPACKED", 20_000)
+    said = [compressed(START + index * SECOND, bytes(15_000)) for index in range(4)]
+    for writer in ("ros1-bz2", "ros1-lz4", "mcap-zstd", "mcap-lz4"):
+        (tmp_path / writer).mkdir()
+        with open_recording(WRITERS[writer](tmp_path / writer, said)) as recording:
+            assert len(recording.frames) < 2, writer
+            assert "chunk" in recording.remarks[0], writer
+    large = write_rosbag2(tmp_path / "large", [compressed(START, bytes(30_000))], packed="message")
+    with pytest.raises(InvalidRecording, match="too large"):
+        open_recording(large)
 
 
 def test_a_recorder_that_was_killed_leaves_a_database_without_metadata(tmp_path: Path) -> None:

@@ -48,6 +48,14 @@ def test_frames_come_in_order_with_the_times_of_the_container(name: str, tmp_pat
         assert recording.frames[7].load() == recording.frames[7].load()
 
 
+def test_a_long_name_leaves_room_for_the_numbers_of_the_frames(tmp_path: Path) -> None:
+    write_video(tmp_path / "walk.avi", frames=3)
+    path = (tmp_path / "walk.avi").rename(tmp_path / f"{'a' * 200}.avi")
+    with open_recording(path) as recording:
+        ids = [frame.id for frame in recording.frames]
+    assert len(set(ids)) == 3 and max(map(len, ids)) <= 128 and ids[2].endswith("a-000002")
+
+
 def test_a_rotated_video_is_turned_upright(tmp_path: Path) -> None:
     path = tmp_path / "walk.mp4"
     shown = write_video(path, frames=3, pictures=1)

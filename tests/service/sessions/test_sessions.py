@@ -109,6 +109,24 @@ def test_a_frame_sent_again_counts_once(server: Server, traverse: str) -> None:
     assert send(server, traverse, unnumbered, again(1))["frames"] == 2, "under another id it is another frame"
 
 
+def test_the_request_that_begins_a_session_can_be_sent_again(server: Server, map_id: str) -> None:
+    server.enrol(map_id, "p1", jpeg(1), sequence="walk")
+
+    def begun(request_id: str | None, **options: object) -> str:
+        headers = {} if request_id is None else {"X-Request-Id": request_id}
+        response = server.client.post(f"/v1/maps/{map_id}/sessions", json=options, headers=headers)
+        assert response.status_code == 201, response.text
+        assert response.headers["location"].endswith(response.json()["id"])
+        return str(response.json()["id"])
+
+    first = begun("begin-7", lag=2)
+    assert begun("begin-7", lag=2) == first
+    others = [begun("begin-8", lag=2), begun("begin-7", lag=3), begun(None, lag=2), begun(None, lag=2)]
+    assert len({first, *others}) == 5, "another id, other options, no id"
+    send(server, map_id, first, again(1))
+    assert begun("begin-7", lag=2) not in {first, *others}, "a session with a frame is a robot's"
+
+
 def test_frames_go_in_one_at_a_time(server: Server, traverse: str) -> None:
     session = begin(server, traverse)
     with ThreadPoolExecutor(4) as pool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import uuid
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -37,6 +38,9 @@ PAGE = 500
 
 KNOWN_URLS = 1000
 
+KEY = re.compile(r"[!-~]+")
+"""The visible characters of ASCII, of which a header may be made."""
+
 
 class AsyncConnection:
     """The connection to a service, which all objects of one client share.
@@ -50,6 +54,7 @@ class AsyncConnection:
 
     Raises:
         ConnectionFailed: the URL is none of a service.
+        PlacerecError: the key has characters that none has, such as the end of the line after it in a file.
     """
 
     def __init__(
@@ -74,7 +79,9 @@ class AsyncConnection:
             (b"User-Agent", f"placerec-client/{VERSION}".encode()),
         ]
         if key is not None:
-            self.headers.append((b"Authorization", f"Bearer {key}".encode("ascii", "replace")))
+            if not KEY.fullmatch(key):  # httpx would show it in its error
+                raise PlacerecError("The key has characters that no key has, such as a space or the end of a line.")
+            self.headers.append((b"Authorization", f"Bearer {key}".encode()))
         self._urls: dict[str, httpx.URL] = {}
 
     def patient(self, retry: Retry) -> AsyncConnection:
@@ -173,6 +180,9 @@ class AsyncConnection:
         try:
             response = await self._transport.handle_async_request(request)
             response.request = request
+            if left is not None:
+                assert isinstance(response.stream, httpx.AsyncByteStream)
+                response.stream = AsyncTimely(response.stream, clock, times)
             try:
                 await response.aread()
             finally:
@@ -247,3 +257,28 @@ class AsyncConnection:
                 await response.aclose()
         except httpx.HTTPError as error:
             raise self._failure("cannot be reached", error) from error
+
+
+class AsyncTimely(httpx.AsyncByteStream):
+    """The body of an answer, which counts as lost when it is not complete at the deadline.
+
+    The time limits of httpx are for one piece at a time; an answer in many pieces could last for any time.
+    """
+
+    def __init__(self, stream: httpx.AsyncByteStream, clock: Clock, times: dict[str, float]) -> None:
+        self._stream, self._clock, self._times = stream, clock, times
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        self._times["read"] = max(self._left(), LEAST_SECONDS)  # httpx looks at it once, when the body begins
+        async for chunk in self._stream:
+            yield chunk
+            if self._left() <= 0:
+                raise httpx.ReadTimeout("The deadline is over.")
+
+    def _left(self) -> float:
+        left = self._clock.left()
+        return 0.0 if left is None else left
+
+    async def aclose(self) -> None:
+        """Close the answer."""
+        await self._stream.aclose()

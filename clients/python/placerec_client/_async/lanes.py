@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator
 from urllib.request import getproxies, proxy_bypass
 
 from placerec_client._http import httpx
+from placerec_client.errors import ConnectionFailed
 
 
 class AsyncLanes(httpx.AsyncBaseTransport):
@@ -24,7 +25,7 @@ class AsyncLanes(httpx.AsyncBaseTransport):
     def __init__(self, url: httpx.URL, idle: float) -> None:
         self._limits = httpx.Limits(max_connections=1, max_keepalive_connections=1, keepalive_expiry=idle)
         self._verify = httpx.create_ssl_context() if url.scheme == "https" else False
-        self._proxy = None if proxy_bypass(url.host) else getproxies().get(url.scheme)
+        self._proxy = _proxy(url)
         self._free: list[httpx.AsyncHTTPTransport] = []
         self._all: list[httpx.AsyncHTTPTransport] = []
 
@@ -75,3 +76,19 @@ class AsyncLent(httpx.AsyncByteStream):
                 await self._stream.aclose()
             finally:
                 self._free.append(self._lane)
+
+
+def _proxy(url: httpx.URL) -> httpx.Proxy | None:
+    """The proxy that the environment names for a service, by the rules of httpx; None for none.
+
+    Raises:
+        ConnectionFailed: what the environment names is no proxy.
+    """
+    named = getproxies()
+    found = named.get(url.scheme) or named.get("all")
+    if not found or proxy_bypass(url.host):
+        return None
+    try:
+        return httpx.Proxy(found if "://" in found else f"http://{found}")
+    except (ValueError, httpx.InvalidURL) as error:
+        raise ConnectionFailed(f"The environment names a proxy that is none: {error}.") from error

@@ -77,7 +77,7 @@ class AsyncSession:
         await self.end()
 
     async def begin(self) -> models.SessionView:
-        """Begin the session. If the answer to an attempt is lost, the session of that attempt ends by itself."""
+        """Begin the session. If the answer to an attempt is lost, the next one gets the session that it has begun."""
         view = await self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
         self.id = view.id
         self._numbering = AsyncNumbering(self._connection, self.path, 0)

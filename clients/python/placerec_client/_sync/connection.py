@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -38,6 +39,9 @@ PAGE = 500
 
 KNOWN_URLS = 1000
 
+KEY = re.compile(r"[!-~]+")
+"""The visible characters of ASCII, of which a header may be made."""
+
 
 class Connection:
     """The connection to a service, which all objects of one client share.
@@ -51,6 +55,7 @@ class Connection:
 
     Raises:
         ConnectionFailed: the URL is none of a service.
+        PlacerecError: the key has characters that none has, such as the end of the line after it in a file.
     """
 
     def __init__(
@@ -75,7 +80,9 @@ class Connection:
             (b"User-Agent", f"placerec-client/{VERSION}".encode()),
         ]
         if key is not None:
-            self.headers.append((b"Authorization", f"Bearer {key}".encode("ascii", "replace")))
+            if not KEY.fullmatch(key):  # httpx would show it in its error
+                raise PlacerecError("The key has characters that no key has, such as a space or the end of a line.")
+            self.headers.append((b"Authorization", f"Bearer {key}".encode()))
         self._urls: dict[str, httpx.URL] = {}
 
     def patient(self, retry: Retry) -> Connection:
@@ -174,6 +181,9 @@ class Connection:
         try:
             response = self._transport.handle_request(request)
             response.request = request
+            if left is not None:
+                assert isinstance(response.stream, httpx.SyncByteStream)
+                response.stream = Timely(response.stream, clock, times)
             try:
                 response.read()
             finally:
@@ -248,3 +258,28 @@ class Connection:
                 response.close()
         except httpx.HTTPError as error:
             raise self._failure("cannot be reached", error) from error
+
+
+class Timely(httpx.SyncByteStream):
+    """The body of an answer, which counts as lost when it is not complete at the deadline.
+
+    The time limits of httpx are for one piece at a time; an answer in many pieces could last for any time.
+    """
+
+    def __init__(self, stream: httpx.SyncByteStream, clock: Clock, times: dict[str, float]) -> None:
+        self._stream, self._clock, self._times = stream, clock, times
+
+    def __iter__(self) -> Iterator[bytes]:
+        self._times["read"] = max(self._left(), LEAST_SECONDS)  # httpx looks at it once, when the body begins
+        for chunk in self._stream:
+            yield chunk
+            if self._left() <= 0:
+                raise httpx.ReadTimeout("The deadline is over.")
+
+    def _left(self) -> float:
+        left = self._clock.left()
+        return 0.0 if left is None else left
+
+    def close(self) -> None:
+        """Close the answer."""
+        self._stream.close()

@@ -76,7 +76,7 @@ class Session:
         self.end()
 
     def begin(self) -> models.SessionView:
-        """Begin the session. If the answer to an attempt is lost, the session of that attempt ends by itself."""
+        """Begin the session. If the answer to an attempt is lost, the next one gets the session that it has begun."""
         view = self._connection.ask(models.SessionView, "POST", self._sessions, json=self._options)
         self.id = view.id
         self._numbering = Numbering(self._connection, self.path, 0)
