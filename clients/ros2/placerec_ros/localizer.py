@@ -97,7 +97,7 @@ class Localizer:
         self._run_generation = 0
         self._sent: Frame | None = None
         self._correction: Planar | None = None
-        self._mapping = False
+        self._mapping = self._unanswered = False
         self._paused_until = self._heard = self._pictured = 0.0
         self._pause = FIRST_PAUSE
         began = datetime.now(UTC)
@@ -265,7 +265,13 @@ class Localizer:
             return
         run = self._running()
         began = time.monotonic()
-        answer = run.send(picture, frame.number, frame.stamp, self._moved(frame))
+        try:
+            answer = run.send(picture, frame.number, frame.stamp, self._moved(frame))
+        except PlacerecError as error:
+            if not isinstance(reason_of(error), Problem):  # a frame that was refused is not counted
+                self._unanswered = True
+            raise
+        self._unanswered = False
         took = time.monotonic() - began
         self._heard_from_service()
         for kind in ("map", "load", "session"):
@@ -300,7 +306,11 @@ class Localizer:
         return self._run
 
     def _moved(self, frame: Frame) -> Increment | None:
-        if self._sent is None or not frame.stamp or not self._sent.stamp:
+        """The motion since the last frame of the session; None if it is not known which one that is.
+
+        A frame without an answer may have reached the session all the same: its motion must not be counted twice.
+        """
+        if self._unanswered or self._sent is None or not frame.stamp or not self._sent.stamp:
             return None
         before, after = self.odometer.at(self._sent.stamp), self.odometer.at(frame.stamp)
         if before is None or after is None:
@@ -358,6 +368,7 @@ class Localizer:
     def _end_run(self) -> None:
         """End the session, if the service lets us; it ends by itself otherwise."""
         run, self._run, self._sent, self._correction = self._run, None, None, None
+        self._unanswered = False
         if run is not None:
             with suppress(PlacerecError):
                 run.end()

@@ -194,6 +194,20 @@ export function Copy({ text, label = "Copy" }) {
   return html`<button type="button" class="small" onClick=${copy} aria-live="polite">${done ? "Copied" : label}</button>`;
 }
 
+// Pages of a list
+
+/** The way to the pages before and after: `cursors` are those of the pages up to this one, `next` that of the one after. */
+export function Pager({ cursors, next, show, back = "Newer", on = "Older" }) {
+  if (cursors.length === 1 && !next) return null;
+  return html`
+    <nav class="pager" aria-label="Pages">
+      <button type="button" disabled=${cursors.length === 1} onClick=${() => show(cursors.slice(0, -1))}>← ${back}</button>
+      <span class="faint">page ${cursors.length}</span>
+      <button type="button" disabled=${!next} onClick=${() => show([...cursors, next])}>${on} →</button>
+    </nav>
+  `;
+}
+
 // Messages that go by themselves
 
 export const messages = signal([]);

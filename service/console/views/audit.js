@@ -1,6 +1,6 @@
 // Who changed what: the audit trail, the newest first.
 import { get } from "../shared/api.js";
-import { Dialog, Field, Head, Moment, Nothing } from "../shared/elements.js";
+import { Dialog, Field, Head, Moment, Nothing, Pager } from "../shared/elements.js";
 import { Result } from "../shared/result.js";
 import { Shown, useResource } from "../shared/resource.js";
 import { href, restate } from "../shared/router.js";
@@ -31,12 +31,7 @@ export default function Audit({ query }) {
     <${Shown} resource=${lines}>
       ${({ items, next }) => html`
         ${items.length === 0 ? html`<${Nothing} title="No lines" />` : html`<${Table} items=${items} open=${setOpen} />`}
-        ${(cursors.length > 1 || next) && html`
-          <nav class="pager" aria-label="Pages">
-            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Newer</button>
-            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Older →</button>
-          </nav>
-        `}
+        <${Pager} cursors=${cursors} next=${next} show=${setCursors} />
       `}
     <//>
     ${open && html`<${Dialog} title=${open.operation || open.event} close=${() => setOpen(null)} wide><${Result} value=${open} /><//>`}

@@ -1,6 +1,6 @@
 // Long work: what runs, what waits, what ended and with which result; running work can be cancelled.
 import { caller, get, may } from "../shared/api.js";
-import { Dialog, Field, Head, Moment, Nothing, Progress, Trouble } from "../shared/elements.js";
+import { Dialog, Field, Head, Moment, Nothing, Pager, Progress, Trouble } from "../shared/elements.js";
 import { duration, integer } from "../shared/formats.js";
 import { CancelJob, hasEnded, JobState, useJob } from "../shared/jobs.js";
 import { Result } from "../shared/result.js";
@@ -32,12 +32,7 @@ export default function Jobs({ query }) {
         ${items.length === 0
           ? html`<${Nothing} title="No jobs">${caller.value.maps ? "Jobs of other maps are not shown to this key." : "Calibrating, verifying, pruning, merging and importing in the background are jobs."}<//>`
           : html`<${Table} items=${items} open=${setOpen} changed=${jobs.reload} />`}
-        ${(cursors.length > 1 || next) && html`
-          <nav class="pager" aria-label="Pages">
-            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Newer</button>
-            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Older →</button>
-          </nav>
-        `}
+        <${Pager} cursors=${cursors} next=${next} show=${setCursors} />
       `}
     <//>
     ${open && html`<${Details} key=${open.id} job=${open} close=${() => setOpen(null)} />`}

@@ -1,6 +1,6 @@
 // The places of a map as thumbnails, page by page and filtered; one place, where the address names it.
 import { get, may, post } from "../shared/api.js";
-import { ByName, complain, Field, Head, Moment, Nothing, Pill } from "../shared/elements.js";
+import { ByName, complain, Field, Head, Moment, Nothing, Pager, Pill } from "../shared/elements.js";
 import { counted, integer, poseText } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Thumbnail } from "../shared/pictures.js";
@@ -58,13 +58,7 @@ function List({ map, query }) {
         <ul class="thumbs" aria-label="Places">
           ${items.map((place) => html`<${Tile} key=${place.id} map=${map} place=${place} chosen=${chosen.has(place.id)} toggle=${toggle} />`)}
         </ul>
-        ${(cursors.length > 1 || next) && html`
-          <nav class="pager" aria-label="Pages">
-            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Before</button>
-            <span class="faint">page ${cursors.length}</span>
-            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Next →</button>
-          </nav>
-        `}
+        <${Pager} cursors=${cursors} next=${next} show=${setCursors} back="Before" on="Next" />
       `}
     <//>
     ${dialog}

@@ -1,6 +1,6 @@
 // Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
 import { get, getTagged, may, patch, post, save } from "../shared/api.js";
-import { complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Verdict } from "../shared/elements.js";
+import { complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
 import { bytes, counted, decimal, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
@@ -77,12 +77,7 @@ function Frames({ map, labelled, keeps }) {
               ${current && html`<${Labelling} key=${current.id} map=${map} frame=${current} label=${label} discard=${discard} />`}
             </div>
           `}
-        ${(cursors.length > 1 || next) && html`
-          <nav class="pager" aria-label="Pages">
-            <button type="button" disabled=${cursors.length === 1} onClick=${() => setCursors(cursors.slice(0, -1))}>← Newer</button>
-            <button type="button" disabled=${!next} onClick=${() => setCursors([...cursors, next])}>Older →</button>
-          </nav>
-        `}
+        <${Pager} cursors=${cursors} next=${next} show=${setCursors} />
       `}
     <//>
   `;

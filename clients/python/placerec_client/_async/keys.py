@@ -8,6 +8,7 @@ from typing import Literal, Unpack
 from placerec_client import models, parameters
 from placerec_client._async.connection import AsyncConnection
 from placerec_client.requests import quoted
+from placerec_client.retry import Retry
 
 
 class AsyncKeys:
@@ -35,6 +36,8 @@ class AsyncKeys:
     ) -> models.CreatedKey:
         """Create a key; its secret is in this answer only.
 
+        It is sent once: if the answer is lost, the key may be there all the same, and should be revoked.
+
         Args:
             name: whose key it is.
             role: what it may do.
@@ -42,9 +45,8 @@ class AsyncKeys:
             options: such as ``maps`` and ``expires_at``.
         """
         body = {"name": name, "role": role, **options}
-        return await self._connection.ask(
-            models.CreatedKey, "POST", self._path, params={"lock_out": lock_out}, json=body
-        )
+        once = self._connection.patient(Retry(0))
+        return await once.ask(models.CreatedKey, "POST", self._path, params={"lock_out": lock_out}, json=body)
 
     async def read(self, key_id: str) -> models.KeyView:
         """Return one key."""

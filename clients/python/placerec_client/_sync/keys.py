@@ -9,6 +9,7 @@ from typing import Literal, Unpack
 from placerec_client import models, parameters
 from placerec_client._sync.connection import Connection
 from placerec_client.requests import quoted
+from placerec_client.retry import Retry
 
 
 class Keys:
@@ -36,6 +37,8 @@ class Keys:
     ) -> models.CreatedKey:
         """Create a key; its secret is in this answer only.
 
+        It is sent once: if the answer is lost, the key may be there all the same, and should be revoked.
+
         Args:
             name: whose key it is.
             role: what it may do.
@@ -43,7 +46,8 @@ class Keys:
             options: such as ``maps`` and ``expires_at``.
         """
         body = {"name": name, "role": role, **options}
-        return self._connection.ask(models.CreatedKey, "POST", self._path, params={"lock_out": lock_out}, json=body)
+        once = self._connection.patient(Retry(0))
+        return once.ask(models.CreatedKey, "POST", self._path, params={"lock_out": lock_out}, json=body)
 
     def read(self, key_id: str) -> models.KeyView:
         """Return one key."""
