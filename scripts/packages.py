@@ -1,12 +1,14 @@
 """Install the packages of a lock file into the environment of the Python that runs this.
 
     .venv/bin/python scripts/packages.py service|development
+    .venv-ros/bin/python scripts/packages.py ros        # without torch
     .venv/bin/python scripts/packages.py --settings     # prints uv's variables for pip's configuration
 
 uv does it in seconds; requirements/installer.lock pins it.  Where uv cannot be had, or fails, pip does it.  Both look
-where pip is configured to look.  TORCH_BACKEND names the build of torch: ``cpu`` (the default), ``auto`` (CUDA if this
-machine has a driver for it), or any other that ``uv pip install --torch-backend`` knows.  uv looks for it in PyTorch's
-own indexes; where these cannot be reached, torch is the build that pip's indexes have.
+where pip is configured to look.  All profiles but ``ros`` have torch.  TORCH_BACKEND names the build of torch: ``cpu``
+(the default), ``auto`` (CUDA if this machine has a driver for it), or any other that ``uv pip install
+--torch-backend`` knows.  uv looks for it in PyTorch's own indexes; where these cannot be reached, torch is the build
+that pip's indexes have.
 """
 
 from __future__ import annotations
@@ -71,8 +73,8 @@ class UnknownBackend(Exception):
     """TORCH_BACKEND names no build of torch."""
 
 
-def install_by_uv(lock: Path, folder: Path) -> None:
-    """Install torch and the lock's packages by a uv that is put into ``folder``.
+def install_by_uv(lock: Path, folder: Path, torch: bool) -> None:
+    """Install the lock's packages, and torch, by a uv that is put into ``folder``.
 
     Raises:
         UnknownBackend: uv knows no such build of torch.
@@ -83,14 +85,17 @@ def install_by_uv(lock: Path, folder: Path) -> None:
     listing = pip_settings()
     environment = {**uv_settings(listing), **os.environ}
     indexes = ("--no-index",) if without_index(listing) else ()
-    torch = ("--requirement", REQUIREMENTS / "torch.lock")
+    of_torch = ("--requirement", REQUIREMENTS / "torch.lock")
     backend: tuple[str, ...] = ("--torch-backend", os.environ.get("TORCH_BACKEND", "cpu"))
 
     def uv(*arguments: str | Path, quiet: bool = False) -> subprocess.CompletedProcess[bytes]:
         command = [folder / "bin" / "uv", "pip", "install", "--quiet", *indexes, "--python", sys.executable, *arguments]
         return subprocess.run(command, env=environment, check=not quiet, capture_output=quiet)
 
-    first = uv("--no-deps", *backend, *torch, quiet=True)
+    if not torch:
+        uv("--require-hashes", "--requirement", lock)
+        return
+    first = uv("--no-deps", *backend, *of_torch, quiet=True)
     if first.returncode:
         why = first.stderr.decode(errors="replace").strip()
         if "invalid value" in why:
@@ -101,20 +106,21 @@ def install_by_uv(lock: Path, folder: Path) -> None:
             file=sys.stderr,
         )
         backend = ()
-        uv("--no-deps", *torch)
+        uv("--no-deps", *of_torch)
     uv("--require-hashes", "--requirement", lock)
-    uv(*backend, *torch)  # the libraries that a CUDA build asks for; the CPU build's are in the lock
+    uv(*backend, *of_torch)  # the libraries that a CUDA build asks for; the CPU build's are in the lock
 
 
-def install_by_pip(lock: Path) -> None:
-    """Install torch and the lock's packages by pip, torch from wherever it finds it.
+def install_by_pip(lock: Path, torch: bool) -> None:
+    """Install the lock's packages, and torch, by pip, torch from wherever it finds it.
 
     Raises:
         subprocess.CalledProcessError: it fails.
     """
-    torch = ("--requirement", REQUIREMENTS / "torch.lock")
+    packages, of_torch = ("--require-hashes", "--requirement", lock), ("--requirement", REQUIREMENTS / "torch.lock")
     # torch first and by its exact pin, so that nothing else can bring in another build.
-    for arguments in (("--no-deps", *torch), ("--require-hashes", "--requirement", lock), torch):
+    steps = (("--no-deps", *of_torch), packages, of_torch) if torch else (packages,)
+    for arguments in steps:
         subprocess.run([*PIP, *arguments], check=True)
 
 
@@ -123,14 +129,14 @@ def main(profile: str) -> int:
     if profile == "--settings":
         print("\n".join(f"{name}={value}" for name, value in uv_settings(pip_settings()).items()))
         return 0
-    lock = REQUIREMENTS / f"{profile}.lock"
+    lock, torch = REQUIREMENTS / f"{profile}.lock", profile != "ros"
     try:
         try:
             with tempfile.TemporaryDirectory() as folder:
-                install_by_uv(lock, Path(folder))
+                install_by_uv(lock, Path(folder), torch)
         except (subprocess.CalledProcessError, OSError):
             print("uv could not install the packages; pip does it, which takes minutes.", file=sys.stderr)
-            install_by_pip(lock)
+            install_by_pip(lock, torch)
     except UnknownBackend as error:
         print(f"TORCH_BACKEND names no build of torch. {error}", file=sys.stderr)
         return 1

@@ -9,13 +9,15 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 CLIENT = ROOT / "clients" / "python"
 OF_CLIENT = "clients/python/placerec_client"
-FOLDERS = ("core", "service", "training", "benchmarks", OF_CLIENT, "examples", "scripts", "tests")
+NODE = ROOT / "clients" / "ros2"
+OF_NODE = "clients/ros2/placerec_ros"
+FOLDERS = ("core", "service", "training", "benchmarks", OF_CLIENT, OF_NODE, "examples", "scripts", "tests")
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
 def module_of(path: Path) -> str:
     """The dotted name of a file's module (a package's for its ``__init__.py``)."""
-    root = CLIENT if path.is_relative_to(CLIENT) else ROOT
+    root = next((one for one in (CLIENT, NODE) if path.is_relative_to(one)), ROOT)
     return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
 
 

@@ -46,6 +46,14 @@ def test_torch_is_pinned_exactly_and_alone() -> None:
         assert [entry for entry in locked(name) if re.match(r"torch$|triton|nvidia-|cuda-", entry)] == []
 
 
+def test_the_packages_of_ros_are_locked_within_their_ranges() -> None:
+    entries = locked("ros")
+    for package, requirement in declared(PROJECT["dependency-groups"]["ros"]).items():
+        assert requirement.specifier.contains(version(entries[package])), package
+    for package, requirement in declared(CLIENT["dependencies"]).items():
+        assert requirement.specifier.contains(version(entries[package])), package
+
+
 @pytest.mark.parametrize(("name", "extras"), [("service", []), ("development", ["dev", "report"])])
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:
     texts = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"]

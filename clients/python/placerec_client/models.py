@@ -983,9 +983,7 @@ class MapMatch(Model):
 class ReviewSetting(Model):
     """Which frames a map keeps so that people can say later what they show, and how many at most."""
 
-    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]] = Field(
-        default_factory=lambda: ["ambiguous", "unknown"]
-    )
+    verdicts: list[Known[Literal["recognized", "ambiguous", "unknown"]]] = Field(default=["ambiguous", "unknown"])
     most_frames: int = 500
     most_bytes: int = 268435456
 

@@ -154,7 +154,7 @@ def model_field(name: str, schema: Mapping[str, Any], required: bool) -> str:
     nullable = "None" in kind.split(" | ")
     default = schema.get("default")
     if isinstance(default, list) and default:
-        return f"    {name}: {kind} = Field(default_factory=lambda: {default!r})"
+        return f"    {name}: {kind} = Field(default={default!r})"
     if default not in (None, []) and not isinstance(default, dict):
         return f"    {name}: {kind} = {default!r}"
     if nullable or (not required and not kind.startswith("list")):

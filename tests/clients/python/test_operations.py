@@ -156,6 +156,7 @@ def tour(client: Client, folder: Path) -> None:
     assert client.draw_regions(jpeg(1)).startswith(b"\x89PNG")
     assert client.match(jpeg(1), scene(1)).score > 0.5 and client.draw_match(jpeg(1), jpeg(2)).startswith(b"\x89PNG")
     session(lab)
+    labelling(lab)
     assert lab.answers(limit=5).items and lab.places.matches("p3").items
     assert lab.calibration(threshold=0.5).map == "tour"
     report = lab.calibrate("frames", frames=calibration_frames(), labels=LABELS, target=TARGET, dry_run=True)

@@ -220,14 +220,11 @@ def test_labels_calibrate_the_map(reviewed: Server) -> None:
     assert alone["calibration"]["source"] == "labels" and not alone["stored"] and alone["warnings"]
     both = calibrate(beside="map").json()
     assert both["measurement"]["frames"] == 26 + 25
-    adjusted = calibrate().json()
-    assert adjusted["measurement"]["trials"] == 26, "each frame is asked once, of the map as it is"
-    before, after = adjusted["previous"], adjusted["calibration"]
-    assert after["margin"] == before["margin"] and after["curve"] != before["curve"]
-    job = calibrate(background=True, dry_run=False)
+    assert "no curve" in assert_problem(calibrate(), 422, "calibration-impossible")["detail"]
+    job = calibrate(beside="none", background=True, dry_run=False)
     assert job.status_code == 202
     done = finished(reviewed, job.json())
-    assert done["state"] == "succeeded" and done["result"]["calibration"] == after
+    assert done["state"] == "succeeded" and done["result"]["calibration"] == alone["calibration"]
     assert reviewed.client.get("/v1/maps/hall").json()["calibration"]["source"] == "labels"
     reviewed.client.delete("/v1/maps/hall/places/p3")
     assert calibrate(beside="none").json()["measurement"]["frames"] == 25, "a place that is gone is no truth"
@@ -271,3 +268,21 @@ def test_more_frames_than_can_be_written_are_dropped(tmp_path: Path, monkeypatch
     keeper.offer(map_, b"late", {"verdict": "unknown"})
     assert keeper.dropped == before + 1
     atlas.close()
+
+
+def test_ten_labels_move_the_encoders_curve(server: Server) -> None:
+    server.create_map("moved", same_place_radius=1.0, review={"verdicts": ["recognized", "ambiguous", "unknown"]})
+    for number in range(6):
+        assert server.enrol("moved", f"p{number}", jpeg(number), x=2 * number, y=0).is_success
+    shown = {}
+    for number in range(10):
+        frame = encoded(seen_again(scene(number))) if number < 6 else encoded(stranger(number))
+        shown[hashlib.sha256(frame).hexdigest()] = {"place": f"p{number}"} if number < 6 else {"stranger": True}
+        server.query("moved", frame)
+    for one in kept(server, "moved", 10):
+        label(server, "moved", one["id"], **shown[one["sha256"]])
+    report = server.client.post("/v1/maps/moved/calibrate", json={"method": "labels"}).json()
+    assert report["stored"] and report["measurement"]["trials"] == 10, "each frame is asked once, of the map as it is"
+    before, after = report["previous"], report["calibration"]
+    assert after["margin"] == before["margin"] and after["curve"] != before["curve"]
+    assert server.client.get("/v1/maps/moved").json()["calibration"]["source"] == "labels"

@@ -71,7 +71,6 @@ class AsyncConnection:
         self._transport = transport or AsyncLanes(parsed_url, IDLE_SECONDS)
         self.headers = [
             (b"Host", parsed_url.netloc),
-            (b"Accept", b"*/*"),
             (b"User-Agent", f"placerec-client/{VERSION}".encode()),
         ]
         if key is not None:

@@ -72,7 +72,6 @@ class Connection:
         self._transport = transport or Lanes(parsed_url, IDLE_SECONDS)
         self.headers = [
             (b"Host", parsed_url.netloc),
-            (b"Accept", b"*/*"),
             (b"User-Agent", f"placerec-client/{VERSION}".encode()),
         ]
         if key is not None:

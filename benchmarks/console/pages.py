@@ -1,6 +1,6 @@
 """The console's pages in a browser with a large map: first paint, the plan, panning, the comparison of two traverses.
 
-    python -m benchmarks.console_pages [--places 100000] [--frames 2000]
+    python -m benchmarks.console.pages [--places 100000] [--frames 2000]
 
 A server of its own holds a map of made-up descriptors for the plan, and one with the default encoder whose two
 traverses of ``--frames`` places are compared.  The browser is the system's Chromium, without a window and without a
@@ -21,7 +21,7 @@ import numpy as np
 import typer
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from benchmarks.console import fill
+from benchmarks.console.endpoints import fill
 from benchmarks.process import service
 from benchmarks.report import report, verdict
 from core.method.catalogue import EncoderCatalogue

@@ -1,6 +1,6 @@
 """What live events cost a query: with nobody listening, and with listeners, as the whole request sees it.
 
-    python -m benchmarks.events [--other ../other-checkout]
+    python -m benchmarks.clients.events [--other ../other-checkout]
 
 One client asks maps of the same places in turn, one request each, so that whatever disturbs one disturbs all: a map
 that nobody listens to, maps with one and with sixteen listeners, a map with a listener that wants pictures and, if one

@@ -1,6 +1,6 @@
 """Robots that use the Python client beside those of the load tool, which only count bytes; and the time of an import.
 
-    python -m benchmarks.client
+    python -m benchmarks.clients.python
 
 Sixteen clients in one asyncio process reach at least 0.95 times the answers a second of the load tool; importing the
 client takes less than 0.3 seconds.  Both kinds of robots send the same frames to the same service, turn by turn;
@@ -42,7 +42,7 @@ RUNS = 9
 def client_robots(url: str, frames: Path, robots: int, seconds: float, verify: str) -> dict[str, Any]:
     """The measurement of robots that use the client, in a process of their own."""
     words = {"url": url, "map": MAP, "frames": frames, "robots": robots, "seconds": seconds, "verify": verify}
-    command = [sys.executable, str(ROBOTS_PROGRAM), *(f"--{name}={value}" for name, value in words.items())]
+    command: list[str] = [sys.executable, str(ROBOTS_PROGRAM), *(f"--{name}={value}" for name, value in words.items())]
     found: dict[str, Any] = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)
     return found
 

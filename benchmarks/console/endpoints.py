@@ -1,6 +1,6 @@
 """What the console asks of a large map: its plan, pages of filtered places, forgetting many places.
 
-    python -m benchmarks.console [--places 100000] [--rounds 5]
+    python -m benchmarks.console.endpoints [--places 100000] [--rounds 5]
 
 A server of its own holds a map of made-up descriptors, with poses, times, three traverses and metadata.  ``plan`` is
 the first one after a write, ``again`` the next, ``304`` one that the caller has; all are taken as a browser takes them,

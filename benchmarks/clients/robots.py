@@ -1,6 +1,6 @@
 """Robots in one asyncio process that send frames by the client and drive on when they have the answer.
 
-    python benchmarks/client/robots.py --url http://127.0.0.1:8000 --map lab --frames DIR --robots 16
+    python benchmarks/clients/robots.py --url http://127.0.0.1:8000 --map lab --frames DIR --robots 16
 
 They do what those of ``service.commands.load`` do, but every answer is read and checked against its model.  Prints one
 JSON object.

@@ -1,1 +1,0 @@
-"""The Python client beside the load tool."""

@@ -1,0 +1,437 @@
+"""The thread that speaks with the service, so that the node's callbacks never wait for it.
+
+Frames come in by :meth:`Localizer.add`, answers go out by an :class:`Outlet`. What the node's services ask for is done
+by the same thread, between two frames.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+from placerec_client import Client, DeadlineExceeded, PlacerecError, Problem
+from placerec_ros.frame_queue import Frame, FrameQueue
+from placerec_ros.health import ERROR, OK, Health
+from placerec_ros.odometry import CLOCK_JUMP, NANOSECONDS, Increment, Odometer, increment
+from placerec_ros.parameters import Settings
+from placerec_ros.pictures import UnfitPicture, picture_of
+from placerec_ros.planar import Planar, map_to_odom
+from placerec_ros.pose import UNKNOWN_ANGLE, PoseEstimate, estimate, metric
+from placerec_ros.run import NOT_ALLOWED, SESSION_GONE, Run, client_of, moment_of
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.2, 5.0
+"""Seconds before the service is asked again after a trouble; they double."""
+IDLE_CHECK = 5.0
+"""Seconds without a frame after which the node asks whether the service is there."""
+CAMERA_WAIT = 2.0
+"""Seconds for which the first session waits for a CameraInfo."""
+FRESH = 1.0
+"""Seconds that an image may be old to be enrolled."""
+OF_THE_FRAME = frozenset({400, 413, 415, 422})
+
+
+@dataclass(frozen=True)
+class Answered:
+    """An answer with what follows from it.
+
+    report: what is published as JSON.
+    robot: the robot's pose in the map; None while it is not localized.
+    correction: the transform from the map to the odometry; None without odometry, or if the heading is not known.
+    """
+
+    frame: Frame
+    report: dict[str, Any]
+    estimate: PoseEstimate | None
+    robot: Planar | None
+    correction: Planar | None
+
+
+class Outlet(Protocol):
+    """Where results go; the worker's thread calls it."""
+
+    def answered(self, answered: Answered) -> None: ...
+
+    def wants_picture(self) -> bool: ...
+
+    def picture(self, frame: Frame, png: bytes) -> None: ...
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a service of the node answers."""
+
+    success: bool
+    message: str
+
+
+class Localizer:
+    """The worker; it lives from the node's configuration until its clean-up.
+
+    Args:
+        outlet: gets the answers while the localizer is active.
+    """
+
+    def __init__(self, settings: Settings, outlet: Outlet, health: Health) -> None:
+        self._settings, self._outlet, self._health = settings, outlet, health
+        self.queue = FrameQueue(settings.queue_length)
+        self.odometer = Odometer()
+        self._latest: Frame | None = None
+        self._intrinsics: dict[str, Any] | None = None
+        self._camera_due = 0.0
+        self._commands: deque[tuple[Callable[[], Done], Future[Done]]] = deque()
+        self._wake = threading.Event()
+        self._active = self._stopped = False
+        self._generation = 0
+        # What follows is the worker's own.
+        self._client: Client | None = None
+        self._run: Run | None = None
+        self._run_generation = 0
+        self._sent: Frame | None = None
+        self._correction: Planar | None = None
+        self._mapping = False
+        self._paused_until = self._heard = self._pictured = 0.0
+        self._pause = FIRST_PAUSE
+        began = datetime.now(UTC)
+        self._sequence = settings.sequence or f"ros-{began:%Y%m%dT%H%M%SZ}"
+        self._thread = threading.Thread(target=self._work, name="placerec", daemon=True)
+        self._thread.start()
+
+    # ---- for the node's callbacks; none of these waits
+
+    def add(self, frame: Frame) -> None:
+        """Take in a frame."""
+        self._latest = frame
+        self.queue.put(frame)
+        self._wake.set()
+
+    def camera(self, intrinsics: dict[str, Any] | None) -> None:
+        """Take in the camera's intrinsics; None if the message tells none."""
+        self._intrinsics = intrinsics
+        self._camera_due = 0.0
+
+    def activate(self) -> None:
+        """Begin a run with the next frame."""
+        self._generation += 1
+        self._camera_due = time.monotonic() + CAMERA_WAIT
+        self._active = True
+        self._wake.set()
+
+    def deactivate(self) -> None:
+        """End the run; answers that are under way are not published."""
+        self._active = False
+        self._generation += 1
+        self.queue.clear()
+        self._latest = None
+        self._wake.set()
+
+    def stop(self, patience: float) -> None:
+        """End the thread. If a request keeps it longer than so many seconds, it ends by itself after the request."""
+        self.deactivate()
+        self._stopped = True
+        self._wake.set()
+        self._thread.join(patience)
+
+    def create_map(self) -> Future[Done]:
+        """Create the map, bound to the encoder of the parameters."""
+        return self._ask(self._create_map)
+
+    def enrol_here(self) -> Future[Done]:
+        """Enrol the present frame with the pose that odometry gives."""
+        return self._ask(self._enrol_here)
+
+    def relocalize(self) -> Future[Done]:
+        """Forget the belief: begin a new session."""
+        return self._ask(self._relocalize)
+
+    def _ask(self, command: Callable[[], Done]) -> Future[Done]:
+        future: Future[Done] = Future()
+        self._commands.append((command, future))
+        self._wake.set()
+        return future
+
+    # ---- the worker
+
+    def _work(self) -> None:
+        try:
+            while not self._stopped:
+                self._wake.wait(self._rest())
+                self._wake.clear()
+                self._work_once()
+        finally:
+            self._end_run()
+            for _, future in self._commands:
+                future.set_result(Done(False, "The node was cleaned up before it came to this."))
+            if self._client is not None:
+                self._client.close()
+
+    def _rest(self) -> float:
+        """Seconds to sleep if nothing happens."""
+        if self._paused_until > (now := time.monotonic()):
+            return self._paused_until - now
+        return IDLE_CHECK
+
+    def _work_once(self) -> None:
+        """Do all there is to do."""
+        while not self._stopped:
+            if self._run is not None and self._run_generation != self._generation:
+                self._end_run()
+            if self._commands:
+                command, future = self._commands.popleft()
+                future.set_result(self._done(command))
+            elif time.monotonic() < self._paused_until:
+                return
+            elif self._active and (frame := self.queue.take(time.monotonic() - self._settings.deadline)) is not None:
+                self._guarded(lambda frame=frame: self._locate(frame))  # type: ignore[misc]
+            else:
+                if time.monotonic() - self._heard >= IDLE_CHECK:
+                    self._guarded(self._check_service)
+                return
+
+    def _open(self) -> Client:
+        if self._client is None:
+            self._client = client_of(self._settings)
+        return self._client
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        """Run a step; what goes wrong is told, and the next attempt waits."""
+        try:
+            step()
+        except UnfitPicture as error:
+            self._health.frame(f"{_sentence(str(error))}")
+        except PlacerecError as error:
+            self._heard = time.monotonic()  # the next check of an idle node comes later
+            reason = reason_of(error)
+            if isinstance(reason, Problem):
+                self._health.over("service")
+                self._told(reason)
+            else:
+                self._health.fact("service", str(reason))
+                self._health.begins("service", str(reason), ERROR)
+                self._rest_longer()
+        except Exception as error:  # the thread has to live on
+            self._run = None
+            self._health.begins("node", f"The node failed with {type(error).__name__}: {error}", ERROR)
+            self._rest_longer()
+        else:
+            self._health.over("node")
+
+    def _told(self, problem: Problem) -> None:
+        """Decide what a problem means for the frames to come."""
+        if problem.slug in SESSION_GONE:
+            self._run = None  # a new one begins with the next frame
+            self._health.begins("session", f"The session ended: {problem}", OK)
+        elif problem.status in OF_THE_FRAME and self._run is not None:
+            self._health.frame(f"The service refused an image: {problem}")
+        elif problem.status in (429, 503, 504):
+            self._health.begins("load", f"The service has no room for a frame: {problem} ({problem.slug})")
+            self._rest_longer(problem.retry_after or 0.0)
+        else:
+            self._run = None  # a setting, a key or the map has to change; then a run can begin
+            self._health.begins("map", f"The service refuses: {problem} ({problem.slug})", ERROR)
+            self._rest_longer()
+
+    def _rest_longer(self, least: float = 0.0) -> None:
+        self._paused_until = time.monotonic() + max(least, self._pause)
+        self._pause = min(2 * self._pause, LONGEST_PAUSE)
+
+    def _check_service(self) -> None:
+        self._open().liveness()
+        self._heard_from_service()
+
+    def _heard_from_service(self) -> None:
+        self._heard = time.monotonic()
+        self._pause, self._paused_until = FIRST_PAUSE, 0.0
+        self._health.fact("service", f"{self._settings.url}: reachable")
+        self._health.over("service")
+
+    # ---- frames
+
+    def _locate(self, frame: Frame) -> None:
+        if not self._in_order(frame):
+            return
+        generation = self._generation
+        picture = picture_of(frame.message)
+        if self._settings.use_camera_info and self._intrinsics is None and time.monotonic() < self._camera_due:
+            self._health.counts["frames before the first CameraInfo"] += 1
+            return
+        run = self._running()
+        began = time.monotonic()
+        answer = run.send(picture, frame.number, frame.stamp, self._moved(frame))
+        took = time.monotonic() - began
+        self._heard_from_service()
+        for kind in ("map", "load", "session"):
+            self._health.over(kind)
+        self._sent = frame
+        if generation != self._generation:
+            return  # deactivated meanwhile
+        answered = self._judged(frame, answer, run, took)
+        self._health.answered(took, None if answered.robot is None else str(moment_of(frame.stamp) or "no stamp"))
+        self._outlet.answered(answered)
+        self._annotate(frame, picture, run)
+
+    def _in_order(self, frame: Frame) -> bool:
+        """Whether the frame was taken after the last one; a clock that was set back begins a new run."""
+        if self._sent is None or not frame.stamp or not self._sent.stamp or frame.stamp >= self._sent.stamp:
+            return True
+        if frame.stamp < self._sent.stamp - CLOCK_JUMP * NANOSECONDS:
+            self._mapping = False
+            self._end_run()
+            return True
+        self._health.counts["frames out of order"] += 1
+        return False
+
+    def _running(self) -> Run:
+        """The present run; it begins if there is none, and anew when intrinsics come or change."""
+        known = self._intrinsics if self._settings.use_camera_info else None
+        if self._run is not None and known is not None and self._run.intrinsics != known:
+            self._end_run()
+        if self._run is None:
+            self._run_generation = self._generation
+            self._run = Run(self._open(), self._settings, self._health, known)
+        return self._run
+
+    def _moved(self, frame: Frame) -> Increment | None:
+        if self._sent is None or not frame.stamp or not self._sent.stamp:
+            return None
+        before, after = self.odometer.at(self._sent.stamp), self.odometer.at(frame.stamp)
+        if before is None or after is None:
+            return None
+        return increment(before, after, math.radians(self._settings.camera_yaw))
+
+    def _judged(self, frame: Frame, answer: Mapping[str, Any], run: Run, took: float) -> Answered:
+        found = estimate(answer, run.radius)
+        if found is None and answer["verdict"] == "recognized":
+            pose = answer["place"]["pose"] if answer["place"] else None
+            kind = "no pose" if not pose else "a pose in degrees; only one in metres is published"
+            if not metric(pose):
+                self._health.begins("pose", f"The robot is recognized, but the place has {kind}.")
+        elif found is not None:
+            self._health.over("pose")
+        robot = correction = None
+        if found is not None:
+            robot = found.planar.then(Planar(0.0, 0.0, -math.radians(self._settings.camera_yaw)))
+            in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
+            if in_odom is not None and found.covariance[35] < 0.99 * UNKNOWN_ANGLE:
+                correction = map_to_odom(robot, in_odom)
+                self._correction = correction
+        self._health.fact("verdict", answer["verdict"])
+        report = {
+            "stamp": frame.stamp / NANOSECONDS,
+            "frame_id": frame.message.header.frame_id,
+            "number": frame.number,
+            "map": self._settings.map,
+            "revision": answer["single"].get("revision"),
+            "verdict": answer["verdict"],
+            "probability": answer["probability"],
+            "place": None if answer["place"] is None else answer["place"]["id"],
+            "pose_source": None if found is None else found.source,
+            "request_milliseconds": round(1e3 * took, 3),
+            "answer": dict(answer),
+        }
+        return Answered(frame, report, found, robot, correction)
+
+    def _annotate(self, frame: Frame, picture: Any, run: Run) -> None:
+        """Send the frame again for a picture, if somebody looks on; the answer of the session is out already."""
+        now = time.monotonic()
+        if now - self._pictured < self._settings.picture_period or not self._outlet.wants_picture():
+            return
+        self._pictured = now
+        generation = self._generation
+        try:
+            png = run.picture(picture)
+        except PlacerecError as error:
+            self._health.begins("picture", f"There is no annotated picture: {reason_of(error)}")
+            return
+        self._health.over("picture")
+        if png is not None and generation == self._generation:
+            self._outlet.picture(frame, png)
+
+    def _end_run(self) -> None:
+        """End the session, if the service lets us; it ends by itself otherwise."""
+        run, self._run, self._sent, self._correction = self._run, None, None, None
+        if run is not None:
+            with suppress(PlacerecError):
+                run.end()
+
+    # ---- what the node's services ask for
+
+    def _done(self, command: Callable[[], Done]) -> Done:
+        try:
+            return command()
+        except UnfitPicture as error:
+            return Done(False, _sentence(str(error)))
+        except PlacerecError as error:
+            reason = reason_of(error)
+            if not isinstance(reason, Problem):
+                return Done(False, str(reason))
+            hint = " Give the node a key that may." if reason.slug in NOT_ALLOWED else ""
+            return Done(False, f"The service refuses: {reason}{hint} ({reason.slug})")
+        except Exception as error:  # the thread has to live on
+            return Done(False, f"The node failed with {type(error).__name__}: {error}")
+
+    def _create_map(self) -> Done:
+        fields: Any = {"encoder": self._settings.encoder} if self._settings.encoder else {}
+        made = self._open().maps.create(self._settings.map, **fields).view
+        assert made is not None
+        self._paused_until = 0.0
+        return Done(True, f"The map {made.id} was created, with the encoder {made.encoder}.")
+
+    def _relocalize(self) -> Done:
+        if not self._active:
+            return Done(False, "The node is not active.")
+        self._mapping = False
+        self._end_run()
+        self._paused_until = 0.0
+        run = self._running()
+        return Done(True, f"The session {run.id} began.")
+
+    def _enrol_here(self) -> Done:
+        frame = self._present()
+        if not self._active:
+            return Done(False, "The node is not active.")
+        if frame is None:
+            return Done(False, f"No image has come in the last {FRESH:g} s.")
+        in_odom = self.odometer.at(frame.stamp) if frame.stamp else None
+        if in_odom is None:
+            return Done(False, "There is no odometry for the moment of the image, so its pose is not known.")
+        run = self._running()
+        if self.odometer.frame == self._settings.map_frame:
+            robot = in_odom
+        elif self._mapping or run.places() == 0:
+            self._mapping, robot = True, in_odom  # the frame of the odometry is that of the new map
+        elif self._correction is not None:
+            robot = self._correction.then(in_odom)
+        else:
+            return Done(False, "The map has places and the robot is not localized in it: no pose can be given.")
+        heading = math.degrees(robot.yaw) + self._settings.camera_yaw
+        moment = moment_of(frame.stamp)
+        assert moment is not None
+        place = f"here-{moment:%Y%m%dT%H%M%S}-{moment.microsecond // 1000:03d}-{secrets.token_hex(2)}"
+        fields = {"x": robot.x, "y": robot.y, "heading": heading % 360, "sequence": self._sequence}
+        if robot.z:
+            fields["z"] = robot.z
+        run.enrol(place, picture_of(frame.message), frame.stamp, **fields)
+        return Done(True, f"{place} was enrolled at x {robot.x:.2f}, y {robot.y:.2f}, heading {heading % 360:.0f}°.")
+
+    def _present(self) -> Frame | None:
+        frame = self._latest
+        return frame if frame is not None and time.monotonic() - frame.arrived <= FRESH else None
+
+
+def reason_of(error: PlacerecError) -> PlacerecError:
+    """Why the last attempt failed, which a request with a deadline has behind the deadline."""
+    cause = error.__cause__
+    return cause if isinstance(error, DeadlineExceeded) and isinstance(cause, PlacerecError) else error
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")

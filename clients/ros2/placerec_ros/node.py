@@ -1,0 +1,392 @@
+"""The lifecycle node: topics, services and parameters of ROS around a :class:`~placerec_ros.localizer.Localizer`.
+
+Callbacks only hand things over; all that takes time is done by the localizer's thread. So the node answers its
+lifecycle services at any time, also while the service cannot be reached.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future as ThreadFuture
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from placerec_ros import messages
+from placerec_ros.frame_queue import Frame
+from placerec_ros.health import ERROR, WARN, Health
+from placerec_ros.intrinsics import UnfitCamera, intrinsics_of
+from placerec_ros.localizer import Answered, Done, Localizer
+from placerec_ros.odometry import stamp_of
+from placerec_ros.parameters import PARAMETERS, InvalidParameters, Parameter, Settings, settings
+
+IMAGE_TYPES = {
+    "compressed": ("sensor_msgs/msg/CompressedImage", CompressedImage),
+    "raw": ("sensor_msgs/msg/Image", Image),
+}
+TICK_SECONDS = 1.0
+SILENCE_SECONDS = 5.0
+"""Seconds without an image after which the node says so."""
+STOP_SECONDS = 1.0
+"""Seconds for which a clean-up waits for a request under way."""
+QUEUED = 5
+"""Messages of a sensor that wait in the middleware."""
+
+RCLError = rclpy_implementation.RCLError
+Success, Failure = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+def sensor_qos(depth: int) -> QoSProfile:
+    """Best effort, the last few: a sensor's message that was lost is not asked for again."""
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+class PlacerecNode(LifecycleNode):
+    """The node. Its topics are relative, so that a launch file can remap them; see ``docs/how-to/ros2.md``."""
+
+    def __init__(self, name: str = "placerec", **options: Any) -> None:
+        super().__init__(name, **options)
+        for parameter in PARAMETERS:
+            self.declare_parameter(parameter.name, parameter.default, descriptor(parameter))
+        self._health = Health(self._log)
+        self._settings: Settings | None = None
+        self._localizer: Localizer | None = None
+        self._outlet_lock = threading.Lock()
+        self._publishing = False
+        self._subscriptions_made: list[Any] = []
+        self._image_subscription: Any = None
+        self._topics: list[Any] = []
+        self._broadcaster: Any = None
+        self._frames = 0
+        self._heard = {"image": 0.0, "info": 0.0}
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._waiting = ReentrantCallbackGroup()  # while one of these waits, all other callbacks go on
+        self._ask_for("create_map", lambda localizer: localizer.create_map())
+        self._ask_for("enrol_here", lambda localizer: localizer.enrol_here())
+        self._ask_for("relocalize", lambda localizer: localizer.relocalize())
+        self.create_timer(TICK_SECONDS, self._tick)
+
+    # ---- transitions
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Check the parameters, and make the publishers and the thread that speaks with the service."""
+        self._health = Health(self._log)
+        try:
+            chosen = settings({one.name: self.get_parameter(one.name).value for one in PARAMETERS})
+        except InvalidParameters as error:
+            self._health.begins("parameters", str(error), ERROR)
+            return Failure
+        self._settings = chosen
+        if chosen.key and chosen.url.startswith("http:") and not _is_local(chosen.url):
+            self._health.begins("key", "The key goes to another machine without TLS; others can read it.")
+        self._health.fact("service", chosen.url)
+        self._pose = self.create_lifecycle_publisher(PoseWithCovarianceStamped, "~/pose", 10)
+        self._transform = self.create_lifecycle_publisher(TransformStamped, "~/map_to_odom", 10)
+        self._answer = self.create_lifecycle_publisher(String, "~/answer", 10)
+        self._picture = self.create_lifecycle_publisher(CompressedImage, "~/annotated/compressed", 1)
+        self._topics = [self._pose, self._transform, self._answer, self._picture]
+        self._broadcaster = _broadcaster(self) if chosen.publish_tf else None
+        self._health.fact("tf", "sent" if self._broadcaster else "not sent")
+        self._localizer = Localizer(chosen, self, self._health)
+        self._health.state = "inactive"
+        return Success
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe, and begin a run."""
+        result = super().on_activate(state)
+        localizer, chosen = self._made()
+        self._heard = {"image": time.monotonic(), "info": 0.0}
+        if chosen.use_camera_info:
+            self._subscribe(CameraInfo, "camera_info", self._on_camera_info, sensor_qos(1))
+        self._subscribe(Odometry, "odom", self._on_odometry, sensor_qos(50))
+        self._look_for_images()
+        with self._outlet_lock:
+            self._publishing = True
+        localizer.activate()
+        self._health.state = "active"
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End the run and the subscriptions; nothing is published afterwards."""
+        self._fall_silent()
+        self._health.state = "inactive"
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give everything back that the configuration took."""
+        self._release()
+        self._health = Health(self._log)
+        return Success
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give everything back, from any state."""
+        self._release()
+        self._health.state = "finalized"
+        return Success
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Give everything back, so that the node can be configured again."""
+        self._release()
+        self._health = Health(self._log)
+        return Success
+
+    def _made(self) -> tuple[Localizer, Settings]:
+        assert self._localizer is not None and self._settings is not None
+        return self._localizer, self._settings
+
+    def _fall_silent(self) -> None:
+        with self._outlet_lock:
+            self._publishing = False
+        if self._localizer is not None:
+            self._localizer.deactivate()
+        self._drop_images()
+        while self._subscriptions_made:
+            self.destroy_subscription(self._subscriptions_made.pop())
+
+    def _release(self) -> None:
+        self._fall_silent()
+        if self._localizer is not None:
+            self._localizer.stop(STOP_SECONDS)
+            self._localizer = None
+        while self._topics:
+            self.destroy_lifecycle_publisher(self._topics.pop())
+        self._broadcaster = self._settings = None
+
+    def close(self) -> None:
+        """End the run where the process ends without a transition."""
+        self._release()
+
+    # ---- what comes in
+
+    def _subscribe(self, kind: Any, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> Any:
+        overridden = QoSOverridingOptions.with_default_policies()
+        made = self.create_subscription(kind, topic, callback, qos, qos_overriding_options=overridden)
+        self._subscriptions_made.append(made)
+        return made
+
+    def _drop_images(self) -> None:
+        if self._image_subscription is not None:
+            self._subscriptions_made.remove(self._image_subscription)
+            self.destroy_subscription(self._image_subscription)
+            self._image_subscription = None
+
+    def _look_for_images(self) -> None:
+        """Subscribe to the images once their type is known; say so if it is none of an image."""
+        _, chosen = self._made()
+        topic = self.resolve_topic_name("image")
+        published = {one.topic_type for one in self.get_publishers_info_by_topic(topic)}
+        wanted = {name: pair for name, pair in IMAGE_TYPES.items() if chosen.image_type in ("auto", name)}
+        fitting = [kind for name, kind in wanted.values() if name in published]
+        if published and not fitting:
+            self._health.begins(
+                "image type",
+                f"The topic {topic} has the type {', '.join(sorted(published))}; the node takes "
+                f"{' or '.join(name for name, _ in wanted.values())}.",
+                ERROR,
+            )
+            if chosen.image_type == "auto":
+                self._drop_images()
+            return
+        if published:
+            self._health.over("image type")
+        elif chosen.image_type != "auto":
+            fitting = [kind for _, kind in wanted.values()]
+        if fitting and (self._image_subscription is None or self._image_subscription.msg_type not in fitting):
+            self._drop_images()
+            try:
+                self._image_subscription = self._subscribe(fitting[0], "image", self._on_image, sensor_qos(QUEUED))
+            except (
+                RCLError
+            ) as error:  # the middleware has not forgotten the type from before; the next tick tries again
+                self.get_logger().debug(f"No subscription yet: {error}")
+
+    def _on_image(self, message: Any) -> None:
+        self._frames += 1
+        self._heard["image"] = time.monotonic()
+        if self._localizer is not None:
+            self._localizer.add(Frame(self._frames, stamp_of(message), message))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        if self._localizer is None or self._settings is None:
+            return
+        localizer, chosen = self._localizer, self._settings
+        self._heard["info"] = time.monotonic()
+        try:
+            intrinsics = intrinsics_of(message, chosen.rectified)
+        except UnfitCamera as error:
+            localizer.camera(None)
+            self._health.begins("camera info", f"The intrinsics are not used: {error}.")
+        else:
+            localizer.camera(intrinsics)
+            self._health.over("camera info")
+
+    def _on_odometry(self, message: Odometry) -> None:
+        if self._localizer is None:
+            return
+        try:
+            self._localizer.odometer.add(message)
+        except ValueError as error:
+            self._health.begins("odometry", f"A message of odometry cannot be used: {error}.")
+        else:
+            self._health.over("odometry")
+
+    def _ask_for(self, name: str, ask: Callable[[Localizer], ThreadFuture[Done]]) -> None:
+        """Make a service that the localizer's thread answers."""
+
+        async def answer(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            if self._localizer is None:
+                response.success, response.message = False, "The node is not configured."
+                return response
+            done = await self._awaited(ask(self._localizer))
+            response.success, response.message = done.success, done.message
+            return response
+
+        self.create_service(Trigger, f"~/{name}", answer, callback_group=self._waiting)
+
+    def _awaited(self, result: ThreadFuture[Done]) -> Future:
+        """A future of the executor that is done when that of another thread is."""
+        future: Future = Future(executor=self.executor)
+
+        def finish(done: ThreadFuture[Done]) -> None:
+            future.set_result(done.result())
+            if (executor := self.executor) is not None:
+                executor.wake()
+
+        result.add_done_callback(finish)
+        return future
+
+    # ---- what goes out; the localizer's thread calls these
+
+    def answered(self, answered: Answered) -> None:
+        """Publish the answer, and the pose and the transform if the robot is localized."""
+        with self._outlet_lock:
+            if not self._publishing:
+                return
+            localizer, chosen = self._made()
+            if answered.robot is not None:
+                self._pose.publish(messages.pose_message(answered, chosen.map_frame))
+            self._answer.publish(messages.answer_message(answered))
+            if answered.correction is not None:
+                transform = messages.transform_message(
+                    answered.correction, answered.frame.message.header.stamp, chosen.map_frame, localizer.odometer.frame
+                )
+                self._transform.publish(transform)
+                if self._broadcaster is not None:
+                    self._broadcaster.sendTransform(transform)
+
+    def wants_picture(self) -> bool:
+        """Whether somebody subscribes to annotated pictures."""
+        with self._outlet_lock:
+            return self._publishing and self._picture.get_subscription_count() > 0
+
+    def picture(self, frame: Frame, png: bytes) -> None:
+        """Publish an annotated picture."""
+        with self._outlet_lock:
+            if self._publishing:
+                self._picture.publish(messages.picture_message(frame, png))
+
+    # ---- every second
+
+    def _tick(self) -> None:
+        if self._health.state == "active":
+            self._look_for_images()
+            self._look_for_silence()
+        level, text, values = self._health.report()
+        if self._localizer is not None:
+            values["frames dropped from the queue"] = str(self._localizer.queue.dropped)
+        values["frames received"] = str(self._frames)
+        url = "" if self._settings is None else self._settings.url
+        now = self.get_clock().now().to_msg()
+        name = self.get_fully_qualified_name().lstrip("/") + ": localization"
+        self._diagnostics.publish(messages.diagnostics_message(level, text, values, name, url, now))
+
+    def _look_for_silence(self) -> None:
+        _, chosen = self._made()
+        silent = time.monotonic() - self._heard["image"]
+        if silent > SILENCE_SECONDS:
+            self._health.begins("images", f"No image has come on {self.resolve_topic_name('image')}.", WARN)
+            return
+        self._health.over("images")
+        if not chosen.use_camera_info or self._heard["info"]:
+            self._health.over("no camera info")
+        elif self._frames:
+            topic = self.resolve_topic_name("camera_info")
+            self._health.begins(
+                "no camera info", f"No CameraInfo has come on {topic}: the frames count without intrinsics."
+            )
+
+    def _log(self, level: int, sentence: str) -> None:
+        log = self.get_logger()
+        if level == ERROR:  # rclpy wants each line of code to log at one level
+            log.error(sentence)
+        elif level == WARN:
+            log.warning(sentence)
+        else:
+            log.info(sentence)
+
+
+def descriptor(parameter: Parameter) -> ParameterDescriptor:
+    """What ROS shows of a parameter, and the range that it holds it to."""
+    made = ParameterDescriptor(description=parameter.description)
+    if parameter.choices:
+        made.additional_constraints = f"One of: {', '.join(parameter.choices)}"
+    if parameter.least is not None and parameter.most is not None:
+        if isinstance(parameter.default, float):
+            made.floating_point_range = [FloatingPointRange(from_value=parameter.least, to_value=parameter.most)]
+        else:
+            made.integer_range = [IntegerRange(from_value=int(parameter.least), to_value=int(parameter.most), step=1)]
+    return made
+
+
+def _broadcaster(node: LifecycleNode) -> Any:
+    """A broadcaster of transforms; None where tf2_ros is not installed."""
+    try:
+        from tf2_ros import TransformBroadcaster
+    except ImportError:
+        return None
+    return TransformBroadcaster(node)
+
+
+def _is_local(url: str) -> bool:
+    return any(url.startswith(f"http://{host}") for host in ("127.", "localhost", "[::1]"))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the node until it is told to end."""
+    rclpy.init(args=arguments)
+    node = PlacerecNode()
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    if node.get_parameter("autostart").value and node.trigger_configure() == Success:
+        node.trigger_activate()
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.close()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,188 @@
+"""The parameters of the node: their names, types, defaults, ranges and descriptions, and the settings made of them.
+
+The node declares them by this table, and ``docs/how-to/ros2.md`` shows it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+MAP_ID = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+CAMERA_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
+KEY_VARIABLE = "PLACEREC_KEY"
+
+
+class InvalidParameters(Exception):
+    """A parameter has a value that the node cannot work with; the text is a sentence that says which."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter; ``least`` and ``most`` are those of numbers, ``choices`` those of words."""
+
+    name: str
+    default: str | bool | int | float
+    description: str
+    least: float | None = None
+    most: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+PARAMETERS = (
+    Parameter("url", "http://127.0.0.1:8000", "Address of the placerec service."),
+    Parameter("key_file", "", f"File with the key to send; without it the key is that of {KEY_VARIABLE}, if any."),
+    Parameter("map", "", "Id of the map to localize in. It has to be given."),
+    Parameter(
+        "encoder",
+        "",
+        "Name or identity of the encoder that the map must have; empty: any. A map that the node creates gets it.",
+    ),
+    Parameter(
+        "camera",
+        "",
+        "Name of the camera in the map. Empty: one named by its intrinsics, so that robots with other cameras"
+        " do not share it.",
+    ),
+    Parameter("use_camera_info", True, "Send the intrinsics of CameraInfo to the map."),
+    Parameter(
+        "rectified",
+        False,
+        "The images are rectified: the intrinsics are those of the matrix P, without distortion.",
+    ),
+    Parameter("camera_yaw", 0.0, "Degrees by which the camera looks to the left of the robot's front.", -180.0, 180.0),
+    Parameter(
+        "image_type",
+        "auto",
+        "Type of the image topic. auto: that of its publishers.",
+        choices=("auto", "compressed", "raw"),
+    ),
+    Parameter("map_frame", "map", "Frame of the map's poses, in all that is published."),
+    Parameter(
+        "publish_tf",
+        True,
+        "Send the transform from the map to the odometry to /tf, where tf2_ros is installed.",
+    ),
+    Parameter("queue_length", 2, "Most images that wait for the service; the oldest gives way.", 1, 100),
+    Parameter(
+        "deadline",
+        2.0,
+        "Seconds after which an answer is of no use; an image that waited longer is dropped.",
+        0.05,
+        60.0,
+    ),
+    Parameter(
+        "advance",
+        1.0,
+        "Places of the map's traverse that usually go by from image to image, where neither odometry nor a "
+        "speed limit tells it.",
+        0.0,
+        100.0,
+    ),
+    Parameter("backwards", False, "The robot may go against the map's traverse."),
+    Parameter("speed_limit", 0.0, "Metres a second that the robot does not exceed; 0: none.", 0.0, 1000.0),
+    Parameter("verify", "auto", "When the geometry of candidates is verified.", choices=("auto", "always", "never")),
+    Parameter(
+        "picture_period",
+        1.0,
+        "Seconds between two annotated pictures, while someone subscribes to them.",
+        0.1,
+        3600.0,
+    ),
+    Parameter("autostart", False, "Configure and activate the node when it starts, without a manager of lifecycles."),
+    Parameter(
+        "sequence",
+        "",
+        "Traverse of the places that enrol_here adds; empty: named by the time when the node was configured.",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The values of all parameters, as the node works with them, and the key."""
+
+    url: str
+    key_file: str
+    map: str
+    encoder: str
+    camera: str
+    use_camera_info: bool
+    rectified: bool
+    camera_yaw: float
+    image_type: str
+    map_frame: str
+    publish_tf: bool
+    queue_length: int
+    deadline: float
+    advance: float
+    backwards: bool
+    speed_limit: float
+    verify: str
+    picture_period: float
+    autostart: bool
+    sequence: str
+    key: str | None
+
+    def __repr__(self) -> str:
+        return f"<settings of {self.map!r} at {self.url!r}>"  # never the key
+
+
+def settings(values: Mapping[str, Any], environment: Mapping[str, str] = os.environ) -> Settings:
+    """The settings of the parameters' values.
+
+    Raises:
+        InvalidParameters: a value cannot be used.
+    """
+    for parameter in PARAMETERS:
+        _check(parameter, values[parameter.name])
+    if not MAP_ID.fullmatch(values["map"]):
+        raise InvalidParameters(
+            "The parameter map has to be the id of a map."
+            if not values["map"]
+            else f"No map is named {values['map']!r}."
+        )
+    if values["camera"] and not CAMERA_NAME.fullmatch(values["camera"]):
+        raise InvalidParameters(f"No camera of a map is named {values['camera']!r}.")
+    address = urlsplit(values["url"])
+    if address.scheme not in ("http", "https") or not address.hostname or address.username or address.query:
+        raise InvalidParameters("The parameter url has to be an address such as http://127.0.0.1:8000.")
+    if not values["map_frame"]:
+        raise InvalidParameters("The parameter map_frame has to name a frame.")
+    if any(ord(one) < 32 or one in "/\x7f" for one in values["sequence"]) or len(values["sequence"]) > 128:
+        raise InvalidParameters("The parameter sequence cannot name a traverse: a / is in it, or it is too long.")
+    return Settings(**{one.name: values[one.name] for one in PARAMETERS}, key=_key(values["key_file"], environment))
+
+
+def _check(parameter: Parameter, value: Any) -> None:
+    name = parameter.name
+    wanted: type[Any] = type(parameter.default)
+    if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
+        raise InvalidParameters(f"The parameter {name} has to be of the type {wanted.__name__}.")
+    if parameter.choices and value not in parameter.choices:
+        raise InvalidParameters(f"The parameter {name} is one of {', '.join(parameter.choices)}, not {value!r}.")
+    if parameter.least is None or parameter.most is None:
+        return
+    if not parameter.least <= value <= parameter.most:
+        raise InvalidParameters(
+            f"The parameter {name} is {value}; it can be {parameter.least:g} to {parameter.most:g}."
+        )
+
+
+def _key(file: str, environment: Mapping[str, str]) -> str | None:
+    """The key; its text is in no message."""
+    if not file:
+        return environment.get(KEY_VARIABLE) or None
+    try:
+        key = Path(file).expanduser().read_text().strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise InvalidParameters(f"The key file {file} cannot be read: {reason}.") from None
+    if not key or len(key.split()) != 1:
+        raise InvalidParameters(f"The key file {file} has to hold one key, and nothing else.")
+    return key

@@ -1,0 +1,89 @@
+"""The pose that an answer of a session gives: position, heading and covariance, or nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from placerec_ros.planar import Planar, wrapped
+
+UNKNOWN_HEIGHT = 1e6
+"""Variance of z in m² where places have none, as the service gives it."""
+UNKNOWN_ANGLE = math.pi**2 / 3
+"""Variance in rad² of an angle of which nothing is known."""
+HEADING_VARIANCE = math.radians(20) ** 2
+"""A frame may be turned by so much and still match its place."""
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """Where the robot's camera is.
+
+    covariance: 36 numbers, row by row, of x, y, z (m) and of the rotations about x, y, z (rad), as in
+        ``geometry_msgs/PoseWithCovariance``.
+    source: ``frame``: the pose that the service measured for this frame. ``belief``: the frame alone is not
+        recognized, but the run is: the pose of the places that the session believes in.
+    """
+
+    planar: Planar
+    covariance: tuple[float, ...]
+    source: Literal["frame", "belief"]
+
+
+def estimate(answer: Mapping[str, Any], same_place_radius: float) -> PoseEstimate | None:
+    """The pose of a session's answer; None unless the session recognizes a place that has a pose in metres.
+
+    Args:
+        answer: ``SessionAnswer`` as JSON.
+        same_place_radius: metres, of the map: places within it count as one.
+    """
+    if answer["verdict"] != "recognized" or answer["place"] is None or not metric(answer["place"]["pose"]):
+        return None
+    believed = answer["place"]["pose"]
+    single = answer["single"]
+    measured = single.get("pose")
+    if single["verdict"] == "recognized" and metric(measured) and measured.get("covariance"):
+        reach = same_place_radius + 3 * (measured.get("spread") or 0.0)
+        if math.hypot(measured["x"] - believed["x"], measured["y"] - believed["y"]) <= reach:
+            return PoseEstimate(_planar(measured), tuple(map(float, measured["covariance"])), "frame")
+    return _of_belief(answer["candidates"], same_place_radius)
+
+
+def metric(pose: Mapping[str, Any] | None) -> bool:
+    """Whether there is a pose, in metres."""
+    return pose is not None and pose.get("x") is not None
+
+
+def _planar(pose: Mapping[str, Any]) -> Planar:
+    heading = pose.get("heading")
+    return Planar(
+        float(pose["x"]), float(pose["y"]), wrapped(math.radians(heading or 0.0)), float(pose.get("z") or 0.0)
+    )
+
+
+def _of_belief(candidates: Sequence[Mapping[str, Any]], radius: float) -> PoseEstimate:
+    """The best candidate's pose; its covariance is the scatter of all candidates about it, by their probabilities.
+
+    A candidate stands for its neighbours within ``radius`` too, so each adds the variance of a disc of that radius.
+    """
+    posed = [(one["probability"], one["place"]["pose"]) for one in candidates if metric(one["place"]["pose"])]
+    best, total = posed[0][1], sum(weight for weight, _ in posed)
+    across = {"xx": radius**2 / 4, "xy": 0.0, "yy": radius**2 / 4}
+    turned = HEADING_VARIANCE if best.get("heading") is not None else UNKNOWN_ANGLE
+    height = radius**2 / 4 if best.get("z") is not None else UNKNOWN_HEIGHT
+    for weight, pose in posed:
+        share, x, y = weight / total, pose["x"] - best["x"], pose["y"] - best["y"]
+        across["xx"] += share * x * x
+        across["xy"] += share * x * y
+        across["yy"] += share * y * y
+        if best.get("z") is not None:
+            height += share * ((pose.get("z") or 0.0) - best["z"]) ** 2
+        if best.get("heading") is not None and pose.get("heading") is not None:
+            turned += share * wrapped(math.radians(pose["heading"] - best["heading"])) ** 2
+    covariance = [0.0] * 36
+    covariance[0], covariance[1], covariance[6], covariance[7] = across["xx"], across["xy"], across["xy"], across["yy"]
+    covariance[14], covariance[21], covariance[28] = height, UNKNOWN_ANGLE, UNKNOWN_ANGLE
+    covariance[35] = min(turned, UNKNOWN_ANGLE)
+    return PoseEstimate(_planar(best), tuple(covariance), "belief")

@@ -1,0 +1,139 @@
+"""A robot's run at the service: the map, the camera in it, and the session that takes the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal, cast
+
+from placerec_client import Client, Problem
+from placerec_client.retry import Retry
+from placerec_ros.health import Health
+from placerec_ros.intrinsics import camera_name
+from placerec_ros.odometry import Increment
+from placerec_ros.parameters import Settings
+
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+SESSION_GONE = frozenset({"unknown-session", "session-expired", "frame-out-of-order"})
+"""Problems after which a new session is begun."""
+NOT_ALLOWED = frozenset({"role-too-low", "map-forbidden", "key-needed", "key-refused"})
+
+
+def client_of(settings: Settings) -> Client:
+    """A client that asks once: a frame that was not answered gives way to a newer one."""
+    return Client(settings.url, key=settings.key, timeout=settings.deadline, retry=Retry(patience=0))
+
+
+def moment_of(stamp: int) -> datetime | None:
+    """The time of a stamp in nanoseconds, to the microsecond; None for a message without one."""
+    return EPOCH + timedelta(microseconds=stamp // 1000) if stamp else None
+
+
+class Run:
+    """A run; one thread uses it. All methods raise what ``placerec_client`` raises.
+
+    Args:
+        intrinsics: of the robot's camera, as the service takes them; None if they are not known.
+    """
+
+    def __init__(
+        self, client: Client, settings: Settings, health: Health, intrinsics: Mapping[str, Any] | None
+    ) -> None:
+        self._client, self._settings, self._health = client, settings, health
+        self._map = client.maps[settings.map]
+        self._read_map()
+        self.intrinsics = intrinsics
+        self.camera = self._camera(intrinsics)
+        self._session = self._map.sessions.begin(
+            advance=settings.advance,
+            backwards=settings.backwards,
+            speed_limit=settings.speed_limit or None,
+            camera=self.camera,
+            verify=cast(Literal["auto", "always", "never"], settings.verify),
+        )
+        self.id = self._session.begin().id
+        health.fact("session", self.id)
+
+    def _read_map(self) -> None:
+        view = self._map.read()
+        self.radius = float(view.same_place_radius)
+        self.revision = view.revision
+        self._health.fact("map", f"{view.id}, revision {view.revision}, {view.places} places")
+        self._health.fact("encoder", view.encoder)
+
+    def _camera(self, intrinsics: Mapping[str, Any] | None) -> str | None:
+        """The name of the camera in the map, which has the intrinsics afterwards if the key allows it."""
+        name = self._settings.camera or None
+        if intrinsics is None:
+            return name
+        name = name or camera_name(dict(intrinsics))
+        known = {camera.name: camera for camera in self._map.cameras}
+        there = known.get(name)
+        if there is not None and there.intrinsics is not None:
+            stated = there.intrinsics.model_dump(mode="json")
+            if all(_same(stated.get(key), value) for key, value in intrinsics.items()):
+                self._health.over("camera")
+                return name
+        mask = None if there is None or there.mask is None else there.mask.model_dump(mode="json")
+        definition: Any = {"mask": mask, "intrinsics": dict(intrinsics)}
+        try:
+            self._map.cameras.put(name, **definition)
+        except Problem as problem:
+            if problem.slug not in NOT_ALLOWED and problem.status != 422:
+                raise
+            without = "its frames count without intrinsics" if there is None else "it stays as the map has it"
+            self._health.begins("camera", f"The camera {name} could not be sent to the map, so {without}: {problem}")
+            return None if there is None else name
+        self._health.over("camera")
+        return name
+
+    def send(self, frame: Any, number: int, stamp: int, moved: Increment | None) -> dict[str, Any]:
+        """Send a frame; the service's ``SessionAnswer`` as JSON."""
+        motion: dict[str, Any] = {}
+        if moved is not None:
+            motion = {"forward": moved.forward, "left": moved.left, "turn": moved.turn}
+        answer = self._session.send(
+            frame,
+            frame=number,
+            timestamp=moment_of(stamp),
+            encoder=self._settings.encoder or None,
+            deadline=self._settings.deadline,
+            **motion,
+        )
+        if answer.single.revision is not None and answer.single.revision != self.revision:
+            self._read_map()  # its settings were edited
+        return answer.model_dump(mode="json")
+
+    def picture(self, frame: Any) -> bytes | None:
+        """A PNG of the frame beside its best match, with lines between what matches; None if there is no match."""
+        answer = self._map.query(frame, explain=True, camera=self.camera, deadline=self._settings.deadline)
+        path = None if answer.explanation is None else answer.explanation.picture
+        return None if path is None else self._map.explanation(path.rpartition("/")[2])
+
+    def enrol(self, place: str, frame: Any, stamp: int, **fields: Any) -> None:
+        """Enrol a frame."""
+        self._map.places.put(
+            place,
+            frame,
+            timestamp=moment_of(stamp),
+            camera=self.camera,
+            encoder=self._settings.encoder or None,
+            deadline=self._settings.deadline,
+            **fields,
+        )
+
+    def places(self) -> int:
+        """How many places the map has now."""
+        return int(self._map.read().places)
+
+    def end(self) -> None:
+        """End the session."""
+        self._session.end()
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, (list, tuple)) and isinstance(other, (list, tuple)):
+        return len(one) == len(other) and all(_same(*pair) for pair in zip(one, other, strict=True))
+    if isinstance(one, (int, float)) and isinstance(other, (int, float)):
+        return abs(one - other) <= 1e-6 * max(1.0, abs(one), abs(other))
+    return bool(one == other)

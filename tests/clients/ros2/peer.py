@@ -1,0 +1,326 @@
+"""What a robot has beside the node: it plays bags, records what the node publishes, and calls its services.
+
+It runs in .venv-ros, takes one JSON object a line from standard input, and answers each with one on standard output.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+KINDS = {kind.__name__: kind for kind in (CompressedImage, Image, CameraInfo, Odometry, String)}
+TRANSITIONS = {
+    "configure": 1,
+    "cleanup": 2,
+    "activate": 3,
+    "deactivate": 4,
+    "shutdown unconfigured": 5,
+    "shutdown inactive": 6,
+    "shutdown active": 7,
+}
+BAG_TYPES = {
+    "CompressedImage": "sensor_msgs/msg/CompressedImage",
+    "CameraInfo": "sensor_msgs/msg/CameraInfo",
+    "Odometry": "nav_msgs/msg/Odometry",
+}
+PATIENCE = 15.0
+
+
+class Peer:
+    """The process's node, and what it has heard."""
+
+    def __init__(self) -> None:
+        self.node: Any = Node("peer")
+        self.heard: dict[str, list[dict[str, Any]]] = {}
+        self._lock = threading.Lock()
+        self._publishers: dict[str, Any] = {}
+        self._subscriptions: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+        self._playing: threading.Thread | None = None
+
+    def note(self, topic: str, entry: dict[str, Any]) -> None:
+        with self._lock:
+            self.heard.setdefault(topic, []).append({"at": time.time(), **entry})
+
+    # ---- commands
+
+    def sleep(self, seconds: float) -> dict[str, Any]:
+        """Wait."""
+        time.sleep(seconds)
+        return {}
+
+    def listen(self, topic: str, durable: bool = False, node: str = "placerec") -> dict[str, Any]:
+        """Record a topic of the node: answer, pose, map_to_odom, annotated/compressed or /diagnostics."""
+        known: dict[str, tuple[Any, Callable[[Any], dict[str, Any]]]] = {
+            "answer": (String, lambda message: json.loads(message.data)),
+            "pose": (PoseWithCovarianceStamped, pose_of),
+            "map_to_odom": (TransformStamped, transform_of),
+            "annotated/compressed": (CompressedImage, picture_of),
+            "/diagnostics": (DiagnosticArray, diagnostics_of),
+        }
+        kind, show = known[topic]
+        qos = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+        if durable:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        full = topic if topic.startswith("/") else f"/{node}/{topic}"
+        if topic in self._subscriptions:
+            self.deafen(topic)
+        self._subscriptions[topic] = self.node.create_subscription(
+            kind, full, lambda message: self.note(topic, show(message)), qos
+        )
+        return {}
+
+    def deafen(self, topic: str) -> dict[str, Any]:
+        """End the recording of a topic."""
+        self.node.destroy_subscription(self._subscriptions.pop(topic))
+        return {}
+
+    def take(self, topic: str) -> dict[str, Any]:
+        """What was heard since the last time."""
+        with self._lock:
+            return {"heard": self.heard.pop(topic, [])}
+
+    def advertise(self, topic: str, kind: str, reliable: bool = False) -> dict[str, Any]:
+        """Make a publisher."""
+        reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        qos = QoSProfile(depth=10, reliability=reliability)
+        self.withdraw(topic)
+        until = time.monotonic() + PATIENCE
+        while topic not in self._publishers:  # the middleware takes a moment to forget another type
+            try:
+                self._publishers[topic] = self.node.create_publisher(KINDS[kind], topic, qos)
+            except rclpy_implementation.RCLError:
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.1)
+        return {}
+
+    def withdraw(self, topic: str) -> dict[str, Any]:
+        """Take a publisher back."""
+        if topic in self._publishers:
+            self.node.destroy_publisher(self._publishers.pop(topic))
+        return {}
+
+    def subscribers(self, topic: str) -> dict[str, Any]:
+        """How many subscribe to a topic of this peer."""
+        return {"subscribers": self._publishers[topic].get_subscription_count()}
+
+    def publishers(self) -> dict[str, Any]:
+        """To how many publishers of the node each of this peer's recordings is connected."""
+        counts = {topic: made.get_publisher_count() for topic, made in self._subscriptions.items()}
+        return {"publishers": {topic: count for topic, count in counts.items() if not topic.startswith("/")}}
+
+    def publish(self, topic: str, kind: str, **fields: Any) -> dict[str, Any]:
+        """Publish one message; bytes are named by the path of a file."""
+        self._publishers[topic].publish(message_of(kind, fields))
+        return {"at": time.time()}
+
+    def ask(self, topic: str, kind: str, **fields: Any) -> dict[str, Any]:
+        """Publish one message, and wait for the node's answer to it; the seconds from the one to the other."""
+        message = message_of(kind, fields)
+        with self._lock:
+            self.heard.pop("answer", None)
+        began = time.time()
+        self._publishers[topic].publish(message)
+        while time.time() < began + PATIENCE:
+            with self._lock:
+                heard = self.heard.get("answer", [])
+                if heard and abs(heard[-1]["stamp"] - fields["stamp"]) < 1e-3:
+                    return {"seconds": heard[-1]["at"] - began, "answer": heard[-1]}
+            time.sleep(0.002)
+        raise TimeoutError("the node did not answer")
+
+    def write_bag(self, path: str, messages: list[dict[str, Any]]) -> dict[str, Any]:
+        """Write a bag; each message has a topic, a kind and a stamp in seconds."""
+        store = get_typestore(Stores.ROS2_KILTED)
+        connections: dict[str, Any] = {}
+        with Writer(Path(path), version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+            for fields in messages:
+                topic, kind = fields.pop("topic"), fields.pop("kind")
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, BAG_TYPES[kind], typestore=store)
+                stamp = int(fields["stamp"] * 1e9)
+                writer.write(connections[topic], stamp, serialize_message(message_of(kind, fields)))
+        return {}
+
+    def play(self, path: str, rate: float = 1.0, wait: bool = False, settle: float = 0.0) -> dict[str, Any]:
+        """Publish a bag's messages at the pace of their times, so many times faster."""
+        with Reader(Path(path)) as reader:
+            for connection in reader.connections:
+                if connection.topic not in self._publishers:
+                    self.advertise(connection.topic, connection.msgtype.rpartition("/")[2])
+        self._playing = threading.Thread(target=self._play, args=(path, rate), daemon=True)
+        self._playing.start()
+        return self.played() if wait else {}
+
+    def _play(self, path: str, rate: float) -> None:
+        with Reader(Path(path)) as reader:
+            began, first = time.monotonic(), None
+            for connection, stamp, raw in reader.messages():
+                first = stamp if first is None else first
+                due = began + (stamp - first) / 1e9 / rate
+                time.sleep(max(0.0, due - time.monotonic()))
+                kind = KINDS[connection.msgtype.rpartition("/")[2]]
+                message = deserialize_message(bytes(raw), kind)
+                now = time.time()
+                self._publishers[connection.topic].publish(message)
+                if kind is CompressedImage:
+                    self.note("played", {"stamp": stamp_of(message), "published": now})
+
+    def played(self) -> dict[str, Any]:
+        """Wait until the bag has been played."""
+        assert self._playing is not None
+        self._playing.join()
+        return {}
+
+    def call(self, service: str, patience: float = PATIENCE) -> dict[str, Any]:
+        """Call one of the node's own services."""
+        done = self._call(Trigger, f"/placerec/{service}", Trigger.Request(), patience)
+        return {"success": done.success, "message": done.message}
+
+    def transition(self, name: str, node: str = "placerec") -> dict[str, Any]:
+        """Ask a node for a transition; how long it took."""
+        request = ChangeState.Request()
+        request.transition.id = TRANSITIONS[name]
+        began = time.monotonic()
+        done = self._call(ChangeState, f"/{node}/change_state", request)
+        return {"success": done.success, "seconds": time.monotonic() - began}
+
+    def set(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Set parameters of the node; why each was refused, if so."""
+        request = SetParameters.Request()
+        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        done = self._call(SetParameters, "/placerec/set_parameters", request)
+        return {"refused": [result.reason for result in done.results if not result.successful]}
+
+    def describe(self, names: list[str]) -> dict[str, Any]:
+        """What the node says of its parameters."""
+        done = self._call(DescribeParameters, "/placerec/describe_parameters", DescribeParameters.Request(names=names))
+        return {"descriptions": {one.name: one.description for one in done.descriptors}}
+
+    def state(self, node: str = "placerec") -> dict[str, Any]:
+        """The state of a node, and how long it took to say so."""
+        began = time.monotonic()
+        done = self._call(GetState, f"/{node}/get_state", GetState.Request())
+        return {"state": done.current_state.label, "seconds": time.monotonic() - began}
+
+    def _call(self, kind: Any, name: str, request: Any, patience: float = PATIENCE) -> Any:
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+        client = self._clients[name]
+        if not client.wait_for_service(patience):
+            raise TimeoutError(f"no service {name}")
+        future, done = client.call_async(request), threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(patience):
+            raise TimeoutError(f"{name} did not answer in {patience} s")
+        return future.result()
+
+
+def message_of(kind: str, fields: dict[str, Any]) -> Any:
+    """A message of the fields that matter in the tests."""
+    message = KINDS[kind]()
+    if kind == "String":
+        message.data = fields.get("data", "")
+        return message
+    stamp = fields["stamp"]
+    message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), round(1e9 * (stamp - int(stamp)))
+    message.header.frame_id = fields.get("frame_id", "camera")
+    if kind == "CompressedImage":
+        message.format = fields.get("format", "jpeg")
+        message.data = Path(fields["file"]).read_bytes()
+    elif kind == "Image":
+        message.height, message.width, message.encoding = fields["height"], fields["width"], fields["encoding"]
+        message.data = Path(fields["file"]).read_bytes()
+        message.step = fields.get("step", len(message.data) // message.height)
+    elif kind == "CameraInfo":
+        message.width, message.height = fields["width"], fields["height"]
+        message.k = [fields["fx"], 0.0, fields["cx"], 0.0, fields["fy"], fields["cy"], 0.0, 0.0, 1.0]
+        message.distortion_model, message.d = fields.get("distortion_model", "plumb_bob"), fields.get("d", [0.0] * 5)
+    else:
+        message.header.frame_id, message.child_frame_id = fields.get("frame_id", "odom"), "base_link"
+        pose, yaw = message.pose.pose, math.radians(fields.get("heading", 0.0))
+        pose.position.x, pose.position.y = float(fields["x"]), float(fields["y"])
+        pose.orientation.z, pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    return message
+
+
+def stamp_of(message: Any) -> float:
+    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)
+
+
+def pose_of(message: Any) -> dict[str, Any]:
+    pose = message.pose.pose
+    return {
+        "stamp": stamp_of(message),
+        "frame": message.header.frame_id,
+        "x": pose.position.x,
+        "y": pose.position.y,
+        "heading": math.degrees(2 * math.atan2(pose.orientation.z, pose.orientation.w)) % 360,
+        "covariance": list(map(float, message.pose.covariance)),
+    }
+
+
+def transform_of(message: Any) -> dict[str, Any]:
+    moved, turned = message.transform.translation, message.transform.rotation
+    yaw = math.degrees(2 * math.atan2(turned.z, turned.w)) % 360
+    frames = {"frame": message.header.frame_id, "child": message.child_frame_id}
+    return {"stamp": stamp_of(message), "x": moved.x, "y": moved.y, "heading": yaw, **frames}
+
+
+def picture_of(message: Any) -> dict[str, Any]:
+    return {"stamp": stamp_of(message), "format": message.format, "start": bytes(message.data[:8]).hex()}
+
+
+def diagnostics_of(message: Any) -> dict[str, Any]:
+    (status,) = message.status
+    level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+    values = {one.key: one.value for one in status.values}
+    return {"level": level, "message": status.message, "name": status.name, "values": values}
+
+
+def main() -> None:
+    rclpy.init()
+    peer = Peer()
+    executor = SingleThreadedExecutor()
+    executor.add_node(peer.node)
+    spinning = threading.Thread(target=executor.spin)
+    spinning.start()
+    for line in sys.stdin:
+        order = json.loads(line)
+        try:
+            answer = getattr(peer, order.pop("do"))(**order)
+        except Exception as error:
+            answer = {"error": f"{type(error).__name__}: {error}"}
+        print(json.dumps(answer), flush=True)
+    executor.shutdown()
+    rclpy.try_shutdown()
+    spinning.join()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,424 @@
+"""The node with real peers: what it publishes, and what it says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import httpx
+import pytest
+
+from placerec_ros.parameters import PARAMETERS
+from tests.clients.ros2.robot import Node, Peer, Robot, Site, until
+from tests.service.scenes import blank, encoded, stranger
+
+
+@pytest.fixture
+def image(robot: Robot) -> Robot:
+    """A robot whose camera publishes JPEG files; begin() is called by the test."""
+    robot.peer.do("advertise", topic="/image", kind="CompressedImage")
+    return robot
+
+
+def over_http(site: Site, frames: list[tuple[int, float, bytes]], **options: Any) -> list[dict[str, Any]]:
+    """The answers of a session over HTTP to numbered, stamped frames."""
+    from placerec_client import Client
+    from placerec_ros.run import moment_of
+
+    with (
+        Client(site.url, key=site.keys["query"]) as client,
+        client.maps["walk"].sessions.begin(**options) as session,
+    ):
+        return [
+            session.send(data, frame=number, timestamp=moment_of(round(stamp * 1e9))).model_dump(mode="json")
+            for number, stamp, data in frames
+        ]
+
+
+def test_the_verdicts_of_a_bag_are_those_over_http(image: Robot) -> None:
+    site, robot = image.site, image
+    stamps = [robot.BASE + 0.1 * number for number in range(len(site.again))]
+    bag = site.folder / "bag"
+    robot.peer.do(
+        "write_bag",
+        path=str(bag),
+        messages=[
+            {
+                "topic": "/image",
+                "kind": "CompressedImage",
+                "stamp": stamp,
+                "file": str(site.folder / f"again-{at:02d}.jpg"),
+            }
+            for at, stamp in enumerate(stamps)
+        ],
+    )
+    robot.begin()
+    robot.connected()
+    robot.peer.do("play", path=str(bag), wait=True)
+    answers = robot.answers(len(stamps))
+    by_stamp = {round(stamp, 3): data for stamp, data in zip(stamps, site.again, strict=True)}
+    sent = [(one["number"], one["stamp"], by_stamp[round(one["stamp"], 3)]) for one in answers]
+    for found, expected in zip(answers, over_http(site, sent), strict=True):
+        assert (found["verdict"], found["place"]) == (
+            expected["verdict"],
+            expected["place"] and expected["place"]["id"],
+        )
+        assert found["probability"] == pytest.approx(expected["probability"], abs=1e-6)
+        assert found["answer"]["unknown"] == pytest.approx(expected["unknown"], abs=1e-6)
+    assert sum(one["verdict"] == "recognized" for one in answers) >= len(answers) - 3
+    assert answers[-1]["revision"] == 1
+    assert answers[-1]["map"] == "walk"
+    assert answers[-1]["frame_id"] == "camera"
+    poses = {round(one["stamp"], 3): one for one in robot.peer.take("pose")}
+    localized = [one for one in answers if one["verdict"] == "recognized"]
+    assert poses.keys() == {round(one["stamp"], 3) for one in localized}, "one pose for each localized frame"
+    last = poses[round(localized[-1]["stamp"], 3)]
+    assert last["frame"] == "map"
+    assert last["x"] == pytest.approx(len(stamps) - 1, abs=1.5)
+    assert 0 < last["covariance"][0] < 10
+    if localized[-1]["pose_source"] == "frame":
+        assert last["covariance"] == pytest.approx(localized[-1]["answer"]["single"]["pose"]["covariance"])
+
+
+def test_nothing_is_published_while_not_localized(image: Robot) -> None:
+    robot = image
+    robot.begin()
+    robot.connected()
+    assert robot.drive(0, 3)["verdict"] == "recognized"
+    until(lambda: robot.peer.take("pose"))
+    last = robot.answers_to([encoded(stranger(40 + number)) for number in range(4)])[-1]
+    assert last["verdict"] == "unknown"
+    assert last["pose_source"] is None
+    robot.peer.take("pose")
+    robot.answers_to([encoded(stranger(50)), encoded(blank())])
+    status = robot.says("The verdict is unknown")
+    assert float(status["values"]["seconds since then"]) > 0
+    assert status["values"]["last localized"].startswith("2025-11-22 08:26:40")
+    assert robot.peer.take("pose") == []
+
+
+def test_a_late_subscriber_hears_no_old_pose(image: Robot) -> None:
+    robot = image
+    robot.begin()
+    robot.connected()
+    robot.drive(0, 3)
+    until(lambda: robot.peer.take("pose"))
+    robot.peer.do("deafen", topic="pose")
+    robot.peer.do("listen", topic="pose", durable=True)  # asks for what was published before; there is none such
+    late = Peer(robot.site.folder / "late")
+    try:
+        late.do("listen", topic="pose")
+        late.do("listen", topic="answer")
+        late.hears(1)
+        stamp = robot.look(number=3)
+        heard = until(lambda: late.take("pose"))
+        assert [round(one["stamp"], 3) for one in heard] == [round(stamp, 3)]
+        assert len(until(lambda: late.take("answer"))) == 1
+    finally:
+        late.stop()
+    assert robot.peer.take("pose") == []
+
+
+def test_every_transition_is_clean(image: Robot) -> None:
+    robot = image
+    for _ in range(3):
+        robot.begin(active=False)
+        robot.look(number=0)
+        assert robot.transition("activate")
+        robot.connected()
+        assert robot.asked(1)["place"] == "p01"
+        assert robot.transition("deactivate")
+        until(lambda: robot.peer.do("subscribers", topic="/image")["subscribers"] == 0)
+        robot.look(number=2)
+        assert not robot.peer.do("call", service="relocalize")["success"]
+        assert robot.transition("activate")
+        robot.connected()
+        assert robot.asked(3)["answer"]["frames"] == 1, "a new run"
+        assert robot.transition("deactivate")
+        assert robot.transition("cleanup")
+        assert not robot.peer.do("call", service="relocalize")["success"]
+    assert robot.peer.take("answer") == []
+    assert not robot.transition("activate"), "not before it is configured"
+    assert robot.state == "unconfigured"
+    assert "Traceback" not in robot.log()
+    headers = {"Authorization": f"Bearer {robot.site.keys['query']}"}
+    sessions = f"{robot.site.url}/v1/maps/walk/sessions"
+    until(lambda: httpx.get(sessions, headers=headers).json()["items"] == [])  # each run was ended
+
+
+def test_it_can_be_shut_down_from_every_state(site: Site) -> None:
+    ways = {"one": [], "two": ["configure"], "three": ["configure", "activate"]}
+    states = {"one": "unconfigured", "two": "inactive", "three": "active"}
+    nodes = {name: Node(site.folder / name, {"url": site.url, "map": "walk"}, name=name) for name in ways}
+    try:
+        for name, transitions in ways.items():
+            for transition in (*transitions, f"shutdown {states[name]}"):
+                assert site.peer.do("transition", name=transition, node=name)["success"], transition
+            assert site.peer.do("state", node=name)["state"] == "finalized"
+    finally:
+        ended = {name: node.stop() for name, node in nodes.items()}
+    assert ended == {"one": 0, "two": 0, "three": 0}
+    assert not any("Traceback" in node.log() for node in nodes.values())
+
+
+def test_a_node_that_starts_by_itself(image: Robot) -> None:
+    """With autostart and the key of the environment, under another name."""
+    robot = image
+    parameters: dict[str, object] = {"url": robot.site.url, "map": "walk", "use_camera_info": False, "autostart": True}
+    words = {"PLACEREC_KEY": robot.site.keys["query"]}
+    node = Node(robot.site.folder / "own", parameters, name="other", **words)
+    try:
+        robot.connected()
+        robot.peer.do("listen", topic="answer", node="other")
+        robot.look(number=0)
+        assert until(lambda: robot.peer.take("answer"))[0]["place"] == "p00"
+    finally:
+        assert node.stop() == 0, node.log()
+    assert robot.site.keys["query"] not in node.log()
+
+
+def test_parameters_that_cannot_be_are_refused(robot: Robot) -> None:
+    robot.begin(active=False)
+    assert robot.transition("cleanup")
+    assert "range" in robot.peer.do("set", values={"queue_length": 0})["refused"][0]
+    robot.peer.do("set", values={"map": "No Map"})
+    assert not robot.transition("configure")
+    assert robot.says("No map is named 'No Map'")["level"] == 2
+    assert robot.state == "unconfigured"
+    said = robot.peer.do("describe", names=[one.name for one in PARAMETERS])["descriptions"]
+    assert said == {one.name: one.description for one in PARAMETERS}
+
+
+def test_the_type_of_the_topic_is_found_and_a_wrong_one_is_said(robot: Robot) -> None:
+    other = Peer(robot.site.folder / "other")  # a process of ROS has one type for a topic
+    try:
+        other.do("advertise", topic="/image", kind="String")
+        robot.begin(image_type="auto")
+        assert "has the type std_msgs/msg/String" in robot.says("has the type")["message"]
+    finally:
+        other.stop()
+    robot.peer.do("advertise", topic="/image", kind="Image")
+    robot.connected()
+    rgb = robot.site.file("raw", cv2.cvtColor(robot.site.frames[4], cv2.COLOR_BGR2RGB).tobytes())
+    shape: dict[str, object] = {"width": 320, "height": 240, "stamp": robot.BASE}
+    robot.peer.do("publish", topic="/image", kind="Image", encoding="rgb8", file=rgb, **shape)
+    assert robot.answers()[0]["place"] == "p04"
+    robot.peer.do("advertise", topic="/image", kind="CompressedImage")
+    robot.connected()
+    assert robot.asked(5)["place"] == "p05"
+    assert robot.log().count("has the type std_msgs") == 2, "when it began, and when it was over"
+
+
+def test_pictures_that_cannot_be_used_are_said_once(image: Robot) -> None:
+    robot = image
+    robot.begin()
+    robot.connected()
+    robot.drive(0, 2)
+    whole = robot.site.again[2]
+    for _ in range(3):
+        robot.look(b"\0\0\0\1video", format="h264")
+        robot.look(whole[: len(whole) // 2])
+    robot.look(encoded(blank(12, 12)))
+    assert robot.says("The service refused an image")["level"] == 1
+    assert robot.asked(3)["place"] == "p03", "it goes on"
+    log = robot.log()
+    assert log.count("'h264' is no JPEG, PNG or WebP") == 1
+    assert log.count("The service refused an image") == 2, "two kinds: torn, and too small"
+
+
+def test_raw_pictures_of_a_wrong_encoding_are_said_once(robot: Robot) -> None:
+    robot.peer.do("advertise", topic="/image", kind="Image")
+    robot.begin(image_type="raw")
+    robot.connected()
+    depth, grey = robot.site.file("depth", b"\1" * 2 * 320 * 240), robot.site.file("grey", b"\1" * 320 * 240)
+    for number in range(3):
+        fields: dict[str, object] = {"width": 320, "height": 240, "stamp": robot.BASE + number}
+        robot.peer.do("publish", topic="/image", kind="Image", encoding="16UC1", file=depth, **fields)
+        robot.peer.do("publish", topic="/image", kind="Image", encoding="bgr8", file=grey, **fields)
+    robot.says("bytes in rows of")
+    assert robot.log().count("'16UC1' of the Image is not supported") == 1
+
+
+def camera_info(robot: Robot, **fields: object) -> None:
+    plain: dict[str, object] = {"width": 320, "height": 240, "fx": 300.0, "fy": 300.0, "cx": 159.5, "cy": 119.5}
+    robot.peer.do("publish", topic="/camera_info", kind="CameraInfo", stamp=robot.BASE, **{**plain, **fields})
+
+
+def test_the_intrinsics_become_a_camera_of_the_map(image: Robot) -> None:
+    robot, server = image, image.site.server
+    mask = {"polygons": [[[0, 0.9], [1, 0.9], [1, 1], [0, 1]]]}
+    server.client.put("/v1/maps/walk/cameras/front", json={"mask": mask}).raise_for_status()
+    robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
+    robot.begin(use_camera_info=True, camera="front")
+    robot.connected()
+    robot.connected("/camera_info")
+    camera_info(robot)
+    until(lambda: "frames answered" in (robot.look(number=0), robot.says("")["values"])[1])
+    made = server.client.get("/v1/maps/walk/cameras/front").json()
+    assert made["intrinsics"]["fx"] == 300.0
+    assert made["mask"]["polygons"] == mask["polygons"], "the mask stays"
+    robot.peer.take("answer")
+    assert robot.asked(1)["answer"]["single"]["pose"].get("note") is None
+    camera_info(robot, fx=310.0)
+    until(
+        lambda: robot.asked(2) and server.client.get("/v1/maps/walk/cameras/front").json()["intrinsics"]["fx"] == 310.0
+    )
+
+
+def test_without_camera_info_it_goes_on_and_says_so(image: Robot) -> None:
+    robot, server = image, image.site.server
+    robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
+    robot.begin(use_camera_info=True)
+    robot.connected()
+    robot.connected("/camera_info")
+    until(lambda: (robot.look(number=0), robot.peer.take("answer"))[1])
+    assert "No CameraInfo has come on /camera_info" in robot.says("CameraInfo")["message"]
+    camera_info(robot, fx=0.0)
+    assert "not calibrated" in robot.says("The intrinsics are not used")["message"]
+    camera_info(robot, fx=305.0)
+
+    def named() -> list[str]:
+        robot.look(number=1)
+        items = server.client.get("/v1/maps/walk/cameras").json()["items"]
+        return [one["name"] for one in items if one["intrinsics"] and one["intrinsics"]["fx"] == 305.0]
+
+    assert until(named)[0].startswith("ros-")
+
+
+def test_a_key_that_may_not_define_cameras_is_said(image: Robot) -> None:
+    robot = image
+    robot.peer.do("advertise", topic="/camera_info", kind="CameraInfo")
+    robot.begin(use_camera_info=True, role="query")
+    robot.connected()
+    robot.connected("/camera_info")
+    camera_info(robot, fx=333.0)
+    until(lambda: (robot.look(number=0), robot.peer.take("answer"))[1])
+    said = robot.says("could not be sent to the map")
+    assert said["level"] == 1
+    assert "frames count without intrinsics" in said["message"]
+
+
+def odometry(robot: Robot, x: float, y: float, heading: float, ahead: int = 0) -> None:
+    """Publish odometry of the moment of the next frame, and give it time to arrive first."""
+    stamp = robot.BASE + 0.1 * (robot.frame + ahead)
+    robot.peer.do("publish", topic="/odom", kind="Odometry", stamp=stamp, x=x, y=y, heading=heading)
+    robot.peer.do("sleep", seconds=0.1)
+
+
+def test_odometry_moves_the_belief_and_gives_the_transform(image: Robot) -> None:
+    """The odometry's frame is turned by 90° and lies at (5, -2) of the map: x of the map is y of the odometry."""
+    robot = image
+    robot.peer.do("advertise", topic="/odom", kind="Odometry")
+    robot.begin()
+    robot.connected()
+    robot.connected("/odom")
+    answer: dict[str, Any] = {}
+    for number in range(6):
+        odometry(robot, -2.0, 5.0 - number, -90.0)
+        answer = robot.asked(number)
+    assert answer["answer"]["motion"] == "odometry"
+    assert answer["verdict"] == "recognized"
+    found = robot.peer.take("map_to_odom")[-1]
+    assert (found["frame"], found["child"]) == ("map", "odom")
+    assert found["heading"] == pytest.approx(90, abs=5)
+    pose = robot.peer.take("pose")[-1]
+    # Map = R(90°) * odometry + t, with the odometry at (-2, 0): t = pose - (0, -2).
+    assert (found["x"], found["y"]) == pytest.approx((pose["x"], pose["y"] + 2.0), abs=0.5)
+
+
+def test_a_map_is_created_and_enrolled_by_services(image: Robot) -> None:
+    robot, server = image, image.site.server
+    robot.peer.do("advertise", topic="/odom", kind="Odometry")
+    robot.begin(map="made", role="admin", sequence="patrol")
+    robot.connected()
+    robot.connected("/odom")
+    robot.look(number=0)
+    assert "unknown-map" in robot.says("The service refuses")["message"]
+    assert robot.peer.do("call", service="create_map")["success"]
+    again = robot.peer.do("call", service="create_map")
+    assert not again["success"] and "map-exists" in again["message"]
+    robot.frame += 10
+    robot.look(number=0)
+    refused = robot.peer.do("call", service="enrol_here")
+    assert not refused["success"] and "no odometry" in refused["message"]
+    for number in (0, 6, 12):
+        odometry(robot, float(number), 1.0, 30.0)
+        robot.look(encoded(robot.site.frames[number]))
+        robot.peer.do("sleep", seconds=0.1)
+        done = robot.peer.do("call", service="enrol_here")
+        assert done["success"], done["message"]
+    places = list(server.places("made").values())
+    assert [(one["pose"]["x"], one["pose"]["y"], round(one["pose"]["heading"])) for one in places] == [
+        (0.0, 1.0, 30),
+        (6.0, 1.0, 30),
+        (12.0, 1.0, 30),
+    ]
+    assert {one["sequence"] for one in places} == {"patrol"}
+    assert robot.transition("deactivate") and robot.transition("cleanup")
+    robot.begin(map="made", role="enrol")
+    robot.connected()
+    robot.connected("/odom")
+    odometry(robot, 50.0, 50.0, 0.0)
+    robot.look(encoded(stranger(77)))
+    robot.answers_settled()
+    refused = robot.peer.do("call", service="enrol_here")
+    assert not refused["success"] and "not localized" in refused["message"]
+
+
+def test_relocalize_forgets_the_belief(image: Robot) -> None:
+    robot = image
+    robot.begin()
+    robot.connected()
+    before = robot.drive(0, 3)
+    done = robot.peer.do("call", service="relocalize")
+    assert done["success"], done["message"]
+    after = robot.asked(3)
+    assert after["answer"]["frames"] == 1
+    assert after["answer"]["session"] != before["answer"]["session"]
+
+
+def test_annotated_pictures_are_made_for_those_who_look(image: Robot) -> None:
+    robot, server = image, image.site.server
+    robot.begin(picture_period=0.1)
+    robot.connected()
+    robot.drive(0, 2)
+
+    def queries() -> int:
+        return len(server.lines(message="request", method="POST", path="/v1/maps/walk/query"))
+
+    before = queries()
+    robot.peer.do("listen", topic="annotated/compressed")
+    stamps = [robot.look(number=number) for number in (2, 3)]
+    heard = until(lambda: robot.peer.take("annotated/compressed"))
+    assert heard[0]["format"] == "png"
+    assert bytes.fromhex(heard[0]["start"]) == b"\x89PNG\r\n\x1a\n"
+    assert round(heard[0]["stamp"], 3) in [round(stamp, 3) for stamp in stamps]
+    robot.answers_settled()
+    robot.peer.do("deafen", topic="annotated/compressed")
+    robot.peer.do("sleep", seconds=0.5)
+    made = until(lambda: queries() - before)
+    robot.drive(4, 6)
+    assert queries() - before == made <= 2
+
+
+@pytest.mark.parametrize(
+    ("role", "parameters", "said"),
+    [
+        ("", {}, "key-needed"),
+        ("query", {"map": "nowhere"}, "unknown-map"),
+        ("query", {"encoder": "m-region-vlad@" + "0" * 64}, "wrong-encoder"),
+    ],
+)
+def test_what_the_service_refuses_is_said_and_tried_again(
+    image: Robot, role: str, parameters: dict[str, Any], said: str
+) -> None:
+    robot = image
+    robot.begin(role=role, **parameters)
+    robot.connected()
+    robot.look(number=0)
+    status = robot.says(said)
+    assert status["level"] == 2
+    before = len(robot.site.server.lines(message="request"))
+    until(lambda: (robot.look(number=0), len(robot.site.server.lines(message="request")))[1] >= before + 2)
+    assert robot.log().count(f"({said})") == 1
+    assert robot.state == "active"

@@ -1,0 +1,105 @@
+"""Odometry between frames, and the transform from the map to the odometry."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from placerec_ros.odometry import MOST_KEPT, NANOSECONDS, Odometer, increment
+from placerec_ros.planar import Planar, map_to_odom, quaternion, wrapped, yaw_of
+from tests.clients.ros2.ros_messages import odometry
+
+poses = st.builds(Planar, *[st.floats(-50, 50)] * 2, st.floats(-3.1, 3.1))
+
+
+def at(odometer: Odometer, seconds: float) -> Planar | None:
+    return odometer.at(round(seconds * NANOSECONDS))
+
+
+def test_a_pose_is_interpolated_across_the_half_turn() -> None:
+    odometer = Odometer()
+    odometer.add(odometry(10.0, 0.0, 0.0, math.radians(170)))
+    odometer.add(odometry(10.4, 4.0, 2.0, math.radians(-170)))
+    found = at(odometer, 10.1)
+    assert found is not None
+    assert (found.x, found.y) == pytest.approx((1.0, 0.5))
+    assert math.degrees(found.yaw) == pytest.approx(175)
+    assert odometer.frame == "odom"
+    assert odometer.child == "base_link"
+
+
+def test_no_pose_is_made_up_where_odometry_is_missing() -> None:
+    odometer = Odometer()
+    assert at(odometer, 10.0) is None
+    odometer.add(odometry(10.0, 0.0, 0.0))
+    odometer.add(odometry(12.0, 1.0, 0.0))
+    assert at(odometer, 9.9) is None, "before the first"
+    assert at(odometer, 11.0) is None, "in a gap"
+    assert at(odometer, 12.05) == at(odometer, 12.0), "a little after the last"
+    assert at(odometer, 12.2) is None, "long after the last"
+
+
+def test_messages_out_of_order_are_sorted_and_a_clock_that_is_set_back_begins_anew() -> None:
+    odometer = Odometer()
+    for stamp in (10.0, 10.4, 10.2):
+        odometer.add(odometry(stamp, stamp, 0.0))
+    found = at(odometer, 10.3)
+    assert found is not None and found.x == pytest.approx(10.3)
+    odometer.add(odometry(5.0, 5.0, 0.0))
+    assert at(odometer, 10.2) is None
+    odometer.add(odometry(5.1, 5.0, 0.0, frame_id="map"))
+    assert at(odometer, 5.0) is None, "another frame is another odometry"
+
+
+def test_what_is_kept_is_bounded() -> None:
+    odometer = Odometer()
+    for number in range(3 * MOST_KEPT // 2):
+        odometer.add(odometry(100 + number * 1e-4, 0.0, 0.0))
+    assert len(odometer._poses) <= MOST_KEPT
+    for number in range(3000):
+        odometer.add(odometry(200 + number * 0.02, 0.0, 0.0))
+    assert len(odometer._poses) < 700, "ten seconds and a little"
+
+
+@pytest.mark.parametrize("broken", [(math.nan, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, math.inf)])
+def test_a_pose_that_is_none_is_refused(broken: tuple[float, float, float]) -> None:
+    message = odometry(1.0, broken[0], broken[1])
+    message.pose.pose.orientation.w = broken[2]
+    odometer = Odometer()
+    with pytest.raises(ValueError, match=r"finite|rotation"):
+        odometer.add(message)
+    assert odometer.frame == ""
+
+
+def test_the_motion_is_that_of_the_robot_or_of_a_camera_that_looks_aside() -> None:
+    before, after = Planar(3.0, 1.0, math.radians(90)), Planar(3.0, 3.0, math.radians(120))
+    straight = increment(before, after)
+    assert (straight.forward, straight.left, straight.turn) == pytest.approx((2.0, 0.0, 30.0))
+    aside = increment(before, after, camera_yaw=math.radians(90))
+    assert (aside.forward, aside.left, aside.turn) == pytest.approx((0.0, -2.0, 30.0))
+
+
+@given(poses, poses)
+def test_the_map_to_odom_transform_takes_odometry_to_the_map(in_map: Planar, in_odom: Planar) -> None:
+    found = map_to_odom(in_map, in_odom).then(in_odom)
+    assert (found.x, found.y) == pytest.approx((in_map.x, in_map.y), abs=1e-9)
+    assert abs(wrapped(found.yaw - in_map.yaw)) < 1e-9
+
+
+@given(poses, poses)
+def test_transforms_are_those_of_matrices(first: Planar, second: Planar) -> None:
+    def matrix(one: Planar) -> np.ndarray:
+        cos, sin = math.cos(one.yaw), math.sin(one.yaw)
+        return np.array([[cos, -sin, one.x], [sin, cos, one.y], [0, 0, 1]])
+
+    np.testing.assert_allclose(matrix(first.then(second)), matrix(first) @ matrix(second), atol=1e-9)
+    np.testing.assert_allclose(matrix(first.inverse()) @ matrix(first), np.eye(3), atol=1e-9)
+
+
+@given(st.floats(-3.14, 3.14))
+def test_quaternions_keep_the_heading(yaw: float) -> None:
+    assert yaw_of(*quaternion(yaw)) == pytest.approx(yaw)
