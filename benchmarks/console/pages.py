@@ -31,7 +31,7 @@ from core.storage import Atlas, Enrolment, MapSettings
 STEPS = 120
 DRAWN = """selector => {
   const canvas = document.querySelector(selector);
-  if (!canvas || !canvas.width || document.querySelector("main .loading")) return false;
+  if (!canvas || !canvas.width) return false;
   const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
   copy.drawImage(canvas, 0, 0);
   return new Uint32Array(copy.getImageData(0, 0, canvas.width, canvas.height).data.buffer).some(Boolean);
