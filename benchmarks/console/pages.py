@@ -31,10 +31,10 @@ from core.storage import Atlas, Enrolment, MapSettings
 STEPS = 120
 DRAWN = """selector => {
   const canvas = document.querySelector(selector);
-  if (!canvas || !canvas.width || document.querySelector("main .loading")) return false;
-  const copy = new OffscreenCanvas(64, 64).getContext("2d", { willReadFrequently: true });
-  copy.drawImage(canvas, 0, 0, 64, 64);
-  return copy.getImageData(0, 0, 64, 64).data.some((value) => value > 0);
+  if (!canvas || !canvas.width) return false;
+  const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  return new Uint32Array(copy.getImageData(0, 0, canvas.width, canvas.height).data.buffer).some(Boolean);
 }"""
 PAN = """steps => new Promise((done) => {
   const canvas = document.querySelector(".plan-canvas canvas[tabindex]");

@@ -25,6 +25,9 @@ const LAST_MAP = "placerec.map";
 
 const menuOpen = signal(false);
 
+// The view of the present address is fetched while the service is asked who we are.
+viewOf(route.value).entry?.[1]().catch(() => {});
+
 export function Frame() {
   const [refused, setRefused] = useState(null);
   const begin = () => {

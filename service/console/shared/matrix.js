@@ -24,8 +24,8 @@ export function Matrix({ data, layers, chosen, choose }) {
     fit();
     return () => observer.disconnect();
   }, [rows, columns]);
-  useEffect(() => drawCells(cells.current, data), [data, theme]);
-  useEffect(() => drawLines(lines.current, data, layers, chosen), [data, layers.join(), chosen.join(), size.join(), theme]);
+  useEffect(() => drawCells(cells.current, data), [data.bytes, theme]);
+  useEffect(() => drawLines(lines.current, data, layers, chosen), [data.stretches, data.counterparts, layers.join(), chosen.join(), size.join(), theme]);
   const cellAt = (event) => {
     const row = Math.floor((event.offsetY / lines.current.clientHeight) * rows);
     const column = Math.floor((event.offsetX / lines.current.clientWidth) * columns);

@@ -65,7 +65,9 @@ function Compare({ map, items, query }) {
   const asked = names.includes(query.query) ? query.query : names[1];
   const reference = names.includes(query.reference) ? query.reference : names.find((name) => name !== asked);
   const [job, setJob] = useState(null);
-  const compared = useResource((signal) => compare(map, asked, reference, signal), [map, asked, reference]);
+  const scores = useResource((signal) => readScores(map, asked, reference, signal), [map, asked, reference]);
+  const there = scores.data !== undefined;
+  const compared = useResource(async (signal) => (there ? get(mapPath(map, "similarity"), { query: asked, reference }, { signal }) : null), [map, asked, reference, there]);
   const choice = (name, value) => html`
     <select value=${value} onChange=${(event) => restate({ query: asked, reference, [name]: event.target.value })}>
       ${names.map((one) => html`<option value=${one}>${one}</option>`)}
@@ -85,20 +87,32 @@ function Compare({ map, items, query }) {
       </div>
       ${job?.error && html`<${Trouble} error=${job.error} />`}
       ${job?.id && html`<section class="panel"><${Alignment} key=${job.id} job=${job} changed=${compared.reload} /></section>`}
-      ${compared.loading && html`<${Loading} what="Comparing all frames" />`}
+      ${scores.loading && html`<${Loading} what="Comparing all frames" />`}
+      ${there && compared.loading && html`<${Loading} what="Looking for a path" />`}
+      ${scores.error && html`<${Trouble} error=${scores.error} again=${scores.reload} />`}
       ${compared.error && html`<${Trouble} error=${compared.error} again=${compared.reload} />`}
-      ${compared.data && html`<${Comparison} key=${`${asked}/${reference}`} map=${map} data=${compared.data} />`}
+      ${there && html`<${Comparison} key=${`${asked}/${reference}`} map=${map} data=${{ ...scores.data, ...compared.data }} />`}
     </section>
   `;
 }
 
-/** The comparison, with its scores as bytes. */
-async function compare(map, query, reference, signal) {
-  const path = mapPath(map, "similarity");
-  const told = await get(path, { query, reference }, { signal });
+/** The scores as bytes, to be drawn while the path is looked for; without it, as far as it is known yet. */
+async function readScores(map, query, reference, signal) {
   const headers = { Accept: "application/octet-stream" };
-  const answer = await send("GET", path, { query: { query, reference }, headers, signal });
-  return { ...told, bytes: new Uint8Array(await answer.arrayBuffer()) };
+  const answer = await send("GET", mapPath(map, "similarity"), { query: { query, reference }, headers, signal });
+  const [rows, columns, low, high] = ["x-rows", "x-columns", "x-low", "x-high"].map((name) => Number(answer.headers.get(name)));
+  return {
+    bytes: new Uint8Array(await answer.arrayBuffer()),
+    rows,
+    columns,
+    scale: { low, high },
+    query: { sequence: query, places: null },
+    reference: { sequence: reference, places: null },
+    stretches: [],
+    truth: null,
+    counterparts: null,
+    milliseconds: null,
+  };
 }
 
 function Alignment({ job, changed }) {
@@ -135,8 +149,8 @@ function Comparison({ map, data }) {
       </div>
       <div class="stack">
         <section class="panel" aria-label="Pair">
-          <${Frame} map=${map} id=${data.query.places[row]} note=${`frame ${integer(row + 1)} of ${data.query.sequence}`} />
-          <${Frame} map=${map} id=${data.reference.places[column]} note=${`frame ${integer(column + 1)} of ${data.reference.sequence}`} />
+          ${data.query.places && html`<${Frame} map=${map} id=${data.query.places[row]} note=${`frame ${integer(row + 1)} of ${data.query.sequence}`} />`}
+          ${data.reference.places && html`<${Frame} map=${map} id=${data.reference.places[column]} note=${`frame ${integer(column + 1)} of ${data.reference.sequence}`} />`}
           <${Facts} rows=${[
             ["Score", decimal(scoreAt(data, row, column))],
             data.truth && ["Truth", data.truth[row] === null ? "no place near" : `frame ${integer(data.truth[row] + 1)}`],
@@ -149,7 +163,7 @@ function Comparison({ map, data }) {
             ["Scores", `${decimal(data.scale.low)} to ${decimal(data.scale.high)}`],
             ["Stretches found", integer(data.stretches.length)],
             data.truth && ["On the truth", truthText(data)],
-            ["Took", milliseconds(data.milliseconds.total)],
+            data.milliseconds && ["Took", milliseconds(data.milliseconds.total)],
           ]} />
         </section>
       </div>
