@@ -16,7 +16,7 @@ MOST_MAPS = 1000
 """Maps that one key may be limited to."""
 
 KeyRole = Literal["query", "enrol", "admin"]
-MapIds = Annotated[list[str], Field(min_length=1, max_length=MOST_MAPS)]
+MapIds = Annotated[list[Annotated[str, Field(max_length=64)]], Field(min_length=1, max_length=MOST_MAPS)]
 
 NEW_KEY_EXAMPLE: dict[str, Any] = {
     "name": "robot-7",

@@ -401,6 +401,7 @@ class Jobs:
         """Tell the listeners of the job's maps how it is; that it only went on is told at most once in a while."""
         used, events = job.used_maps(), self._events
         if events is None or not any(events.heard(name) for name in used if name is not None):
+            self._told.pop(job.id, None)
             return
         state, now = f"{job.state} {job.cancelling}", time.monotonic()
         told, moment = self._told.get(job.id, ("", 0.0))
@@ -408,7 +409,7 @@ class Jobs:
             return
         self._told[job.id] = (state, now)
         if job.ended:
-            del self._told[job.id]
+            self._told.pop(job.id, None)
         for name in used - {None}:
             events.publish(_event(str(name), job), maps=frozenset(used))
 

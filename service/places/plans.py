@@ -20,6 +20,9 @@ MOST_PLACES = 200_000
 MOST_BYTES = 64 * 1024 * 1024
 """Bytes of all compressed plans that are kept together."""
 
+MOST_KEPT = 64
+"""Plans that are kept together: small ones, such as those of many steps, weigh more than their bytes."""
+
 FAST = 1
 """The level of gzip: a higher one takes longer than a local network saves."""
 
@@ -94,7 +97,7 @@ class Plans:
             before = self._kept.pop(key, None)
             self._bytes += len(plan.compressed) - (0 if before is None else len(before.compressed))
             self._kept[key] = plan
-            while self._bytes > MOST_BYTES:
+            while self._bytes > MOST_BYTES or len(self._kept) > MOST_KEPT:
                 _, oldest = self._kept.popitem(last=False)
                 self._bytes -= len(oldest.compressed)
 

@@ -263,8 +263,6 @@ def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: En
     map_, wanted = engine.atlas.get(map_id), order.wanted()
     choose = map_.ids_of if order.dry_run else map_.forget_all
     found = choose(wanted, MOST_FORGOTTEN)
-    if not order.dry_run:
-        tell_change(engine, map_, "deleted", len(found))
     changed = {} if found and not order.dry_run else {"change": None}
     if not order.dry_run:
         tell_change(engine, map_, "deleted", len(found))

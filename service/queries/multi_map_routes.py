@@ -208,8 +208,9 @@ def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
 
 
 def _tell(engine: Engine, report: MapReport, frames: Sequence[RigFrame], milliseconds: dict[str, float]) -> None:
-    """Tell the listeners of a map how it answered; of a rig the first frame is shown."""
-    if engine.events.heard(report.map_id) and (found := _whole_answer(report)) is not None:
+    """Tell the listeners of a map how it answered, and keep the frame for review; of a rig it is the first frame."""
+    keeps = report.map_ is not None and report.map_.record.review is not None
+    if (keeps or engine.events.heard(report.map_id)) and (found := _whole_answer(report)) is not None:
         map_, answer = found
         follow_answer(engine, map_, answer, frames[0].data, frames[0].camera, milliseconds=milliseconds)
 

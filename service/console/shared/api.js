@@ -64,7 +64,11 @@ export function may(role) {
 export const everyMap = computed(() => caller.value !== null && caller.value.maps === null);
 
 export async function useKey(text) {
-  key.value = text.trim();
+  const given = text.trim();
+  if (!/^[!-~]*$/.test(given)) {
+    throw Object.assign(new Error("A key consists of letters, digits, - and _."), { title: "This is no key" });
+  }
+  key.value = given;
   try {
     if (key.value) sessionStorage.setItem(KEY, key.value);
     else sessionStorage.removeItem(KEY);
@@ -72,7 +76,12 @@ export async function useKey(text) {
     // It is kept in memory only.
   }
   keyNeeded.value = null;
-  await identify();
+  try {
+    await identify();
+  } catch (error) {
+    if (error instanceof Problem) keyNeeded.value = error; // Without who we are there is nothing to show.
+    throw error;
+  }
   epoch.value += 1;
 }
 

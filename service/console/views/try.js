@@ -15,10 +15,18 @@ export default function Try({ map }) {
   const [asked, setAsked] = useState([]);
   const [shown, setShown] = useState(null);
   const number = useRef(0);
-  const urls = useRef([]);
+  const urls = useRef(new Map());
   const present = useRef(options);
   present.current = options;
-  useEffect(() => () => urls.current.forEach((url) => URL.revokeObjectURL(url)), []);
+  const forget = (kept) => {
+    for (const [id, url] of urls.current) {
+      if (kept.has(id)) continue;
+      URL.revokeObjectURL(url);
+      urls.current.delete(id);
+    }
+  };
+  useEffect(() => forget(new Set(asked.map((one) => one.id))), [asked]);
+  useEffect(() => () => forget(new Set()), []);
   useEffect(() => {
     if (handedOver.value) {
       ask([handedOver.value]);
@@ -34,7 +42,7 @@ export default function Try({ map }) {
     for (const one of added) {
       try {
         const frame = await readable(one.file);
-        urls.current.push(frame.url);
+        urls.current.set(one.id, frame.url);
         change(one.id, { frame, state: "asking" });
         const answer = await query(map, frame, present.current);
         change(one.id, { answer, state: "answered" });

@@ -151,6 +151,7 @@ def test_what_cannot_be_a_key_is_refused(keyed: Server) -> None:
         {"name": "x", "role": "open"},
         {"name": "x", "role": "query", "expires_at": "2020-01-01T00:00:00Z"},
         {"name": "x", "role": "query", "maps": []},
+        {"name": "x", "role": "query", "maps": ["a" * 300_000]},
         {"name": "x", "role": "query", "rate": 3},
         {"name": "x"},
     ]

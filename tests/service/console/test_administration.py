@@ -100,6 +100,36 @@ def test_a_key_is_asked_for_and_a_wrong_one_refused(visit: Visit, keyed: Server,
     page.get_by_text("The service asks for a key.").wait_for()
 
 
+def test_what_can_be_no_key_is_not_sent(visit: Visit, keyed: Server, keys: dict[str, str]) -> None:
+    operator = visit(None)
+    operator.foresee("401")
+    page = operator.page
+    page.goto(f"{operator.root}/console#/maps")
+    page.get_by_label("Key").fill("placerec_c69fcf6b7439_\u2026")  # a browser throws at such a header
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("alert").get_by_text("This is no key").wait_for()
+    page.get_by_label("Key").fill(keys["query"])
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("link", name=LAB, exact=True).wait_for()
+
+
+def test_a_key_can_be_typed_again_after_the_service_refused_to_look_at_it(
+    visit: Visit, keyed: Server, keys: dict[str, str]
+) -> None:
+    operator = visit(None)
+    operator.foresee("401", "429")
+    page = operator.page
+    page.goto(f"{operator.root}/console#/maps")
+    page.get_by_label("Key").fill(keys["query"])
+    page.route("**/v1/key", lambda route: route.fulfill(status=429, json={"title": "Too many wrong keys"}))
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("alert").get_by_text("Too many wrong keys").first.wait_for()
+    page.unroute("**/v1/key")
+    page.get_by_label("Key").fill(keys["query"])
+    page.get_by_role("button", name="Use the key").click()
+    page.get_by_role("link", name=LAB, exact=True).wait_for()
+
+
 def test_a_key_that_is_revoked_meanwhile_is_asked_for_again(visit: Visit, keyed: Server) -> None:
     key, text = KeyStore(keyed.data_dir).create("soon-gone", "query")
     operator = visit(None)

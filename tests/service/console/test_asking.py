@@ -14,6 +14,7 @@ from tests.service.console.conftest import Operator, Visit
 from tests.service.console.world import LAB, foreign_frame, frame_again
 from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import Server
+from tests.service.wire import eventually
 
 
 @pytest.fixture
@@ -56,6 +57,27 @@ def test_several_pictures_are_asked_one_after_the_other_and_a_bad_one_fails_alon
     told = {row.split("\t")[0]: row for row in rows.all_inner_texts()[1:]}
     assert "recognized" in told["known.jpg"] and "recognized" in told["known.bmp"]
     assert "recognized" not in told["foreign.jpg"]
+
+
+def test_the_pictures_of_frames_that_are_cleared_are_given_up(admin: Operator, pictures: Path) -> None:
+    page = admin.go(f"maps/{LAB}/try")
+    page.evaluate("""() => {
+        window.living = new Set();
+        const { createObjectURL, revokeObjectURL } = URL;
+        URL.createObjectURL = (blob) => {
+            const url = createObjectURL(blob);
+            if (blob instanceof File) living.add(url);  // others are pictures of places
+            return url;
+        };
+        URL.revokeObjectURL = (url) => { living.delete(url); revokeObjectURL(url); };
+    }""")
+    page.get_by_label("Pictures").set_input_files([pictures / "foreign.jpg", pictures / "text.jpg"])
+    rows = page.get_by_role("region", name="Frames", exact=True).get_by_role("row")
+    page.get_by_text("Not a picture").wait_for()
+    assert rows.count() == 3
+    assert page.evaluate("living.size") == 1
+    page.get_by_role("button", name="Clear").click()
+    assert eventually(lambda: page.evaluate("living.size") == 0)
 
 
 def test_the_request_as_curl_does_the_same(admin: Operator, keys: dict[str, str], pictures: Path) -> None:

@@ -141,12 +141,15 @@ def test_enrolments_are_told_by_commit(quick: Server, lab: str) -> None:
             f"/v1/maps/{lab}/query:enrol?id=new", content=jpeg(77), headers=typed(jpeg(77))
         ).json()
         assert closed["change"] == "created", closed
-        told = ear.some(8, "enrolment")
+        order = {"ids": ["b0", "b1"], "dry_run": False}
+        assert quick.client.post(f"/v1/maps/{lab}/places:forget", json=order).json()["places"] == 2
+        assert quick.client.delete(f"/v1/maps/{lab}/places/b2").is_success
+        told = ear.some(10, "enrolment")
     assert [one.data["changes"] for one in told] == [
         {"created": 1}, {"replaced": 1}, {"created": 3}, {"updated": 1}, {"deleted": 1}, {"deleted": 3},
-        {"created": 3}, {"created": 1},
+        {"created": 3}, {"created": 1}, {"deleted": 2}, {"deleted": 1},
     ]  # fmt: skip
-    assert [one.data["total"] for one in told] == [4, 4, 7, 7, 6, 3, 6, 7]
+    assert [one.data["total"] for one in told] == [4, 4, 7, 7, 6, 3, 6, 7, 5, 4]
     assert told[0].data["places"] == [
         {"id": "p9", "change": "created", "sequence": None, "camera": None}
         | {"pose": told[0].data["places"][0]["pose"]}

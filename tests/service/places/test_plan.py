@@ -124,3 +124,13 @@ def test_poses_that_were_handed_over_are_marked(tmp_path: Path) -> None:
         write.connection.execute("UPDATE places SET pose_of = 'p0' WHERE id = 'p1'")
     assert f'"flags":[{0},{HANDED_OVER}]' in lab.plan.columns().replace("2", "0").replace("3", "1")
     atlas.close()
+
+
+def test_only_the_plans_that_were_asked_for_last_are_kept(tmp_path: Path) -> None:
+    atlas = Atlas(tmp_path)
+    lab = atlas.create("lab", "e@1", DIMENSION, MapSettings(), LOCAL_SHAPE)
+    made, steps = plans.Plans(), range(1, plans.MOST_KEPT + 3)
+    for step in steps:
+        made.make(lab, step)
+    assert [step for step in steps if made.kept(lab, step) is not None] == list(steps[2:])
+    atlas.close()

@@ -183,14 +183,15 @@ def test_sessions_and_batches_are_kept_too_and_survive_a_kill(tmp_path: Path) ->
     assert server.client.post(path, content=jpeg(1), headers=typed(jpeg(1))).is_success
     form = {name: (name, jpeg(number), "image/jpeg") for number, name in enumerate(("two", "three"), start=2)}
     assert server.client.post("/v1/maps/lab/query:batch", files=form).is_success
-    found = kept(server, "lab", 3)
+    assert server.client.post("/v1/query?maps=lab", content=jpeg(4), headers=typed(jpeg(4))).is_success
+    found = kept(server, "lab", 4)
     assert {(one["answer"]["session"], one["answer"]["frame"], one["answer"]["file"]) for one in found} == {
-        (session, 3, None), (None, None, "two"), (None, None, "three"),
+        (session, 3, None), (None, None, "two"), (None, None, "three"), (None, None, None),
     }  # fmt: skip
     label(server, "lab", found[0]["id"], stranger=True)
     server.kill()
     server = Server(tmp_path, {"encoder": COARSE}).wait()
-    again = kept(server, "lab", 3)
+    again = kept(server, "lab", 4)
     assert [one["id"] for one in again] == [one["id"] for one in found] and again[0]["label"]["stranger"]
     assert server.client.post("/v1/maps/lab/verify").json()["ok"]
     assert server.stop() == 0
