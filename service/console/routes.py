@@ -6,7 +6,7 @@ from fastapi import APIRouter, HTTPException, Request
 from starlette.responses import RedirectResponse, Response
 
 from service.console.files import ConsoleFile, console_files
-from service.http.headers import is_known
+from service.http.headers import accepts_gzip, is_known
 
 router = APIRouter(include_in_schema=False)
 
@@ -67,6 +67,6 @@ def _answer(request: Request, file: ConsoleFile, caching: str) -> Response:
     headers = {**HEADERS, "Cache-Control": caching, "ETag": f'"{file.tag}"'}
     if is_known(request.headers, file.tag):
         return Response(status_code=304, headers=headers)
-    if "gzip" in request.headers.get("accept-encoding", ""):
+    if accepts_gzip(request.headers.get("accept-encoding")):
         return Response(file.compressed, media_type=file.media_type, headers=headers | {"Content-Encoding": "gzip"})
     return Response(file.content, media_type=file.media_type, headers=headers)
