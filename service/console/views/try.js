@@ -115,7 +115,6 @@ function Webcam({ ask, close }) {
       stream = await navigator.mediaDevices.getUserMedia({ video: { facingMode: "environment", width: { ideal: 1280 } } });
       if (gone) return stop();
       video.current.srcObject = stream;
-      setReady(true);
       return undefined;
     };
     const stop = () => stream?.getTracks().forEach((track) => track.stop());
@@ -149,7 +148,7 @@ function Webcam({ ask, close }) {
   }, [repeated]);
   if (error) return html`<${Trouble} error=${error} close=${close} />`;
   return html`
-    <video ref=${video} autoplay muted playsinline aria-label="What the webcam sees"></video>
+    <video ref=${video} onLoadedData=${() => setReady(true)} autoplay muted playsinline aria-label="What the webcam sees"></video>
     <div class="row">
       <button type="button" class="primary" disabled=${!ready} onClick=${take}>Ask with this frame</button>
       <label class="row"><input type="checkbox" checked=${repeated} onChange=${() => setRepeated(!repeated)} /> every second</label>
