@@ -1,7 +1,7 @@
 // The pieces that views are made of.  Everything that a user may have written is put in as text.
 import { Problem } from "./api.js";
 import { exact, percent, relative } from "./formats.js";
-import { html, signal, useEffect, useId, useRef, useState } from "./view.js";
+import { html, signal, useEffect, useId, useLayoutEffect, useRef, useState } from "./view.js";
 
 // States
 
@@ -123,10 +123,14 @@ export function Field({ label, hint, children, inline = false }) {
 export function Dialog({ title, close, wide = false, children }) {
   const element = useRef(null);
   const id = useId();
-  useEffect(() => {
+  useLayoutEffect(() => {
     const before = document.activeElement;
-    element.current.showModal();
-    return () => before?.focus?.();
+    const shown = element.current;
+    shown.showModal();
+    return () => {
+      shown.close(); // while it is open, nothing behind it takes the focus
+      before?.focus?.();
+    };
   }, []);
   const cancelled = (event) => {
     event.preventDefault();
