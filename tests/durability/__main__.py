@@ -7,7 +7,6 @@ import secrets
 import shutil
 import tempfile
 import time
-from contextlib import ExitStack
 from pathlib import Path
 from random import Random
 
@@ -55,8 +54,8 @@ def points(folder: Path, arguments: argparse.Namespace) -> str:
 def power(folder: Path, arguments: argparse.Namespace) -> str:
     """Trace that process, or the service, and lose all or part of what was not synced."""
     total = PowerTally()
-    with StorageProcesses(folder, unsynced=arguments.unsynced) as processes, ExitStack() as stack:
-        servers = stack.enter_context(ServerProcesses(folder)) if arguments.server else None
+    servers = ServerProcesses(folder) if arguments.server else None
+    with StorageProcesses(folder, unsynced=arguments.unsynced) as processes:
         for number in range(arguments.runs):
             work, seed = folder / f"run-{number}", f"{arguments.seed}/{number}"
             work.mkdir()
@@ -71,8 +70,8 @@ def power(folder: Path, arguments: argparse.Namespace) -> str:
 
 def server(folder: Path, arguments: argparse.Namespace) -> str:
     """Kill the whole service at random moments, while several clients use it."""
-    campaign = ServerKills(folder, arguments.seed)
-    with StorageProcesses(folder) as processes, ServerProcesses(folder) as servers:
+    campaign, servers = ServerKills(folder, arguments.seed), ServerProcesses(folder)
+    with StorageProcesses(folder) as processes:
         for kills in range(1, arguments.kills + 1):
             campaign.run(processes, servers, kills)
             print(campaign.tally, flush=True)

@@ -56,9 +56,8 @@ def test_storage_that_does_not_sync_is_found_out(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ServerProcesses]:
-    with ServerProcesses(tmp_path_factory.mktemp("servers")) as servers:
-        yield servers
+def servers(tmp_path_factory: pytest.TempPathFactory) -> ServerProcesses:
+    return ServerProcesses(tmp_path_factory.mktemp("servers"))
 
 
 def test_a_service_killed_while_clients_use_it_loses_nothing(

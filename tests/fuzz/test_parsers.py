@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
@@ -34,7 +34,7 @@ from service.queries.parameters import FilterParameters, parse_box
 from service.telemetry.requests import read_trace
 from tests.fuzz.encoder import NETWORK, SMALL, install_small_encoder
 
-FEW = settings(max_examples=60, deadline=10_000, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+FEW = settings(max_examples=60, deadline=10_000, derandomize=True)
 
 Reader = Callable[[Path], object]
 

@@ -16,7 +16,8 @@ from typing import Any
 
 import httpx
 
-ROOT = Path(__file__).parents[2]
+from tests.service.forks import ROOT, ForkedServer
+
 START_SECONDS = 120.0
 
 
@@ -28,7 +29,7 @@ def free_port() -> int:
 
 
 class Server:
-    """``placerec serve`` in a process of its own.
+    """``placerec serve`` in a process of its own, forked off one that has imported everything unless it is wrapped.
 
     Args:
         folder: for its data and its log.
@@ -50,10 +51,13 @@ class Server:
         environment = {name: value for name, value in os.environ.items() if not name.startswith("PLACEREC_")}
         own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, **(settings or {})}
         environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
-        environment["PYTHONFAULTHANDLER"] = "1"  # should it crash, its log says where
-        command = [*wrapper, sys.executable, "-m", "service.commands", "serve"]
-        with self.log_file.open("ab") as log:
-            self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+        self.process: ForkedServer | subprocess.Popen[bytes]
+        if wrapper:
+            command = [*wrapper, sys.executable, "-m", "service.commands", "serve"]
+            with self.log_file.open("ab") as log:
+                self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)
+        else:
+            self.process = ForkedServer(environment, self.log_file)
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
         self.client = httpx.Client(base_url=f"http://127.0.0.1:{self.port}", timeout=60, headers=headers)
 

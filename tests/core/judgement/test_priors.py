@@ -91,7 +91,7 @@ def test_a_disc_on_the_earth_is_measured_along_the_ground(p: float, t: float, q:
 
 
 @given(latitudes, longitudes, latitudes, longitudes, latitudes, longitudes)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_a_box(south: float, west: float, north: float, east: float, latitude: float, longitude: float) -> None:
     south, north = sorted((south, north))
     inside_height = south <= latitude <= north

@@ -19,7 +19,7 @@ def apart(rows: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @pytest.mark.parametrize("contiguous", [True, False])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32), rows=st.integers(0, 6), blocks=st.integers(1, 5))
 def test_products_are_those_of_the_values_meant(contiguous: bool, seed: int, rows: int, blocks: int) -> None:
     random = np.random.default_rng(seed)

@@ -72,7 +72,7 @@ def run(definition: NetworkDefinition, weights: dict[str, Tensor], outputs: list
 # Layers
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     channels=st.integers(1, 12),
     half=st.integers(0, 3),
@@ -94,7 +94,7 @@ def test_normalization_follows_its_formula(channels: int, half: int, alpha: floa
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     height=st.integers(3, 20),
     width=st.integers(3, 20),

@@ -165,4 +165,4 @@ class MapHistory(RuleBasedStateMachine):
 
 
 TestMapHistory = MapHistory.TestCase
-TestMapHistory.settings = settings(max_examples=25, stateful_step_count=20, deadline=None)
+TestMapHistory.settings = settings(max_examples=25, stateful_step_count=20)

@@ -21,7 +21,6 @@ def where(kinds: list[int], x: list[float], sequences: list[int] | None = None) 
     return Whereabouts(np.array(kinds, np.int8), position, codes, ordinal)
 
 
-@settings(deadline=None)  # the first example imports SciPy
 @given(
     st.lists(
         st.tuples(
@@ -68,7 +67,7 @@ def graphs(draw: st.DrawFn) -> Graph:
 
 
 @given(graphs())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_whatever_goes_has_a_stand_in_that_stays(graph: Graph) -> None:
     places, pairs, similarity, least = graph
     kept = thinned(places, pairs, similarity, least)

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from core.frames.images import Limits, decode
@@ -81,7 +81,6 @@ async def test_the_oldest_events_go_by_number_and_by_bytes(monkeypatch: pytest.M
     assert numbers(listener) == (4, [30])
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.one_of(st.tuples(st.just("add"), st.integers(1, 30)), st.tuples(st.just("read"), st.integers(1, 12))))
 )

@@ -272,7 +272,7 @@ def test_any_byte_that_is_changed_is_noticed(content: bytes, tmp_path: Path) -> 
     assert missed == []
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_what_is_cut_moved_or_overwritten_is_noticed(content: bytes, tmp_path: Path, data: st.DataObject) -> None:
     start = data.draw(st.integers(0, len(content)))

@@ -280,7 +280,7 @@ def test_searches_while_a_writer_appends() -> None:
     assert faults == []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     steps=st.lists(
         st.one_of(
