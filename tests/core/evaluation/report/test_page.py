@@ -223,7 +223,6 @@ def test_one_query_and_one_reference(tmp_path: Path) -> None:
 
 
 def test_twenty_systems(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("core.evaluation.report.charts.DPI", 50)  # a quarter of the pixels
     # Two plots of each system, which take most of the time and know of no other system.
     monkeypatch.setattr("core.evaluation.report.closeup.plot_fates", lambda *_: [])
     comparison = make_comparison(tmp_path, systems=20, kept=range(6))
