@@ -334,7 +334,7 @@ def test_arbitrary_bytes_are_refused(data: bytes) -> None:
         decode(data)
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(
     st.sampled_from([b"\xff\xd8\xff", PNG_SIGNATURE, PNG_SIGNATURE + png_header(20, 20), b"RIFF\0\1\0\0WEBPVP8X"]),
     st.binary(max_size=300),
@@ -355,7 +355,7 @@ REAL = [
 ]
 
 
-@settings(max_examples=600)
+@settings(max_examples=200)
 @given(st.sampled_from(REAL), st.data())
 def test_mutated_images_are_refused_or_decoded(data: bytes, draw: st.DataObject) -> None:
     mutated = bytearray(data)

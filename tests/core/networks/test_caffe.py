@@ -241,7 +241,7 @@ TARGETS = [
 ]
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(TARGETS), st.data())
 def test_a_mutated_model_is_refused_or_imported(
     imported: Any, monkeypatch: pytest.MonkeyPatch, content: bytes, draw: st.DataObject

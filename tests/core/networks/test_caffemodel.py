@@ -87,7 +87,7 @@ NPY_HEADER = b"\x93NUMPY\x01\0\x76\0{'descr': '<f4', 'fortran_order': False, 'sh
 WHOLE = {"mean.npy": NPY_HEADER + bytes(48), "mean.binaryproto": binaryproto(IMAGE)}
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(WHOLE)), st.integers(0, 140), st.integers(0, 3), st.binary(max_size=4))
 def test_a_mutated_mean_file_is_refused_or_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, place: int, removed: int, added: bytes

@@ -101,9 +101,9 @@ def write_caffemodels(folder: Path) -> list[Path]:
 @pytest.mark.parametrize(
     ("reader", "count", "write", "read_it"),
     [
-        ("core.networks.matfiles", 400, write_mats, read_mat),
-        ("core.networks.checkpoints", 60, write_checkpoints, read_checkpoint),
-        ("core.networks.caffemodel:network", 120, write_caffemodels, read_caffemodel),
+        ("core.networks.matfiles", 150, write_mats, read_mat),
+        ("core.networks.checkpoints", 30, write_checkpoints, read_checkpoint),
+        ("core.networks.caffemodel:network", 60, write_caffemodels, read_caffemodel),
     ],
 )
 def test_damaged_files_harm_nobody(
