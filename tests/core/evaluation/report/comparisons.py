@@ -119,8 +119,24 @@ class Page(HTMLParser):
 
 def written_page(folder: Path, comparison: Comparison) -> Page:
     """The page of a comparison, written to a folder and read again."""
+    return page_of(folder, comparison)[1]
+
+
+def page_of(folder: Path, comparison: Comparison) -> tuple[str, Page]:
+    """The same, and its text."""
     write_report(folder, comparison)
-    return read_page((folder / "index.html").read_text("utf-8"))
+    html = (folder / "index.html").read_text("utf-8")
+    return html, read_page(html)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A report with all its sections."""
+
+    comparison: Comparison
+    folder: Path
+    html: str
+    page: Page
 
 
 def read_page(html: str) -> Page:

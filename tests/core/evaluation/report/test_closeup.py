@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.core.evaluation.report.comparisons import make_comparison, written_page
+from tests.core.evaluation.report.comparisons import Written, make_comparison, written_page
 
 
 def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
@@ -27,10 +27,10 @@ def test_counts_are_those_of_the_evaluation(tmp_path: Path) -> None:
     assert {"scores-after-system-0.png", "scores-before-system-0.png", "similarity-system-0.png"} <= names
 
 
-def test_system_is_described(tmp_path: Path) -> None:
-    page = written_page(tmp_path / "report", make_comparison(tmp_path, systems=1))
-    (section,) = page.named("section", "run")
+def test_system_is_described(written: Written) -> None:
+    page, system = written.page, written.comparison.runs[0].about.name
+    section = page.named("section", "run")[0]
     assert section.attributes["id"] == "run-0" and "Somebody, 2020." in section.text
-    (details,) = page.named("details")
-    for name, value in (("N", "300"), ("layers", "conv3 conv4"), ("identity", "system-0@0123456789abcdef")):
+    details = page.named("details")[0]
+    for name, value in (("N", "300"), ("layers", "conv3 conv4"), ("identity", f"{system}@0123456789abcdef")):
         assert f"{name}{value}" in details.text

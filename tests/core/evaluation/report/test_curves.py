@@ -7,7 +7,7 @@ from core.evaluation import Comparison
 from core.evaluation.protocol.trust import trust_figures
 from core.evaluation.report.curves import plot_pr, plot_recall, plot_reliability, plot_roc
 from core.evaluation.report.theme import Cast
-from tests.core.evaluation.report.comparisons import make_comparison, written_page
+from tests.core.evaluation.report.comparisons import Written, make_comparison, written_page
 
 
 def test_texts_name_all_systems_and_their_areas(tmp_path: Path) -> None:
@@ -60,8 +60,7 @@ def test_the_diagram_and_its_table(tmp_path: Path) -> None:
     assert f"({first.believed_precision.low:.3f}–{first.believed_precision.high:.3f})" in cells[4]
 
 
-def test_without_probabilities_there_is_no_section(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path)
-    assert plot_reliability(comparison.runs, Cast(comparison.runs)) is None
-    page = written_page(tmp_path / "report", comparison)
-    assert "reliability" not in [section.attributes.get("id") for section in page.named("section")]
+def test_without_probabilities_there_is_no_section(written: Written) -> None:
+    runs = written.comparison.runs
+    assert plot_reliability(runs, Cast(runs)) is None
+    assert "reliability" not in [section.attributes.get("id") for section in written.page.named("section")]

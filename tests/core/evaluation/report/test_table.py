@@ -7,7 +7,7 @@ import numpy as np
 
 from core.evaluation.report.table import columns, stages
 from core.frames.traverses import tolerance_truth
-from tests.core.evaluation.report.comparisons import make_comparison, make_run, written_page
+from tests.core.evaluation.report.comparisons import Written, make_comparison, make_run, written_page
 
 
 def test_columns_without_any_figure_are_left_out(tmp_path: Path) -> None:
@@ -48,9 +48,8 @@ def test_a_missing_figure_cannot_be_mistaken_for_a_number(tmp_path: Path) -> Non
     assert all("data-value" not in cell.attributes for cell in missing)
 
 
-def test_sorted_as_it_comes(tmp_path: Path) -> None:
-    comparison = make_comparison(tmp_path, systems=2)
-    page = written_page(tmp_path / "report", comparison)
+def test_sorted_as_it_comes(written: Written) -> None:
+    page = written.page
     sorted_heads = [head for head in page.named("th") if "aria-sort" in head.attributes]
     assert [(head.text, head.attributes["aria-sort"]) for head in sorted_heads] == [("AUC-PR", "descending")]
-    assert len(page.named("button")) == len(columns(comparison.runs)) + 1
+    assert len(page.named("button")) == len(columns(written.comparison.runs)) + 1

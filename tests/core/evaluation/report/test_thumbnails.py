@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from core.evaluation.report.thumbnails import LONGEST, Thumbnails
-from tests.core.evaluation.report.comparisons import make_comparison, write_images, written_page
+from tests.core.evaluation.report.comparisons import Written, write_images
 
 
 def test_an_image_is_kept_once_and_small(tmp_path: Path) -> None:
@@ -47,8 +47,8 @@ def test_what_is_no_image(tmp_path: Path) -> None:
     assert thumbnails.kept == []
 
 
-def test_each_is_stored_once_and_shown_by_its_id(tmp_path: Path) -> None:
-    page = written_page(tmp_path / "report", make_comparison(tmp_path, systems=2))
+def test_each_is_stored_once_and_shown_by_its_id(written: Written) -> None:
+    page = written.page
     stored = [str(image.attributes["id"]) for image in page.named("image")]
     shown = [str(use.attributes["href"]) for use in page.named("use") if "href" in use.attributes]
     assert 0 < len(stored) == len(set(stored)) < len(shown)
