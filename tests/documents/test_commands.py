@@ -40,8 +40,16 @@ def name_of(page: Path) -> str:
     return page.relative_to(ROOT).with_suffix("").as_posix()
 
 
-def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
-    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that ``examples/make_pictures.py`` makes, which every page begins with."""
+    folder = tmp_path_factory.mktemp("made")
+    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], folder, dict(os.environ))
+    return folder / "pictures"
+
+
+def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
+    shutil.copytree(pictures, tmp_path / "pictures")
     (program,) = PYTHON.findall((ROOT / "README.md").read_text())
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     assert run([sys.executable, "-c", program], tmp_path, environment).startswith("recognized corridor ")
@@ -50,8 +58,8 @@ def test_the_python_of_the_readme_runs_as_it_is_written(tmp_path: Path) -> None:
 OF_THE_CLIENT = ROOT / "docs" / "how-to" / "use-the-python-client.md"
 
 
-def test_the_python_of_the_client_runs_as_it_is_written(shared: Server, tmp_path: Path) -> None:
-    run([sys.executable, ROOT / "examples/make_pictures.py", "pictures"], tmp_path, dict(os.environ))
+def test_the_python_of_the_client_runs_as_it_is_written(shared: Server, tmp_path: Path, pictures: Path) -> None:
+    shutil.copytree(pictures, tmp_path / "pictures")
     programs = PYTHON.findall(OF_THE_CLIENT.read_text())
     assert len(programs) > 6
     for program in programs:
@@ -76,30 +84,30 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.mark.parametrize("document", [page for page in PAGES if page != OF_KEYS], ids=name_of)
-def test_the_commands_run_as_they_are_written(document: Path, shared: Server, tmp_path: Path) -> None:
+def test_the_commands_run_as_they_are_written(document: Path, shared: Server, tmp_path: Path, pictures: Path) -> None:
     try:
-        run_page(document, shared, tmp_path)
+        run_page(document, shared, tmp_path, pictures)
     finally:
         for item in shared.client.get("/v1/maps").json()["items"]:
             shared.client.delete(f"/v1/maps/{item['id']}")
 
 
-def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path) -> None:
+def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
     service = Server(tmp_path / "service").wait()
     try:
-        run_page(OF_KEYS, service, tmp_path)
+        run_page(OF_KEYS, service, tmp_path, pictures)
     finally:
         status = service.stop()
     assert status == 0
 
 
-def run_page(document: Path, service: Server, folder: Path) -> None:
+def run_page(document: Path, service: Server, folder: Path, pictures: Path) -> None:
     """Run all commands of a document in a folder with the examples and their pictures."""
     here = folder / "here"
     here.mkdir()
     shutil.copytree(ROOT / "examples", here / "examples")
     (here / ".venv").symlink_to(sys.prefix)
-    run([sys.executable, "examples/make_pictures.py", "pictures"], here, dict(os.environ))
+    shutil.copytree(pictures, here / "pictures")
     root = str(service.client.base_url).rstrip("/")
     environment = {
         **os.environ,
