@@ -16,7 +16,8 @@ from typing import Any
 
 import httpx
 
-from tests.service.forks import ROOT, ForkedServer
+from tests.service.forks import ROOT as ROOT
+from tests.service.forks import ForkedServer
 
 START_SECONDS = 120.0
 

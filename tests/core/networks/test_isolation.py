@@ -102,7 +102,7 @@ def write_caffemodels(folder: Path) -> list[Path]:
     ("reader", "count", "write", "read_it"),
     [
         ("core.networks.matfiles", 150, write_mats, read_mat),
-        ("core.networks.checkpoints", 30, write_checkpoints, read_checkpoint),
+        ("core.networks.checkpoints", 40, write_checkpoints, read_checkpoint),
         ("core.networks.caffemodel:network", 60, write_caffemodels, read_caffemodel),
     ],
 )

@@ -7,7 +7,7 @@ import time
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.service.console.conftest import Operator, Theme, Visit
 from tests.service.console.world import LAB
@@ -119,13 +119,18 @@ def test_light_and_dark_follow_the_system_until_one_is_chosen(visit: Visit) -> N
     assert page.evaluate(ground) == dark
 
 
+def late(route: Route) -> None:
+    time.sleep(0.3)
+    route.continue_()
+
+
 def test_everything_is_reached_by_keyboard(admin: Operator) -> None:
     page = admin.go("maps")
     page.keyboard.press("Tab")
     assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
     button = page.get_by_role("button", name=f"Edit {LAB}")
     button.focus()
-    page.route(f"**/v1/maps/{LAB}", lambda route: (time.sleep(0.3), route.continue_()))  # one dialog follows another
+    page.route(f"**/v1/maps/{LAB}", late)  # one dialog follows another
     page.keyboard.press("Enter")
     dialog = page.get_by_role("dialog", name=f"Edit {LAB}")
     dialog.get_by_label("Description").wait_for()
