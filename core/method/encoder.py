@@ -78,9 +78,9 @@ class Encoding:
 class Encoder:
     """M-Region-VLAD, or Region-VLAD if there is one layer; or a network of others, with its own parts of a frame.
 
-    A frame becomes one vector of V·K values (K is that of the projected features if features are projected), or of those
-    that whitening leaves, and, if there is a second stage, the local descriptors of its cells.  Thread-safe: encoding
-    changes nothing.
+    A frame becomes one vector of V·K values (K is that of the projected features if features are projected; whitening
+    leaves fewer) and, if there is a second stage, the local descriptors of its cells.  Thread-safe: encoding changes
+    nothing.
 
     Args:
         name: by which users choose the encoder.

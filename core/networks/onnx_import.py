@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 
 from core.errors import InvalidModel
 from core.networks.description import NetworkDescription
-from core.networks.isolation import Tree, first_bytes, read_in_child, serve
+from core.networks.isolation import Tree, read_in_child, serve
 
 MAX_GRAPH = 2**31 - 2**20
 """Bytes of a network with its weights, which the format's messages do not exceed."""
@@ -42,7 +42,6 @@ _UNBOUNDED = {"Loop", "Scan"}
 _CHANCE = {
     "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike",
 }  # fmt: skip
-_OTHER_FILES = (b"PK\x03\x04", b"\x80")
 
 
 def import_onnx(path: Path, description: NetworkDescription) -> bytes:
@@ -52,12 +51,6 @@ def import_onnx(path: Path, description: NetworkDescription) -> bytes:
         InvalidModel: the file is damaged, too large, takes or gives something else than the description says, or does
             what no network here may do; the text says what.
     """
-    start = first_bytes(path, 16)
-    if start.startswith(_OTHER_FILES):
-        raise InvalidModel(
-            f"{path.name} is a PyTorch file, not one in the ONNX format; export the network by torch.onnx.export, and "
-            "give that file."
-        )
     beside = sum(_size(file) for file in path.parent.glob(f"{path.name}*") if file != path)
     room = 4 * min(beside, MAX_GRAPH) + 2 * min(_size(path), MAX_GRAPH) + 2**30
     found = read_in_child(__name__, path, description.model_dump_json(), framework="numpy", room=room)
@@ -111,7 +104,7 @@ def check_graph(model: ModelProto) -> None:
 def _check_node(node: NodeProto) -> None:
     if node.domain not in _DOMAINS:
         raise InvalidModel(
-            f"It needs the operator {node.domain[:60]}.{node.op_type[:60]}, which is not a standard one."
+            f"It needs the operator {node.domain[:60]}.{node.op_type[:60]}, which is not of the standard."
         )
     if node.op_type in _UNBOUNDED:
         raise InvalidModel(f"It has a {node.op_type}, whose end cannot be foreseen; export it unrolled.")
@@ -273,7 +266,7 @@ def _bring_in(tensors: Iterable[TensorProto], folder: Path) -> None:
             file.seek(start)
             tensor.raw_data = file.read(length)
         tensor.ClearField("external_data")
-        tensor.data_location = TensorProto.DEFAULT
+        tensor.ClearField("data_location")
 
 
 def _tried(graph: bytes, model: ModelProto, description: NetworkDescription) -> list[int]:

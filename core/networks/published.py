@@ -1,8 +1,8 @@
 """Networks that others published: what goes into each, what comes out, and who made it.
 
-To add one, add a row.  Their weights are not shipped: a user exports the authors' network to the ONNX format, and
-imports the file (docs/how-to/bring-your-own-network.md).  Sizes and dimensions are those of the authors' code and papers;
-the tests run small networks of each layout, with random weights.
+To add one, add a row.  Their weights are not shipped: a user imports the authors' checkpoint, or their network exported
+to the ONNX format (docs/how-to/bring-your-own-network.md).  Sizes and dimensions are those of the authors' code and
+papers; the tests run small networks of each layout, with random weights.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 import typer
@@ -33,7 +34,10 @@ def _group() -> None:
 
 @model.command("import")
 def import_model(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A network, .onnx or .caffemodel.", show_default=False)],
+    file: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help=".onnx, .caffemodel, or a checkpoint.", show_default=False),
+    ],
     name: Annotated[
         str | None, typer.Option(help="Name to install the network under. Default: the preset's.", show_default=False)
     ] = None,
@@ -49,7 +53,8 @@ def import_model(
     images: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="PATH", help="With FILE.onnx: pictures that its encoder learns from and is calibrated by."
+            metavar="PATH",
+            help="With a preset or a description: pictures that teach and calibrate the encoder; may be repeated.",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of what is learned from the pictures.")] = 0,
@@ -68,8 +73,9 @@ def import_model(
 ) -> None:
     """Install a network that was trained elsewhere; its weights are kept as they are.
 
-    A .caffemodel becomes a network that vocabularies can be trained for.  An .onnx file, with a preset or a
-    description, becomes an encoder as well; at once if nothing has to be learned for it, else with --images.
+    A .caffemodel becomes a network that vocabularies can be trained for.  An .onnx file with a preset or a description,
+    or the checkpoint of a preset's network, becomes an encoder as well; at once if nothing has to be learned for it,
+    else with --images.
     """
     # Imported here because they take a second.
     from core.networks.published import PUBLISHED
@@ -106,7 +112,9 @@ def _import_described(
     folder: Path,
 ) -> None:
     from core.method.catalogue import NETWORK_SUFFIX
+    from core.networks.checkpoints import is_checkpoint
     from core.networks.description import read_description
+    from core.networks.layouts.checkpoints import export_checkpoint
     from core.networks.onnx_import import import_onnx
     from core.networks.onnx_network import save_onnx_network
     from core.networks.published import PUBLISHED
@@ -115,7 +123,15 @@ def _import_described(
     described = PUBLISHED[preset] if preset is not None else read_description(cast(Path, description))
     described = described if size is None else described.at(*size)
     chosen = None if images is None else split(find_images(images, FEWEST_IMAGES), MOST_IMAGES, seed)
-    graph = import_onnx(file, described)
+    if not is_checkpoint(file):
+        graph = import_onnx(file, described)
+    elif preset is None:
+        raise Failure(f"{file} is a checkpoint, whose network only a preset tells; else export it to the ONNX format.")
+    else:
+        with TemporaryDirectory(prefix="placerec-import-") as temporary_folder:
+            exported = Path(temporary_folder) / f"{name}.onnx"
+            export_checkpoint(file, preset, described, exported)
+            graph = import_onnx(exported, described)
     path = folder / f"{name}{NETWORK_SUFFIX}"
     _written(path, lambda temporary: save_onnx_network(temporary, name, graph, described))
     shown = described.input
