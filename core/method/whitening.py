@@ -39,9 +39,9 @@ class Whitening:
         return int(self.matrix.shape[1])
 
     def __call__(self, descriptors: Array) -> Array:
-        """Whiten descriptors, float32 [..., D], to unit length, float32 [..., d]; a row of zeros stays zero."""
+        """Whiten descriptors, float32 [n, D], to unit length, float32 [n, d]; a row of zeros stays zero."""
         whitened = unit_length((descriptors - self.mean) @ self.matrix)
-        whitened[~descriptors.any(axis=-1)] = 0
+        whitened[~descriptors.any(axis=1)] = 0
         return np.asarray(whitened, np.float32)
 
     def tensors(self) -> dict[str, torch.Tensor]:
