@@ -122,7 +122,9 @@ class FeatureExtractor:
         if isinstance(network, ShallowNetwork):
             self.forward = GraphPass(network) if plain else TorchPass(network, precision, device)
         elif not plain:
-            raise InvalidModel("a network of others runs on the CPU in float32; set the device cpu, and no precision.")
+            raise InvalidModel(
+                "a plugged or imported network runs on the CPU in float32, unless it moves itself to another device."
+            )
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
         """Of each frame the rectified maps of each output, float32 [X, Y, K]; see :meth:`maps`."""

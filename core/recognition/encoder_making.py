@@ -20,8 +20,8 @@ from core.method.projection import Projection, fit_projection
 from core.method.vlad import aggregate
 from core.method.vocabulary import Vocabulary, pool_features, train_vocabulary
 from core.method.whitening import fit_whitening
-from core.networks.description import NetworkDescription
-from core.networks.onnx_network import OUTPUT, OnnxNetwork
+from core.networks.imported.description import NetworkDescription
+from core.networks.imported.onnx_network import OUTPUT, OnnxNetwork
 from core.recognition.stages import score_matrix
 
 UNMEASURED = Calibration(

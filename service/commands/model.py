@@ -78,7 +78,7 @@ def import_model(
     else with --images.
     """
     # Imported here because they take a second.
-    from core.networks.published import PUBLISHED
+    from core.networks.imported.published import PUBLISHED
 
     if preset is not None and preset not in PUBLISHED:
         raise typer.BadParameter(f"--preset {preset!r} is not one of {', '.join(PUBLISHED)}")
@@ -113,12 +113,12 @@ def _import_described(
 ) -> None:
     from core.method.catalogue import NETWORK_SUFFIX
     from core.networks.checkpoints import is_checkpoint
-    from core.networks.description import read_description
+    from core.networks.imported.description import read_description
+    from core.networks.imported.onnx_import import import_onnx
+    from core.networks.imported.onnx_network import save_onnx_network
+    from core.networks.imported.published import PUBLISHED
     from core.networks.layouts.checkpoints import export_checkpoint
-    from core.networks.onnx_import import import_onnx
-    from core.networks.onnx_network import save_onnx_network
-    from core.networks.published import PUBLISHED
-    from service.commands.encoders import FEWEST_IMAGES, MOST_IMAGES, find_images, install_described, split
+    from service.commands.encoders.making import FEWEST_IMAGES, MOST_IMAGES, find_images, install_described, split
 
     described = PUBLISHED[preset] if preset is not None else read_description(cast(Path, description))
     described = described if size is None else described.at(*size)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from core.errors import InvalidModel
 from core.networks.checkpoints import read_checkpoint, under
-from core.networks.description import NetworkDescription
+from core.networks.imported.description import NetworkDescription
 from core.networks.layouts.heads import CROSS_IMAGE_HEADS, Boq, MixVpr, Pyramid, Salad, gem_and_linear
 from core.networks.layouts.trunks import PATCH, Dino, Weights, resnet, shape_of, vgg16
 
@@ -147,7 +147,7 @@ LAYOUTS: dict[str, Callable[[Weights, Grid], nn.Module]] = {
     "megaloc": SaladNetwork,
     "anyloc": ValueNetwork,
 }
-"""The network of each preset (``core.networks.published``)."""
+"""The network of each preset (``core.networks.imported.published``)."""
 
 
 def build(preset: str, checkpoint: Mapping[str, Tensor], description: NetworkDescription) -> nn.Module:

@@ -13,11 +13,12 @@ import torch
 from safetensors.torch import save_file
 
 from core.method.catalogue import EncoderCatalogue
-from core.networks import checkpoints, onnx_import
-from core.networks.published import PUBLISHED
+from core.networks import checkpoints
+from core.networks.imported import onnx_import
+from core.networks.imported.published import PUBLISHED
+from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
+from tests.core.networks.imported.published_networks import SIZES, WIDTH, small_network
 from tests.core.networks.in_process import use
-from tests.core.networks.onnx_writer import MAPS, onnx_network
-from tests.core.networks.published_networks import SIZES, WIDTH, small_network
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, scene, seen_again
 from tests.service.server import Server

@@ -12,14 +12,13 @@ import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from core.errors import InvalidModel
-from core.networks import onnx_import
-from core.networks.description import Aggregation, NetworkDescription, Output, checked, read_description
 from core.networks.files import network_name, open_network
-from core.networks.onnx_import import import_onnx
-from core.networks.onnx_network import OnnxNetwork, load_onnx_network, save_onnx_network
+from core.networks.imported import onnx_import
+from core.networks.imported.description import Aggregation, NetworkDescription, Output, checked, read_description
+from core.networks.imported.onnx_import import import_onnx
+from core.networks.imported.onnx_network import OnnxNetwork, load_onnx_network, save_onnx_network
 from tests.core.networks.hostile import damaged
-from tests.core.networks.in_process import use
-from tests.core.networks.onnx_writer import (
+from tests.core.networks.imported.onnx_writer import (
     CONVOLUTION,
     DESCRIPTOR,
     MAPS,
@@ -29,6 +28,7 @@ from tests.core.networks.onnx_writer import (
     onnx_network,
     weights,
 )
+from tests.core.networks.in_process import use
 
 
 def write(folder: Path, model: ModelProto) -> Path:

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
-from core.networks.description import NetworkDescription
 from core.networks.forward import GraphRunner
-from core.networks.onnx_import import as_maps, check_graph, graph_input, graph_output, read_graph
+from core.networks.imported.description import NetworkDescription
+from core.networks.imported.onnx_import import as_maps, check_graph, graph_input, graph_output, read_graph
 
 FORMAT = "placerec-onnx-network/1"
 

@@ -23,7 +23,7 @@ from onnx import GraphProto, ModelProto, NodeProto, TensorProto
 from safetensors.numpy import save_file
 
 from core.errors import InvalidModel
-from core.networks.description import NetworkDescription
+from core.networks.imported.description import NetworkDescription
 from core.networks.isolation import Tree, read_in_child, serve
 
 MAX_GRAPH = 2**31 - 2**20

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.disk.files import replacing
 from service.commands.console import Commands, Failure, output, progress
-from service.commands.encoders import (
+from service.commands.encoders.making import (
     FEWEST_IMAGES,
     MOST_IMAGES,
     find_images,
@@ -91,8 +91,8 @@ def train(
     from core.method.encoder import Encoder, EncoderDefinition
     from core.method.features import FeatureExtractor
     from core.method.vocabulary import pool_features, train_vocabulary
+    from core.networks.imported.onnx_network import is_onnx_network
     from core.networks.network import load_network
-    from core.networks.onnx_network import is_onnx_network
     from core.recognition.encoder_making import UNMEASURED
 
     chosen = split(find_images(images), limit, seed)

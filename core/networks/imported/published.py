@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from core.frames.preprocessing import InputDefinition
-from core.networks.description import Aggregation, NetworkDescription, Output, Sizes
+from core.networks.imported.description import Aggregation, NetworkDescription, Output, Sizes
 
 IMAGENET: dict[str, Any] = {
     "channel_order": "rgb",

@@ -94,7 +94,7 @@ def install_described(
         chosen: None: nothing is learned, and the encoder has no measured calibration.
     """
     from core.method.catalogue import save_encoder
-    from core.networks.onnx_network import load_onnx_network
+    from core.networks.imported.onnx_network import load_onnx_network
     from core.recognition.encoder_making import make_encoder
 
     taken = chosen or Split([], [])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from onnx import ModelProto, NodeProto, TensorProto, helper, numpy_helper
 
 from core.frames.preprocessing import InputDefinition
-from core.networks.description import Aggregation, NetworkDescription, Output
+from core.networks.imported.description import Aggregation, NetworkDescription, Output
 
 SIDE = 32
 SHOWN = InputDefinition(height=SIDE, width=SIDE, mean=(128.0, 128.0, 128.0), scale=(0.01, 0.01, 0.01))
@@ -22,7 +23,7 @@ def weights(channels: int = 6) -> NDArray[np.float32]:
     return np.random.default_rng(0).normal(size=(channels, 3, 8, 8)).astype(np.float32)
 
 
-def node(kind: str, inputs: Sequence[str], output: str, **attributes: object) -> NodeProto:
+def node(kind: str, inputs: Sequence[str], output: str, **attributes: Any) -> NodeProto:
     return helper.make_node(kind, list(inputs), [output], **attributes)
 
 

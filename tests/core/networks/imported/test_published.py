@@ -12,13 +12,14 @@ import torch
 from torch import nn
 
 from core.errors import InvalidModel
-from core.networks import checkpoints, onnx_import
+from core.networks import checkpoints
+from core.networks.imported import onnx_import
+from core.networks.imported.onnx_import import import_onnx
+from core.networks.imported.onnx_network import OnnxNetwork
+from core.networks.imported.published import PUBLISHED
 from core.networks.layouts.checkpoints import LAYOUTS, build, export_checkpoint
-from core.networks.onnx_import import import_onnx
-from core.networks.onnx_network import OnnxNetwork
-from core.networks.published import PUBLISHED
+from tests.core.networks.imported.published_networks import NETWORKS, SIZES, Boq, small_network
 from tests.core.networks.in_process import use
-from tests.core.networks.published_networks import NETWORKS, SIZES, Boq, small_network
 
 GOLDEN = 1e-4
 

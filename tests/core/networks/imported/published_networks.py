@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -252,6 +253,8 @@ class ViTBlock(nn.Module):
 class DinoV2(nn.Module):
     """Its positions are of 9 x 9 patches; it gives the tokens before the last normalization."""
 
+    blocks: Any
+
     def __init__(self, blocks: int = 2, gated: bool = False, adapted: bool = False) -> None:
         super().__init__()
         self.cls_token, self.mask_token = nn.Parameter(torch.randn(1, 1, WIDTH)), nn.Parameter(torch.zeros(1, WIDTH))
@@ -314,6 +317,8 @@ def sinkhorn(scores: Tensor) -> Tensor:
 
 
 class Salad(nn.Module):
+    backbone: Any
+
     def __init__(self) -> None:
         super().__init__()
         self.backbone, self.aggregator = Named("model", DinoV2()), SaladHead()
@@ -323,6 +328,8 @@ class Salad(nn.Module):
 
 
 class MegaLoc(nn.Module):
+    backbone: Any
+
     def __init__(self) -> None:
         super().__init__()
         self.backbone = Named("model", DinoV2())
@@ -345,6 +352,8 @@ class BoqBlock(nn.Module):
 
 
 class BoqHead(nn.Module):
+    boqs: Any
+
     def __init__(self, before: int) -> None:
         super().__init__()
         self.proj_c, self.norm_input = nn.Conv2d(before, WIDTH, 3, padding=1), nn.LayerNorm(WIDTH)
