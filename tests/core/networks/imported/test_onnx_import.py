@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from core.networks.imported import onnx_import
 from core.networks.imported.description import Aggregation, NetworkDescription, Output, checked, read_description
 from core.networks.imported.onnx_import import import_onnx
 from core.networks.imported.onnx_network import OnnxNetwork, load_onnx_network, save_onnx_network
-from tests.core.networks.hostile import damaged
 from tests.core.networks.imported.onnx_writer import (
     CONVOLUTION,
     DESCRIPTOR,
@@ -202,21 +200,6 @@ def test_files_of_another_kind_and_size_are_refused(tmp_path: Path, monkeypatch:
         monkeypatch.setattr(onnx_import, "MAX_GRAPH", 2**20)
         named = checked(MAPS.model_dump() | {"output": {"kind": "maps", "name": "second"}})
         import_onnx(write(tmp_path, onnx_network()), named)
-
-
-def test_a_damaged_file_is_refused_or_computes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use(monkeypatch, onnx_import.__name__)
-    chance, sound, refused = random.Random(3), onnx_network().SerializeToString(), 0
-    path = tmp_path / "network.onnx"
-    for _ in range(150):
-        path.write_bytes(damaged(sound, chance))
-        try:
-            graph = import_onnx(path, MAPS)
-        except InvalidModel:
-            refused += 1
-        else:
-            assert OnnxNetwork("damaged", graph, MAPS)(torch.zeros(1, 3, SIDE, SIDE))[0].isfinite().all()
-    assert 50 < refused < 150
 
 
 def test_an_installed_file_with_another_graph_is_refused(tmp_path: Path) -> None:
