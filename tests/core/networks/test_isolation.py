@@ -114,7 +114,7 @@ def read_onnx(path: Path) -> bytes:
     [
         (f"core.networks.imported.onnx_import:{MAPS.model_dump_json()}", 40, write_onnx, read_onnx),
         ("core.networks.matfiles", 150, write_mats, read_mat),
-        ("core.networks.checkpoints", 30, write_checkpoints, read_checkpoint),
+        ("core.networks.checkpoints", 40, write_checkpoints, read_checkpoint),
         ("core.networks.caffemodel:network", 60, write_caffemodels, read_caffemodel),
     ],
 )
