@@ -34,7 +34,7 @@ from core.baselines.stages import (
 from core.baselines.system import About, Resources, System
 from core.errors import InvalidModel, MissingWeights, UnknownEncoder
 from core.method.catalogue import EncoderCatalogue, EncoderSummary
-from core.networks.network import load_network
+from core.networks.files import open_network
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,6 @@ def _encoder(name: str, models: EncoderCatalogue, weights: Path | None) -> Syste
         raise InvalidModel(f"{summary.name} is an installed encoder and takes no file of weights.")
     encoder, about = models.get(asked), about_encoder(summary)
     if stages == FIRST_STAGE:
-        network = load_network(models.network_file(summary.network), encoder.definition.layers)
+        network = open_network(models.network_file(summary.network), encoder.definition.layers)
         return EncoderSystem(first_stage(encoder, network), about_first_stage(about))
     return VerifiedSystem(EncoderSystem(encoder, about)) if stages else EncoderSystem(encoder, about)

@@ -26,7 +26,7 @@ from core.judgement.verdict import Calibration
 from core.method.encoder import Encoder
 from core.method.features import FeatureExtractor
 from core.method.vocabulary import Vocabulary
-from core.networks.network import ShallowNetwork
+from core.networks.backbone import Backbone
 from core.networks.xfeat import load_xfeat
 from core.recognition.verification import CANDIDATES
 
@@ -43,7 +43,7 @@ def about_first_stage(about: About) -> About:
     return replace(about, name=about.name + FIRST_STAGE, title=title, configuration=kept)
 
 
-def first_stage(encoder: Encoder, network: ShallowNetwork) -> Encoder:
+def first_stage(encoder: Encoder, network: Backbone) -> Encoder:
     """A two-stage encoder without its second stage: the same vectors, and scores J / V (equation 4.13).
 
     Args:
@@ -52,7 +52,7 @@ def first_stage(encoder: Encoder, network: ShallowNetwork) -> Encoder:
     definition = encoder.definition.model_copy(update={"agreement": None})
     extractor = FeatureExtractor(network, definition, encoder.extractor.projections)
     vocabulary = Vocabulary(encoder.centers, extractor.origin)
-    return Encoder(encoder.name + FIRST_STAGE, extractor, definition, vocabulary, NOTHING)
+    return Encoder(encoder.name + FIRST_STAGE, extractor, definition, vocabulary, NOTHING, whitening=encoder.whitening)
 
 
 def about_verified(about: About) -> About:

@@ -52,7 +52,8 @@ def sample_descriptors(
     encodings = [encoder.encode(sample_frame(index)) for index in range(min(frames, count))]
     real = [(encoding.descriptor, encoding.local) for encoding in encodings]
     yield from real
-    words, random = encoder.definition.words, np.random.default_rng(seed)
+    words = 1 if encoder.whitening is not None else encoder.definition.words
+    random = np.random.default_rng(seed)
     for _ in range(count - len(real)):
         a, b = random.choice(len(real), 2, replace=False)
         from_a = random.random(words) < 0.5

@@ -1,7 +1,8 @@
 """The encoders installed on a machine: the packaged ones and those in the user's directory.
 
-An encoder is a file ``<name>.encoder.safetensors`` with its vocabulary, projections, golden values, definition and
-calibration.  It names a network file ``<network>.network.safetensors`` in the same folder or among the packaged ones.
+An encoder is a file ``<name>.encoder.safetensors`` with its vocabulary, projections, whitening, golden values,
+definition and calibration.  It names a network file ``<network>.network.safetensors`` in the same folder or among the
+packaged ones.
 """
 
 from __future__ import annotations
@@ -26,14 +27,16 @@ from core.method.encoder import Encoder, EncoderDefinition, canary_frame
 from core.method.features import FeatureExtractor, projection_tensors
 from core.method.projection import Projection
 from core.method.vocabulary import Vocabulary
+from core.method.whitening import Whitening
+from core.networks.files import open_network
 from core.networks.forward import Device, Precision
 from core.networks.identity import canonical_json
-from core.networks.network import NAME, load_network
+from core.networks.network import NAME
 
 DEFAULT_ENCODER = "m-region-vlad"
 PACKAGED = Path(__file__).parents[1] / "models"
 FORMAT = "placerec-encoder/1"
-PROJECTION = "projection."
+PROJECTION, WHITENING = "projection.", "whitening."
 ENCODER_SUFFIX, NETWORK_SUFFIX = ".encoder.safetensors", ".network.safetensors"
 
 
@@ -104,6 +107,8 @@ def save_encoder(
     }
     for name, tensor in projection_tensors(encoder.extractor.projections).items():
         tensors[f"{PROJECTION}{name}"] = tensor.numpy()
+    if encoder.whitening is not None:
+        tensors |= {f"{WHITENING}{name}": tensor.numpy() for name, tensor in encoder.whitening.tensors().items()}
     path = folder / f"{encoder.name}{ENCODER_SUFFIX}"
     _write(path, tensors, header)
     return path
@@ -162,10 +167,14 @@ def load_encoder(path: Path, network: Path) -> Encoder:
     except (OSError, SafetensorError, KeyError) as error:
         raise InvalidModel(f"{path.name} cannot be read: {error}") from error
     vocabulary = Vocabulary(centers, header.origin)
-    backbone = load_network(network, header.definition.outputs)
+    backbone = open_network(network, header.definition.outputs)
     extractor = FeatureExtractor(backbone, header.definition, _read_projections(path, tensors))
     canary = (golden, tensors.get("golden_local", np.zeros((0, 0), np.int8)))
-    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, canary)
+    whitening = None
+    if header.definition.whitening is not None:
+        mean, matrix = (tensors.get(f"{WHITENING}{name}", np.zeros(0)) for name in ("mean", "matrix"))
+        whitening = Whitening(mean.astype(np.float32), matrix.astype(np.float32))
+    encoder = Encoder(header.name, extractor, header.definition, vocabulary, header.calibration, canary, whitening)
     if encoder.identity != header.identity:
         raise InvalidModel(f"{path.name} says it is {header.identity}, its contents are {encoder.identity}.")
     return encoder

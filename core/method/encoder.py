@@ -22,6 +22,7 @@ from core.method.features import FeatureDefinition, FeatureExtractor, content_of
 from core.method.regions import Regions
 from core.method.vlad import aggregate, scores
 from core.method.vocabulary import Vocabulary
+from core.method.whitening import Whitening
 from core.networks.forward import Device, Precision, has_bfloat16
 from core.networks.identity import json_digest, tensors_digest
 from core.networks.network import ShallowNetwork
@@ -40,6 +41,7 @@ class EncoderDefinition(FeatureDefinition):
     gamma: float = Field(gt=0, le=1)
     normalization: Normalization
     agreement: AgreementDefinition | None = Field(default=None, description="The second stage; null: none.")
+    whitening: int | None = Field(default=None, ge=1, le=65_536, description="Values of the whitened descriptor.")
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -74,10 +76,11 @@ class Encoding:
 
 
 class Encoder:
-    """M-Region-VLAD, or Region-VLAD if there is one layer.
+    """M-Region-VLAD, or Region-VLAD if there is one layer; or a network of others, with its own parts of a frame.
 
-    A frame becomes one vector of V·K values (K is that of the projected features if features are projected) and, if
-    there is a second stage, the local descriptors of its cells.  Thread-safe: encoding changes nothing.
+    A frame becomes one vector of V·K values (K is that of the projected features if features are projected; whitening
+    leaves fewer) and, if there is a second stage, the local descriptors of its cells.  Thread-safe: encoding changes
+    nothing.
 
     Args:
         name: by which users choose the encoder.
@@ -86,6 +89,7 @@ class Encoder:
         calibration: the default for maps that have none of their own.
         golden: the descriptor, float [D], and the local descriptors, int8 [C, L], of the canary frame on the machine
             where the encoder was made.
+        whitening: fitted to descriptors of this vocabulary, if the definition has one.
 
     Raises:
         WrongVocabulary: the vocabulary was trained for another extractor.
@@ -101,6 +105,7 @@ class Encoder:
         vocabulary: Vocabulary,
         calibration: Calibration,
         golden: tuple[Array, Cells] | None = None,
+        whitening: Whitening | None = None,
     ) -> None:
         if vocabulary.origin != extractor.origin:
             raise WrongVocabulary(
@@ -109,11 +114,15 @@ class Encoder:
             )
         if len(vocabulary.centers) != definition.words:
             raise InvalidModel(f"{name} needs {definition.words} words, its vocabulary has {len(vocabulary.centers)}.")
+        if definition.whitening != (None if whitening is None else whitening.values):
+            raise InvalidModel(f"{name} needs a whitening to {definition.whitening} values.")
+        if whitening is not None and len(whitening.mean) != vocabulary.centers.size:
+            raise InvalidModel(f"{name}: its whitening is not of vectors of {vocabulary.centers.size} values.")
         self.name, self.extractor, self.definition = name, extractor, definition
-        self.centers = vocabulary.centers
+        self.centers, self.whitening = vocabulary.centers, whitening
         self.calibration, self._golden = calibration, golden
-        self.dimension = int(self.centers.size)
-        self.identity = encoder_identity(name, definition, vocabulary)
+        self.dimension = int(self.centers.size) if whitening is None else whitening.values
+        self.identity = encoder_identity(name, definition, vocabulary, whitening)
         self.grid = self._agreement_grid()
         """Rows and columns of the cells that the second stage compares; (0, 0) without one."""
 
@@ -183,6 +192,8 @@ class Encoder:
         regions = self.extractor.regions(activations, products)
         between = time.perf_counter()
         descriptor = aggregate(regions.features, self.centers, definition.gamma, definition.normalization)
+        if self.whitening is not None:
+            descriptor = self.whitening(descriptor[np.newaxis])[0]
         local = self.local(activations, products) if len(regions) else np.zeros(self.local_shape, np.int8)
         ended = time.perf_counter()
         times = {"forward": forward, "regions": 1e3 * (between - began), "vlad": 1e3 * (ended - between)}
@@ -202,7 +213,8 @@ class Encoder:
     def scores_from_inner_products(self, inner_products: Array) -> Array:
         """Scores from inner products of descriptors, float32 of any shape, of places that the second stage has not
         examined."""
-        first = scores(inner_products, self.definition.words, self.definition.normalization)
+        normalization = self.definition.normalization if self.whitening is None else "global"
+        first = scores(inner_products, self.definition.words, normalization)
         stage = self.definition.agreement
         return first if stage is None else first * np.float32(1 - stage.share)
 
@@ -276,10 +288,18 @@ def _cosine(found: NDArray[Any], golden: NDArray[Any]) -> float:
     return float(a @ b / max(1e-12, float(np.linalg.norm(a) * np.linalg.norm(b)))) if a.size else 1.0
 
 
-def encoder_identity(name: str, definition: EncoderDefinition, vocabulary: Vocabulary) -> str:
+def encoder_identity(
+    name: str, definition: EncoderDefinition, vocabulary: Vocabulary, whitening: Whitening | None = None
+) -> str:
     """``<name>@<sha256>`` over everything that can change a descriptor, tensors by content."""
     centers = tensors_digest({"centers": torch.from_numpy(vocabulary.centers)})
-    fields = {"features": vocabulary.origin, "vocabulary": centers, "definition": content_of(definition)}
+    fields: dict[str, Any] = {
+        "features": vocabulary.origin,
+        "vocabulary": centers,
+        "definition": content_of(definition),
+    }
+    if whitening is not None:
+        fields["whitening"] = tensors_digest(whitening.tensors())
     return f"{name}@{json_digest(fields)}"
 
 

@@ -17,6 +17,8 @@ from core.method.agreement import Cells, Correspondences, correspondences
 from core.method.encoder import Encoder
 from core.method.equations import assign, power, residuals, unit_length
 from core.method.regions import Regions
+from core.method.vlad import aggregate
+from core.method.whitening import Whitening
 
 Array = NDArray[np.float32]
 Indices = NDArray[np.int64]
@@ -40,7 +42,8 @@ class Shown:
 class Explanation:
     """The parts of the score of a frame a against a frame b.
 
-    words: float32 [V], what each word adds to the score (its j_u, scaled as in the score).
+    words: float32 [V], what each word adds to the score (its j_u, scaled as in the score); of whitened
+        descriptors only their sum, float32 [1], for whitening mixes the words.
     losses: of a and of b, float32 [T], what the score would lose without each region; negative if it would gain.
         None if a frame's regions are not known.
     answers: int64 [n, 2], regions of a and of b of one word that are each other's nearest.
@@ -66,8 +69,11 @@ def explain(encoder: Encoder, a: Shown, b: Shown) -> Explanation:
     Args:
         encoder: of both frames.
     """
-    shape = encoder.centers.shape
-    products = np.einsum("vk,vk->v", a.descriptor.reshape(shape), b.descriptor.reshape(shape))
+    if encoder.whitening is None:
+        shape = encoder.centers.shape
+        products = np.einsum("vk,vk->v", a.descriptor.reshape(shape), b.descriptor.reshape(shape))
+    else:
+        products = (a.descriptor @ b.descriptor)[np.newaxis]
     cells = _cells(encoder, a.local, b.local)
     stage = encoder.definition.agreement
     share = 0.0 if stage is None else stage.share / len(a.local)
@@ -95,6 +101,8 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
     features, centers, definition = frame.regions.features, encoder.centers, encoder.definition
     if not len(features):
         return np.zeros(0, np.float32)
+    if encoder.whitening is not None:
+        return encoder.scores_from_inner_products(_whitened_losses(encoder, encoder.whitening, frame, other))
     against = other.descriptor.reshape(centers.shape)
     words = assign(features, centers)
     sums = residuals(features, centers)  # V x K
@@ -112,6 +120,18 @@ def _losses(encoder: Encoder, frame: Shown, other: Shown) -> Array | None:
         reduced = np.divide(left, norms, out=np.zeros_like(left), where=norms > 0)
         parts = np.full(len(words), by_word.sum() / max(float(np.sqrt(squares.sum())), 1e-12), np.float32)
     return encoder.scores_from_inner_products(np.asarray(parts - reduced, np.float32))
+
+
+def _whitened_losses(encoder: Encoder, whitening: Whitening, frame: Shown, other: Shown) -> Array:
+    """What the inner product would lose without each region of a frame that has regions; float32 [T]."""
+    assert frame.regions is not None
+    features, definition = frame.regions.features, encoder.definition
+    without = [
+        aggregate(np.delete(features, at, axis=0), encoder.centers, definition.gamma, definition.normalization)
+        for at in range(len(features))
+    ]
+    left = whitening(np.stack(without)) @ other.descriptor
+    return np.asarray(frame.descriptor @ other.descriptor - left, np.float32)
 
 
 def _answers(encoder: Encoder, a: Regions | None, b: Regions | None) -> Indices:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from core.errors import InvalidModel
 from core.frames.masks import Mask
 from core.frames.preprocessing import Pixels, contrast, prepare
 from core.method.equations import unit_length
+from core.method.parts import cells, pooled
 from core.method.projection import Projection
 from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
 from core.networks.backbone import Backbone
@@ -33,6 +34,8 @@ class FeatureDefinition(BaseModel):
     ``steps`` are the quantisation steps, one a layer, in units of its activations.
     ``unit_features`` scales each regional feature to unit length before anything else, which the thesis does not.
     ``projection`` is to how many values regional features are projected (``projection.py``); None: not at all.
+    ``parts`` are taken in place of regions of interest, ``regions`` being the most of them, and there are no steps; a
+    network of others that gives a global descriptor has one cell.  ``exponent`` is that of the generalized mean.
     ``least_contrast`` is what a frame must have (``preprocessing.contrast``): a blank one excites a
     network through its biases alone, and what looks like regions says nothing of the scene.
     """
@@ -44,10 +47,20 @@ class FeatureDefinition(BaseModel):
     steps: tuple[float, ...]
     unit_features: bool
     projection: int | None = Field(default=None, ge=1)
+    parts: Literal["cells", "pooled"] | None = Field(
+        default=None, description="In place of regions: every cell, or one generalized mean of all; null: regions."
+    )
+    exponent: float | None = Field(default=None, ge=1, le=100, description="Of the generalized mean.")
     least_contrast: float = Field(default=2.0, ge=0, le=255, allow_inf_nan=False)
 
     @model_validator(mode="after")
     def _one_step_a_layer(self) -> FeatureDefinition:
+        if (self.exponent is None) == (self.parts == "pooled"):
+            raise ValueError("an exponent belongs to a generalized mean, and to it only")
+        if self.parts is not None:
+            if self.steps or self.projection is not None:
+                raise ValueError("steps and a projection belong to regions")
+            return self
         if len(self.steps) != len(self.layers) or not all(0 < step < float("inf") for step in self.steps):
             raise ValueError("each layer needs one positive quantisation step")
         if self.projection is not None and not self.unit_features:
@@ -110,7 +123,7 @@ class FeatureExtractor:
             self.forward = GraphPass(network) if plain else TorchPass(network, precision, device)
         elif not plain:
             raise InvalidModel(
-                "a plugged network runs on the CPU in float32, unless it moves itself to another device."
+                "a plugged or imported network runs on the CPU in float32, unless it moves itself to another device."
             )
 
     def activations(self, frames: Sequence[Pixels], masks: Sequence[Mask | None] | None = None) -> list[list[Array]]:
@@ -141,7 +154,7 @@ class FeatureExtractor:
             for layer in maps:
                 if blank[index]:
                     layer[index] = 0
-                elif mask is not None:
+                elif mask is not None and layer.shape[1:3] != (1, 1):  # which is of the whole frame
                     layer[index][mask.covered(*layer.shape[1:3])] = 0
         return maps
 
@@ -168,11 +181,16 @@ class FeatureExtractor:
         """
         definition = self.definition
         fused = activations[: len(definition.layers)]
-        if definition.projection is not None:
+        if definition.parts is not None:
+            found = (
+                cells(fused, definition.regions) if definition.exponent is None else pooled(fused, definition.exponent)
+            )
+        elif definition.projection is not None:
             found = find_regions(fused, definition.steps, definition.regions)
             features = self._projected(found, fused, products or self.products(activations), definition.projection)
             return replace(found, features=features)
-        found = extract_regions(fused, definition.steps, definition.regions)
+        else:
+            found = extract_regions(fused, definition.steps, definition.regions)
         return replace(found, features=unit_length(found.features)) if definition.unit_features else found
 
     def _projected(self, found: Regions, fused: Sequence[Array], products: Mapping[str, Array], values: int) -> Array:

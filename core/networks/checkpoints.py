@@ -46,6 +46,16 @@ def read_checkpoint(path: Path) -> Mapping[str, Tensor]:
     return read_in_child(__name__, path, framework="pt")
 
 
+def is_checkpoint(path: Path) -> bool:
+    """Whether a file begins as a checkpoint or a safetensors file does.
+
+    Raises:
+        InvalidModel: there is no such file, or it cannot be read.
+    """
+    start = first_bytes(path, 9)
+    return start.startswith(_STARTS) or start[8:] == b"{"
+
+
 def under(checkpoint: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Read the tensors whose name starts with ``prefix``, by the rest of their name."""
     return {name.removeprefix(prefix): checkpoint[name] for name in checkpoint if name.startswith(prefix)}

@@ -37,14 +37,15 @@ class GraphRunner:
 
     Args:
         name: by which errors call the network.
+        outputs: names of those that are computed; None: all.
 
     Raises:
         InvalidModel: ONNX Runtime has no such layer, as a normalization over an even number of channels.
     """
 
-    def __init__(self, name: str, graph: ModelProto) -> None:
-        self._name = name
-        self._graph = graph.SerializeToString()
+    def __init__(self, name: str, graph: ModelProto | bytes, outputs: list[str] | None = None) -> None:
+        self._name, self._outputs = name, outputs
+        self._graph = graph if isinstance(graph, bytes) else graph.SerializeToString()
         self._sessions: dict[int, onnxruntime.InferenceSession] = {}
         self._making = threading.Lock()
         self._session()
@@ -68,13 +69,13 @@ class GraphRunner:
             return self._sessions[threads]
 
     def __call__(self, inputs: Mapping[str, NDArray[Any]]) -> list[NDArray[np.float32]]:
-        """The graph's outputs, in their order, for its inputs by name.
+        """The outputs, in their order, for the graph's inputs by name.
 
         Raises:
             InvalidModel: the inputs are too small for the layers, or not what the graph takes.
         """
         try:
-            return self._session().run(None, dict(inputs))
+            return self._session().run(self._outputs, dict(inputs))
         except Exception as error:
             shapes = ", ".join(str(list(array.shape)) for array in inputs.values())
             raise InvalidModel(f"{self._name!r} cannot compute images of {shapes}: {error}") from error

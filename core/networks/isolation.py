@@ -69,12 +69,15 @@ class Contents(Mapping[str, Any]):
         return self._file.get_tensor(name)
 
 
-def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"]) -> Contents:
+def read_in_child(
+    module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"], room: int = 0
+) -> Contents:
     """What a module of this room finds in a file when it is run in a child process.
 
     Args:
         module: calls :func:`serve` when it is run.
         arguments: what the module's reader takes besides the path.
+        room: bytes that it may take beside those of any reader.
 
     Raises:
         InvalidModel: the file cannot be read or is not what the module reads.
@@ -84,7 +87,7 @@ def read_in_child(module: str, path: Path, *arguments: str, framework: Literal["
         raise InvalidModel(f"{path.name} has {size} bytes; from 1 to {MAX_FILE} are read.")
     with _temporary_folder() as folder:
         target = folder / "contents.safetensors"
-        memory = str(SPARE_MEMORY + 4 * size)
+        memory = str(SPARE_MEMORY + 4 * size + room)
         command = [sys.executable, "-P", "-m", module, str(path.absolute()), str(target), memory, *arguments]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OMP_NUM_THREADS": "1"}
         try:

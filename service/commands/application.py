@@ -7,6 +7,7 @@ import typer
 from service.commands.bench import bench
 from service.commands.calibrate import calibrate
 from service.commands.console import Commands
+from service.commands.encoders.vocabulary import vocabulary
 from service.commands.enroll import enroll
 from service.commands.evaluation.evaluate import evaluate
 from service.commands.jobs import jobs
@@ -17,7 +18,6 @@ from service.commands.model import model
 from service.commands.query import query
 from service.commands.serve import serve
 from service.commands.settings import settings
-from service.commands.vocabulary import vocabulary
 
 application = typer.Typer(
     cls=Commands,

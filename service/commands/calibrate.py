@@ -13,7 +13,9 @@ import typer
 from core.errors import InvalidImage, InvalidRecording
 from service.commands.connection.client import AsJson, DataDir, MapId, Target, Url, ask, media_type, path_of
 from service.commands.console import Failure, number, output, remark, show, show_json, table
+from service.commands.encoders.making import FEWEST_IMAGES, MOST_HELD_OUT, find_images, measured
 from service.commands.jobs import submit
+from service.commands.model import ModelsDir, models_directory, open_catalogue
 from service.commands.recordings import RecordingOptions, Topic
 
 SHOWN_POINTS = 9
@@ -50,6 +52,14 @@ def calibrate(
             "--itself", help="Ask for the map's own frames among their neighbours: less reliable, but needs no labels."
         ),
     ] = False,
+    packaged: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="PATH",
+            help="MAP is an installed encoder: measure the calibration that it ships with on these pictures; may be "
+            "repeated.",
+        ),
+    ] = None,
     precision: Annotated[
         float | None, typer.Option(help="Share of the recognized answers that is to be right; default: 0.95.")
     ] = None,
@@ -61,13 +71,22 @@ def calibrate(
     ] = False,
     most: Annotated[int | None, typer.Option(help="Most stored frames to ask for; they are spread evenly.")] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Measure and report only; store nothing.")] = False,
+    models_dir: ModelsDir = None,
     url: Url = None,
     data_dir: DataDir = None,
     as_json: AsJson = False,
 ) -> None:
-    """Choose the threshold, the margin and the probabilities of a map by frames whose place is known."""
-    if (frames is not None) + (sequence is not None) + itself != 1:
-        raise typer.BadParameter("give exactly one of --frames, --sequence and --itself")
+    """Choose the threshold, the margin and the probabilities of a map by frames whose place is known.
+
+    With --packaged: those of an encoder, for maps that have no calibration of their own, by any pictures of places.
+    """
+    if (frames is not None) + (sequence is not None) + itself + (packaged is not None) != 1:
+        raise typer.BadParameter("give exactly one of --frames, --sequence, --itself and --packaged")
+    if packaged is not None:
+        if precision is not None or false_accept_rate is not None or mean_of_negatives or most is not None:
+            raise typer.BadParameter("--packaged takes no target and no --most")
+        _calibrate_encoder(map_id, packaged, models_dir, dry_run, as_json)
+        return
     if pairs is not None and sequence is None:
         raise typer.BadParameter("--pairs needs --sequence")
     for option, value in (("--camera", camera), ("--recording", recording)):
@@ -105,6 +124,35 @@ def calibrate(
             raise Failure(job["problem"]["detail"] if job["problem"] else f"The job {job['id']} was cancelled.")
         report = job["result"]
     show_json(report) if as_json else _show(report)
+
+
+def _calibrate_encoder(name: str, pictures: list[Path], models_dir: Path | None, dry_run: bool, as_json: bool) -> None:
+    """Measure the calibration that an installed encoder ships with, and put it into the encoder's file."""
+    from core.method.catalogue import ENCODER_SUFFIX, PACKAGED, save_calibration
+
+    encoder = open_catalogue(models_dir).get(name)
+    path = models_directory(models_dir) / f"{encoder.name}{ENCODER_SUFFIX}"
+    if not dry_run and (PACKAGED / path.name).exists():
+        raise Failure(f"{encoder.name} belongs to placerec and stays as it is; calibrate a map, or use --dry-run.")
+    found = measured(encoder, find_images(pictures, FEWEST_IMAGES)[:MOST_HELD_OUT])
+    if not dry_run:
+        try:
+            save_calibration(path, found)
+        except OSError as error:
+            raise Failure(f"{path} cannot be written: {error.strerror or error}.") from error
+    if as_json:
+        show_json({"encoder": encoder.identity, "stored": not dry_run, "calibration": found.model_dump(mode="json")})
+        return
+    output.print(
+        f"{encoder.identity} {'would be' if dry_run else 'is'} calibrated by {found.frames} pictures: threshold "
+        f"{number(found.threshold)}, margin {number(found.margin)}.",
+        soft_wrap=True,
+        highlight=False,
+    )
+    if found.curve is None:
+        remark("The pictures are all alike, or told apart without a mistake: no probabilities could be fitted.")
+    if not dry_run:
+        remark("A service that has loaded the encoder already keeps the old calibration until it is started again.")
 
 
 def _pictures(folder: Path, files: list[str]) -> Iterator[bytes]:

@@ -652,11 +652,14 @@ class EncoderDefinition(Model):
     steps: list[float]
     unit_features: bool
     projection: int | None = None
+    parts: Known[Literal["cells", "pooled"]] | None = None
+    exponent: float | None = None
     least_contrast: float = 2.0
     words: int
     gamma: float
     normalization: Known[Literal["intra", "global"]]
     agreement: AgreementDefinition | None = None
+    whitening: int | None = None
 
 
 class EncoderSummary(Model):

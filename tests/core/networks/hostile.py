@@ -69,7 +69,7 @@ def ending(reader: Any, path: Path, target: Path, arguments: list[str]) -> str:
 def main() -> None:
     """The program."""
     name, count, folder, *sounds = sys.argv[1:]
-    module, *arguments = name.split(":")
+    module, *arguments = name.split(":", 1)
     reader = importlib.import_module(module)
     sound = [Path(path).read_bytes() for path in sounds]
     chance, ends = random.Random(7), Counter[str]()

@@ -13,7 +13,7 @@ from core.errors import InvalidModel
 from core.networks.isolation import Contents, convert, first_bytes
 
 
-def read_here(module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"]) -> Contents:
+def read_here(module: str, path: Path, *arguments: str, framework: Literal["pt", "numpy"], room: int = 0) -> Contents:
     """What ``read_in_child`` gives, of a file that neither crashes the library nor takes much memory."""
     first_bytes(path, 1)
     reader = sys.modules[module]

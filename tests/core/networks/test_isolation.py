@@ -17,9 +17,11 @@ from core.errors import InvalidModel
 from core.networks import isolation
 from core.networks.caffemodel import read_caffemodel
 from core.networks.checkpoints import read_checkpoint
+from core.networks.imported.onnx_import import import_onnx
 from core.networks.isolation import Contents, read_in_child
 from core.networks.matfiles import read_mat
 from tests.core.networks.caffe_writer import HEAD, caffemodel, small_network
+from tests.core.networks.imported.onnx_writer import MAPS, onnx_network
 
 MISBEHAVING = "tests.core.networks.misbehaving"
 
@@ -98,9 +100,19 @@ def write_caffemodels(folder: Path) -> list[Path]:
     return [folder / "new", folder / "old"]
 
 
+def write_onnx(folder: Path) -> list[Path]:
+    (folder / "sound.onnx").write_bytes(onnx_network().SerializeToString())
+    return [folder / "sound.onnx"]
+
+
+def read_onnx(path: Path) -> bytes:
+    return import_onnx(path, MAPS)
+
+
 @pytest.mark.parametrize(
     ("reader", "count", "write", "read_it"),
     [
+        (f"core.networks.imported.onnx_import:{MAPS.model_dump_json()}", 40, write_onnx, read_onnx),
         ("core.networks.matfiles", 150, write_mats, read_mat),
         ("core.networks.checkpoints", 40, write_checkpoints, read_checkpoint),
         ("core.networks.caffemodel:network", 60, write_caffemodels, read_caffemodel),

@@ -4,50 +4,34 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.progress import Progress, TaskID
 
 from core.disk.files import replacing
-from core.errors import InvalidImage
-from core.frames.traverses import SUPPORTED_SUFFIXES, natural_key
-from service.commands.connection.client import read_bytes
-from service.commands.console import Commands, Failure, messages, output, progress, remark
+from service.commands.console import Commands, Failure, output, progress
+from service.commands.encoders.making import (
+    FEWEST_IMAGES,
+    MOST_IMAGES,
+    find_images,
+    install_described,
+    measured,
+    read_images,
+    split,
+)
 from service.commands.model import ModelsDir, check_free_name, models_directory
 
 if TYPE_CHECKING:
     from core.frames.preprocessing import Pixels
-    from core.judgement.verdict import Calibration
-    from core.method.encoder import EncoderDefinition
     from core.method.features import FeatureExtractor
-    from core.method.vocabulary import Vocabulary
 
 vocabulary = typer.Typer(cls=Commands, help="Train vocabularies for encoders of your own.", no_args_is_help=True)
 
-HELD_OUT = 5
-"""One image in so many is held out of training and calibrates the verdict."""
-
-FEWEST_IMAGES = 30
-NEIGHBOURS = 3
-"""Held-out images up to so many places apart may show the same place."""
-
-MOST_HELD_OUT = 400
 CAFFE_STEP = 1.0
 """Quantisation step for activations of Caffe's scale, tens to hundreds (method, section 3)."""
-
-
-@dataclass(frozen=True)
-class Split:
-    """Images to learn from and images to measure with, in natural order."""
-
-    train: list[Path]
-    held_out: list[Path]
 
 
 @vocabulary.callback()
@@ -86,7 +70,9 @@ def train(
     seed: Annotated[
         int, typer.Option(min=0, max=2**31 - 1, help="The same seed and images give the same vocabulary.")
     ] = 0,
-    limit: Annotated[int, typer.Option(min=FEWEST_IMAGES, help="Draw this many if there are more images.")] = 3000,
+    limit: Annotated[
+        int, typer.Option(min=FEWEST_IMAGES, help="Draw this many if there are more images.")
+    ] = MOST_IMAGES,
     overwrite: Annotated[
         bool,
         typer.Option("--overwrite", help="Replace an installed encoder of this name, if no map needs it any more."),
@@ -95,6 +81,7 @@ def train(
 ) -> None:
     """Train a vocabulary on a set of images and install the encoder that it makes.
 
+    A network with a description says itself how it is aggregated; only the images, the seed and the limit count for it.
     Four images in five train, the fifth is kept out to set threshold and margin of the verdict.
     """
     # Imported here because they take a second.
@@ -104,12 +91,19 @@ def train(
     from core.method.encoder import Encoder, EncoderDefinition
     from core.method.features import FeatureExtractor
     from core.method.vocabulary import pool_features, train_vocabulary
+    from core.networks.imported.onnx_network import is_onnx_network
     from core.networks.network import load_network
+    from core.recognition.encoder_making import UNMEASURED
 
-    chosen = _split(_find(images), limit, seed)
+    chosen = split(find_images(images), limit, seed)
     folder = models_directory(models_dir)
     check_free_name(folder, name, "encoder", overwrite)
     network_name, network_file = _find_network(network, folder)
+    if is_onnx_network(network_file):
+        _install_network(network_name, network_file, folder)
+        found = install_described(folder, name, network_name, network_file, chosen, seed)
+        output.print(f"{found.identity}\ninstalled in {folder}", soft_wrap=True, highlight=False)
+        return
     layer_names = tuple(part.strip() for part in layers.split(","))
     try:
         definition = EncoderDefinition(
@@ -126,13 +120,13 @@ def train(
     extractor = FeatureExtractor(load_network(network_file, layer_names), definition)
     with progress() as bar:
         reading = bar.add_task("Regions", total=len(chosen.train))
-        frames = (_features(extractor, pixels) for _, pixels in _read(chosen.train, bar, reading))
+        frames = (_features(extractor, pixels) for pixels in bar.track(read_images(chosen.train), task_id=reading))
         features = pool_features(frames, seed)
         clustering = bar.add_task(f"k-means, {words} words", total=None)
         made = train_vocabulary(features, words, seed, extractor.origin)
         bar.update(clustering, total=1, completed=1)
-        calibration = _calibrate(name, extractor, definition, made, chosen.held_out, bar)
-    encoder = Encoder(name, extractor, definition, made, calibration)
+    encoder = Encoder(name, extractor, definition, made, UNMEASURED)
+    encoder.calibration = measured(encoder, chosen.held_out)
     training = {
         "images": len(chosen.train),
         "held_out": len(chosen.held_out),
@@ -147,36 +141,12 @@ def train(
     output.print(f"{encoder.identity}\ninstalled in {folder}", soft_wrap=True, highlight=False)
 
 
-def _find(given: Sequence[Path]) -> list[Path]:
-    """All images among and below the paths, in natural order."""
-    found: set[Path] = set()
-    for path in given:
-        inside = path.rglob("*") if path.is_dir() else [path]
-        images = {image for image in inside if image.suffix.lower() in SUPPORTED_SUFFIXES and image.is_file()}
-        if not images:
-            raise Failure(f"{path} is no image and holds none.")
-        found |= images
-    if len(found) < FEWEST_IMAGES:
-        raise Failure(f"{len(found)} images are too few for a vocabulary; give at least {FEWEST_IMAGES}.")
-    return sorted(found, key=lambda path: natural_key(str(path)))
-
-
-def _split(paths: list[Path], limit: int, seed: int) -> Split:
-    if len(paths) > limit:
-        remark(f"{limit} of {len(paths)} images are drawn (--limit).")
-        drawn = np.random.default_rng(seed).choice(len(paths), limit, replace=False)
-        paths = [paths[index] for index in sorted(drawn)]
-    held_out = paths[HELD_OUT - 1 :: HELD_OUT][:MOST_HELD_OUT]
-    kept = set(held_out)
-    return Split([path for path in paths if path not in kept], held_out)
-
-
 def _find_network(given: str, folder: Path) -> tuple[str, Path]:
     from core.method.catalogue import EncoderCatalogue
-    from core.networks.network import read_definition
+    from core.networks.files import network_name
 
     if given.endswith(".safetensors") or os.sep in given:
-        return read_definition(Path(given)).name, Path(given)
+        return network_name(Path(given)), Path(given)
     return given, EncoderCatalogue(folder).network_file(given)
 
 
@@ -207,44 +177,5 @@ def _steps(text: str | None, network: str, layers: tuple[str, ...]) -> tuple[flo
     return steps * len(layers) if len(steps) == 1 else steps
 
 
-def _read(paths: Sequence[Path], bar: Progress, task: TaskID) -> Iterator[tuple[Path, Pixels]]:
-    """The images that can be decoded; the others are named in a message."""
-    from core.frames.images import decode
-
-    for path in paths:
-        try:
-            yield path, decode(read_bytes(path))
-        except InvalidImage as error:
-            messages.print(f"{path} is left out: {error}", soft_wrap=True, markup=False, highlight=False)
-        bar.advance(task)
-
-
 def _features(extractor: FeatureExtractor, pixels: Pixels) -> NDArray[np.float32]:
     return extractor.regions(extractor.activations([pixels])[0]).features
-
-
-def _calibrate(
-    name: str,
-    extractor: FeatureExtractor,
-    definition: EncoderDefinition,
-    made: Vocabulary,
-    paths: Sequence[Path],
-    bar: Progress,
-) -> Calibration:
-    from core.frames.preprocessing import second_look
-    from core.judgement.calibration import fit_encoder_calibration
-    from core.judgement.verdict import Calibration
-    from core.method.encoder import Encoder
-
-    nothing = Calibration(source="encoder-default", threshold=0, margin=0, background_mean=0, background_deviation=1)
-    encoder = Encoder(name, extractor, definition, made, nothing)
-    task = bar.add_task("Threshold and margin", total=len(paths))
-    looks = [
-        (encoder.encode(pixels).descriptor, encoder.encode(second_look(pixels)).descriptor)
-        for _, pixels in _read(paths, bar, task)
-    ]
-    if len(looks) <= NEIGHBOURS + 1:
-        raise Failure(f"Only {len(looks)} of the images kept out can be decoded; give more images.")
-    first, second = (np.stack(side) for side in zip(*looks, strict=True))  # n x D
-    score = encoder.scores_from_inner_products
-    return fit_encoder_calibration(score(first @ first.T), score(second @ first.T), NEIGHBOURS, "encoder-default")

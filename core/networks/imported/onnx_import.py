@@ -1,0 +1,302 @@
+"""Importing a network that was exported to the ONNX format.
+
+Such a file is a program.  It is read in a process of its own (``core.networks.isolation``), which takes it only if it
+is made of the standard's own operators, without loops and chance, and if its weights lie in the file or beside it; and
+which then lets it compute three frames, within the same limits of memory and time.  What the process gives back is the
+graph with all its weights in it, and nothing else of the file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+from onnx import GraphProto, ModelProto, NodeProto, TensorProto
+from safetensors.numpy import save_file
+
+from core.errors import InvalidModel
+from core.networks.imported.description import NetworkDescription
+from core.networks.isolation import Tree, read_in_child, serve
+
+MAX_GRAPH = 2**31 - 2**20
+"""Bytes of a network with its weights, which the format's messages do not exceed."""
+
+MAX_NODES = 100_000
+MAX_VALUES = 2**17
+"""Values of a descriptor or of a cell."""
+
+MAX_CELLS = 2**14
+TOLERANCE = 1e-5
+"""By how much two passes over one frame may differ, relative to the largest value."""
+
+_DOMAINS = ("", "ai.onnx")
+_UNBOUNDED = {"Loop", "Scan"}
+_CHANCE = {
+    "Bernoulli", "Multinomial", "RandomNormal", "RandomNormalLike", "RandomUniform", "RandomUniformLike",
+}  # fmt: skip
+
+
+def import_onnx(path: Path, description: NetworkDescription) -> bytes:
+    """The graph of a network in a ``.onnx`` file, checked and tried out, with all its weights in it.
+
+    Raises:
+        InvalidModel: the file is damaged, too large, takes or gives something else than the description says, or does
+            what no network here may do; the text says what.
+    """
+    beside = sum(_size(file) for file in path.parent.glob(f"{path.name}*") if file != path)
+    room = 4 * min(beside, MAX_GRAPH) + 2 * min(_size(path), MAX_GRAPH) + 2**30
+    found = read_in_child(__name__, path, description.model_dump_json(), framework="numpy", room=room)
+    return bytes(found["graph"])
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.is_file() else 0
+
+
+# What a graph may be made of
+
+
+def read_graph(data: bytes) -> ModelProto:
+    """The message in the bytes of a graph.
+
+    Raises:
+        InvalidModel: they are no message in the ONNX format.
+    """
+    model = ModelProto()
+    try:
+        model.ParseFromString(data)
+    except DecodeError as error:
+        raise InvalidModel("It is not a file in the ONNX format.") from error
+    if not model.graph.node or not model.opset_import:
+        raise InvalidModel("It is not a network in the ONNX format: it has no operators.")
+    return model
+
+
+def check_graph(model: ModelProto) -> None:
+    """Check that a graph only computes: by the standard's operators, on its input and on weights that it holds.
+
+    Raises:
+        InvalidModel: it does not; the text says why.
+    """
+    if model.functions:
+        raise InvalidModel(f"It defines operators of its own ({model.functions[0].name[:60]}); export it without.")
+    count = 0
+    for graph in _graphs(model.graph):
+        count += len(graph.node)
+        if count > MAX_NODES:
+            raise InvalidModel(f"It has more than {MAX_NODES} operators.")
+        if graph.sparse_initializer:
+            raise InvalidModel("It has sparse weights, which are not read.")
+        for node in graph.node:
+            _check_node(node)
+        for tensor in _tensors(graph):
+            _check_tensor(tensor)
+
+
+def _check_node(node: NodeProto) -> None:
+    if node.domain not in _DOMAINS:
+        raise InvalidModel(
+            f"It needs the operator {node.domain[:60]}.{node.op_type[:60]}, which is not of the standard."
+        )
+    if node.op_type in _UNBOUNDED:
+        raise InvalidModel(f"It has a {node.op_type}, whose end cannot be foreseen; export it unrolled.")
+    training = any(attribute.name == "training_mode" and attribute.i for attribute in node.attribute)
+    if node.op_type in _CHANCE or training:
+        raise InvalidModel(f"It has a {node.op_type} that gives other values each time; export it for evaluation.")
+
+
+def _check_tensor(tensor: TensorProto) -> None:
+    if tensor.data_location == TensorProto.EXTERNAL:
+        raise InvalidModel(f"Its weights {tensor.name[:60]!r} are outside of the file.")
+    held = len(tensor.raw_data)
+    if tensor.HasField("raw_data") and held != _bytes_of(tensor):
+        raise InvalidModel(
+            f"Its weights {tensor.name[:60]!r} have {held} bytes, not the {_bytes_of(tensor)} of their shape."
+        )
+
+
+def _bytes_of(tensor: TensorProto) -> int:
+    """The bytes that the shape of a tensor asks for; two values of four bits share a byte."""
+    count = math.prod(tensor.dims)
+    try:
+        width = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
+    except (KeyError, TypeError) as error:
+        raise InvalidModel(f"Its weights {tensor.name[:60]!r} are of an unknown type.") from error
+    four_bits = tensor.data_type in (TensorProto.INT4, TensorProto.UINT4, TensorProto.FLOAT4E2M1)
+    return (count + 1) // 2 if four_bits else count * width
+
+
+def _graphs(root: GraphProto) -> Iterator[GraphProto]:
+    """A graph and those within its operators, such as the branches of an If."""
+    waiting = [root]
+    while waiting:
+        graph = waiting.pop()
+        yield graph
+        for node in graph.node:
+            for attribute in node.attribute:
+                waiting += [*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs]
+
+
+def _tensors(graph: GraphProto) -> Iterator[TensorProto]:
+    yield from graph.initializer
+    for node in graph.node:
+        for attribute in node.attribute:
+            yield from [attribute.t] if attribute.HasField("t") else []
+            yield from attribute.tensors
+
+
+def graph_input(model: ModelProto, description: NetworkDescription) -> str:
+    """The name of the one input of a graph, float32 [B or 1, 3, H, W].
+
+    Raises:
+        InvalidModel: it has others, or one of another type or shape than the description's.
+    """
+    held = {tensor.name for tensor in model.graph.initializer}
+    inputs = [value for value in model.graph.input if value.name not in held]
+    if len(inputs) != 1:
+        raise InvalidModel(f"It has {len(inputs)} inputs, not one for a picture.")
+    taken = inputs[0].type.tensor_type
+    if taken.elem_type != TensorProto.FLOAT:
+        raise InvalidModel("Its input is not of float32; export it so, whatever its weights are.")
+    shape = [side.dim_value if side.HasField("dim_value") else None for side in taken.shape.dim]
+    shown = description.input
+    wanted = (1, 3, shown.height, shown.width)
+    if len(shape) != 4 or any(side not in (None, want) for side, want in zip(shape, wanted, strict=True)):
+        sides = " x ".join("any" if side is None else str(side) for side in shape)
+        raise InvalidModel(
+            f"Its input is {sides}, not 1 x 3 x {shown.height} x {shown.width} as it is described (--input-size)."
+        )
+    return str(inputs[0].name)
+
+
+def graph_output(model: ModelProto, description: NetworkDescription) -> str:
+    """The name of the output that the description means.
+
+    Raises:
+        InvalidModel: there is none of this name.
+    """
+    names = [str(value.name) for value in model.graph.output]
+    wanted = description.output.name
+    if not names or wanted not in (None, *names):
+        raise InvalidModel(f"It has no output {wanted!r}; it has {', '.join(names)[:300] or 'none'}.")
+    return names[0] if wanted is None else wanted
+
+
+def as_maps(values: NDArray[Any], description: NetworkDescription) -> NDArray[np.float32]:
+    """What a network gives for one frame as maps, float32 [1, K, X, Y].
+
+    Raises:
+        InvalidModel: it has another shape than is described, too many values, or such as are not finite.
+    """
+    output, shown = description.output, description.input
+    if not isinstance(values, np.ndarray) or values.dtype not in (np.float32, np.float16, np.float64):
+        raise InvalidModel("The network gives no floating-point numbers.")
+    shape = list(values.shape)
+    maps = np.asarray(values, np.float32)
+    if output.kind == "tokens":
+        assert output.patch is not None
+        rows, columns = shown.height // output.patch, shown.width // output.patch
+        wanted = output.skip + rows * columns
+        if len(shape) != 3 or shape[1] != wanted:
+            raise InvalidModel(
+                f"The network gives {shape}, not {wanted} tokens: {output.skip}, and {rows} x {columns} of patches of "
+                f"{output.patch} pixels."
+            )
+        maps = maps[:, output.skip :].reshape(shape[0], rows, columns, shape[2]).transpose(0, 3, 1, 2)
+    elif output.kind == "descriptor":
+        maps = maps.reshape([*shape, 1, 1] if len(shape) == 2 else shape)
+    if maps.ndim != 4 or len(maps) != 1 or (output.kind == "descriptor" and maps.shape[2:] != (1, 1)):
+        raise InvalidModel(f"The network gives {shape}, which is no {output.kind} of one frame.")
+    if not 0 < maps.shape[1] <= MAX_VALUES or not 0 < maps.shape[2] * maps.shape[3] <= MAX_CELLS:
+        raise InvalidModel(
+            f"The network gives {shape}; up to {MAX_VALUES} values in up to {MAX_CELLS} cells are taken."
+        )
+    if not np.isfinite(maps).all():
+        raise InvalidModel("The network gives values that are not finite.")
+    return np.maximum(maps, 0) if output.rectify else maps
+
+
+# In the child process
+
+
+def _read(path: Path, description: str) -> tuple[Tree, dict[str, NDArray[np.uint8]]]:
+    """The graph of a file as bytes, once it is checked and has computed three frames."""
+    described = NetworkDescription.model_validate_json(description)
+    if path.stat().st_size > MAX_GRAPH:
+        raise InvalidModel(f"It has more than {MAX_GRAPH} bytes; export the network in half precision.")
+    model = read_graph(path.read_bytes())
+    _bring_in(model.graph.initializer, path.parent)
+    check_graph(model)
+    for field in ("doc_string", "metadata_props", "training_info"):
+        model.ClearField(field)
+    graph = model.SerializeToString(deterministic=True)
+    if len(graph) > MAX_GRAPH:
+        raise InvalidModel(f"With its weights it has more than {MAX_GRAPH} bytes; export it in half precision.")
+    shape = _tried(graph, model, described)
+    return {"shape": shape}, {"graph": np.frombuffer(graph, np.uint8)}
+
+
+def _bring_in(tensors: Iterable[TensorProto], folder: Path) -> None:
+    """Put the weights that lie in files beside the network's into the graph."""
+    total = 0
+    for tensor in tensors:
+        if tensor.data_location != TensorProto.EXTERNAL:
+            continue
+        where = {entry.key: entry.value for entry in tensor.external_data}
+        name = where.get("location", "")
+        path = (folder / name).resolve()
+        if not name or os.path.isabs(name) or not path.is_relative_to(folder.resolve()) or not path.is_file():
+            raise InvalidModel(f"Its weights are to be read from {name[:120]!r}, which is no file beside it.")
+        start, length = int(where.get("offset", 0)), _bytes_of(tensor)
+        size = path.stat().st_size
+        if start < 0 or not 0 <= length <= size - start or int(where.get("length", length)) != length:
+            raise InvalidModel(f"Its weights {tensor.name[:60]!r} are not in {name[:120]!r}: the file is cut off.")
+        total += length
+        if total > MAX_GRAPH:
+            raise InvalidModel(f"Its weights have more than {MAX_GRAPH} bytes; export the network in half precision.")
+        with path.open("rb") as file:
+            file.seek(start)
+            tensor.raw_data = file.read(length)
+        tensor.ClearField("external_data")
+        tensor.ClearField("data_location")
+
+
+def _tried(graph: bytes, model: ModelProto, description: NetworkDescription) -> list[int]:
+    """K, X and Y of what the network gives for a black frame, a white one, and one of noise."""
+    shown, options = description.input, onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    name, output = graph_input(model, description), graph_output(model, description)
+    try:
+        session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its classes have no common base
+        raise InvalidModel(f"ONNX Runtime cannot compute it: {error}") from error
+    pixels = np.random.default_rng(0).uniform(0, 255, (1, 3, shown.height, shown.width))
+    found = []
+    for frame in (np.zeros_like(pixels), np.full_like(pixels, 255), pixels, pixels):
+        image = (frame - np.reshape(shown.mean, (1, 3, 1, 1))) * np.reshape(shown.scale, (1, 3, 1, 1))
+        try:
+            (values,) = session.run([output], {name: image.astype(np.float32)})
+        except Exception as error:
+            raise InvalidModel(f"It does not compute a frame of {shown.width}x{shown.height}: {error}") from error
+        found.append(as_maps(values, description))
+    once, again = found[-2:]
+    if once.shape != again.shape or np.abs(once - again).max() > TOLERANCE * max(1e-9, float(np.abs(once).max())):
+        raise InvalidModel("It gives other values for the same frame each time.")
+    if once.shape != found[0].shape:
+        raise InvalidModel("What it gives for two frames has two shapes.")
+    if not any(maps.any() for maps in found) or (once == found[0]).all():
+        raise InvalidModel("It gives the same for every frame.")
+    return [int(side) for side in once.shape[1:]]
+
+
+if __name__ == "__main__":
+    serve(_read, save_file)
