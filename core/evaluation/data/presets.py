@@ -249,8 +249,8 @@ DATASETS: tuple[Dataset, ...] = (
         Sizes(1622, 1622, 1221, 1217),
     ),
     _frames("nordland", "Nordland", 2, None, "the thesis"),
-    _frames("nordland.1", "Nordland, ±1", 1, NORDLAND_SIZES, "BoQ, CVPR 2024"),
-    _frames("nordland.2", "Nordland, ±2", 2, NORDLAND_SIZES, "the thesis's tolerance on Patch-NetVLAD's list"),
+    _frames("nordland.1", "Nordland, ±1", 1, NORDLAND_SIZES, "±1 on Patch-NetVLAD's list"),
+    _frames("nordland.2", "Nordland, ±2", 2, NORDLAND_SIZES, "the thesis's ±2 on Patch-NetVLAD's list"),
     _frames("nordland.10", "Nordland, ±10", 10, NORDLAND_SIZES, "Patch-NetVLAD, CVPR 2021"),
     Dataset(
         "nordland.patch-netvlad",
