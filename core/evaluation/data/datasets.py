@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from core.errors import InvalidGroundTruth, InvalidTraverse
-from core.evaluation.data.layouts import Layout, Traverses, folders
+from core.evaluation.data.layouts import TRUTH_FILE, Layout, Traverses, folders
 from core.evaluation.data.pairs import TraversePair, all_references, count_negatives, leave_run_out
-from core.evaluation.data.presets import DATASETS, TRUTH_FILE, Dataset
+from core.evaluation.data.presets import DATASETS, Dataset
 from core.frames.traverses import Truth, read_ground_truth
 
 
@@ -37,12 +37,14 @@ def open_dataset(dataset: Dataset, folder: Path, reduced: bool = False, seed: in
         InvalidGroundTruth: the file or the poses that say what is true are missing or malformed.
     """
     layout, base = _find(dataset, folder)
-    found = layout.read(base)
+    found = _read(dataset, layout, base)
     queries, references = found.queries, found.references
     truth = _truth(dataset, layout, base, found)
     excluded = found.excluded if dataset.exclude is None else dataset.exclude(queries, references)
     _check_matched(dataset, excluded, references)
     notes = [*_size_notes(dataset, base, queries, references), *found.notes]
+    if excluded is not None:
+        notes.append(f"A query is not matched against {dataset.excluded}.")
     kept = all_references(references)
     if reduced:
         answerable, keep = _reduced_sizes(dataset, queries, references)
@@ -84,6 +86,19 @@ def _missing(dataset: Dataset, folder: Path) -> str:
     )
 
 
+def _read(dataset: Dataset, layout: Layout, base: Path) -> Traverses:
+    try:
+        return layout.read(base)
+    except InvalidGroundTruth as error:
+        raise _or_own(dataset, base, error) from error
+
+
+def _or_own(dataset: Dataset, base: Path, error: InvalidGroundTruth) -> InvalidGroundTruth:
+    """The same error with the way out of it."""
+    where = base / TRUTH_FILE
+    return InvalidGroundTruth(f"{dataset.title}: {error} Or put its truth into {where}, with rows query,reference.")
+
+
 def _truth(dataset: Dataset, layout: Layout, base: Path, found: Traverses) -> Truth:
     path = base / TRUTH_FILE
     if path.is_file():
@@ -99,9 +114,7 @@ def _truth(dataset: Dataset, layout: Layout, base: Path, found: Traverses) -> Tr
     try:
         return dataset.rule(found.queries, found.references)
     except InvalidGroundTruth as error:
-        raise InvalidGroundTruth(
-            f"{dataset.title}: {error} Or put its truth into {path}, with rows query,reference."
-        ) from error
+        raise _or_own(dataset, base, error) from error
 
 
 def _truth_files(dataset: Dataset, layout: Layout) -> list[str]:

@@ -14,6 +14,9 @@ from core.errors import InvalidTraverse
 from core.evaluation.data.truth_files import Reader, read_masks
 from core.frames.traverses import Truth, find_images
 
+TRUTH_FILE = "ground_truth.csv"
+"""The user's own truth; it comes before every other."""
+
 Names = tuple[str, ...]
 """Names that a file or folder goes by, or patterns of them; the first that is there is taken."""
 
@@ -101,15 +104,16 @@ def folders(
     """Two folders of images side by side.
 
     Args:
-        truth_file, read_truth: the file that says what is true, and its reader.
+        truth_file, read_truth: the file that says what is true, and its reader; not read beside the user's own.
         only: a text file with the names of the images that count, one a line, where it is there.
     """
 
     def read(base: Path) -> Traverses:
         known, asked = _images(base, references, only), _images(base, queries, only)
         path = present(base, (truth_file,)) if truth_file else None
-        truth = None if path is None or read_truth is None else read_truth(path, asked, known)
-        return Traverses(known, asked, truth)
+        if path is None or read_truth is None or (base / TRUTH_FILE).is_file():
+            return Traverses(known, asked)
+        return Traverses(known, asked, read_truth(path, asked, known))
 
     return Layout(publisher, home, (references, queries), read, truth_file)
 

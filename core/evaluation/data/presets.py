@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from core.evaluation.data.layouts import Layout, downloaded, folders, vpr_bench, vpr_tutorial
+from core.evaluation.data.layouts import TRUTH_FILE, Layout, downloaded, folders, vpr_bench, vpr_tutorial
 from core.evaluation.data.listed_layouts import dbstruct, gsv_cities, mapillary, patch_netvlad
 from core.evaluation.data.rules import Rule, around, every, frames, groups, nearest, within
 from core.evaluation.data.sequences import (
@@ -24,8 +24,6 @@ from core.evaluation.data.sequences import (
     tum,
 )
 from core.evaluation.data.truth_files import Reader, read_array, read_matrix, read_table
-
-TRUTH_FILE = "ground_truth.csv"
 
 THESIS = "The thesis"
 GROUP = "The thesis's group"

@@ -89,10 +89,10 @@ def read_table(query: int, reference: int, tolerance: int) -> Reader:
 
 
 def read_matrix(path: Path, queries: Sequence[Path], references: Sequence[Path]) -> Truth:
-    """A MATLAB file: a matrix of zeros and ones, queries by references or turned; or rows of numbers counted from 1.
+    """A MATLAB file: a matrix of zeros and ones, queries by references or turned, or lists of numbers.
 
     Rows of numbers are the references of each query, or where there are two columns and the first counts the queries,
-    a query and a reference.
+    a query and a reference.  They count from 1, and 0 fills up, unless 0 is there once, as of lists that count from 0.
 
     Raises:
         InvalidGroundTruth: the file cannot be read, or holds no matrix of this many queries.
@@ -103,6 +103,8 @@ def read_matrix(path: Path, queries: Sequence[Path], references: Sequence[Path])
         raise InvalidGroundTruth(f"The truth cannot be read: {error}") from error
     sizes = {len(queries), len(references)}
     for value in variables.values():
+        if isinstance(value, list) and len(value) == len(queries):
+            return _of_cell(value, path, len(references))
         if isinstance(value, np.ndarray) and value.ndim == 2 and sizes & set(value.shape):
             return _of_matrix(np.asarray(value, np.float64), path, len(queries), len(references))
     held = ", ".join(f"{name} {getattr(value, 'shape', '')}".strip() for name, value in list(variables.items())[:8])
@@ -238,10 +240,25 @@ def _of_matrix(matrix: NDArray[np.float64], path: Path, queries: int, references
     if rows.shape[1] == 2 and np.array_equal(np.sort(rows[:, 0]), np.arange(1, queries + 1)):
         order = np.argsort(rows[:, 0])
         rows = rows[order, 1:]
-    if rows.max() > references:
-        raise _other_count(path, "reference", int(rows.max()), references)
-    found = [{int(number) - 1 for number in row if number > 0} for row in rows]
-    return _truth(path, found)
+    return _of_rows([row.tolist() for row in rows], path, references)
+
+
+def _of_cell(cell: list[Any], path: Path, references: int) -> Truth:
+    if not all(isinstance(item, np.ndarray) and item.dtype.kind in "iuf" for item in cell):
+        raise InvalidGroundTruth(f"{path.name} holds a cell of something other than numbers.")
+    rows = [np.asarray(item, np.float64).ravel() for item in cell]
+    if any((~np.isfinite(row)).any() or (row < 0).any() or (row != np.round(row)).any() for row in rows):
+        raise InvalidGroundTruth(f"{path.name} holds a cell of something other than whole numbers.")
+    return _of_rows([row.tolist() for row in rows], path, references)
+
+
+def _of_rows(rows: Sequence[Sequence[float]], path: Path, references: int) -> Truth:
+    """Numbers of references, from 1 or, where 0 is there once, from 0."""
+    numbers = [int(number) for row in rows for number in row]
+    first = 0 if numbers.count(0) == 1 and max(numbers) < references else 1
+    if numbers and max(numbers) >= references + first:
+        raise _other_count(path, "reference", max(numbers), references)
+    return _truth(path, [{int(number) - first for number in row if number >= first} for row in rows])
 
 
 def _columns(mask: NDArray[np.bool_]) -> Truth:

@@ -234,7 +234,8 @@ def test_a_walk_by_its_trajectory(tmp_path: Path) -> None:
     trees.tum(tmp_path)
     pair = open_dataset(find_dataset("tum"), tmp_path)
     assert len(pair.queries) == 620 and pair.truth[4].tolist() == [314]
-    assert pair.notes == ["1 of 621 images have no pose within 0.1 s and are left out."]
+    assert pair.notes[0] == "1 of 621 images have no pose within 0.1 s and are left out."
+    assert pair.notes[1] == "A query is not matched against the 300 frames before and after the query, 10 s."
 
 
 def test_what_is_missing_is_said(tmp_path: Path) -> None:
@@ -249,6 +250,13 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
         InvalidGroundTruth, match=r"its truth is expected in .*17places/ground_truth_new\.npy, as published"
     ):
         open_dataset(find_dataset("17-places.vpr-bench"), tmp_path)
+    (tmp_path / "17places/ground_truth_new.npy").write_bytes(b"damaged")
+    with pytest.raises(
+        InvalidGroundTruth, match=r"whole NumPy file .* Or put its truth into .*ground_truth\.csv"
+    ):
+        open_dataset(find_dataset("17-places.vpr-bench"), tmp_path)
+    (tmp_path / "17places/ground_truth.csv").write_text("0,3\n")
+    assert open_dataset(find_dataset("17-places.vpr-bench"), tmp_path).truth[0].tolist() == [3]
     trees.patch_netvlad("tokyo247", "tokyo247")(tmp_path)
     (tmp_path / "tokyo247/index/images-00004.png").unlink()
     with pytest.raises(

@@ -128,6 +128,12 @@ def test_matrices_of_matlab(tmp_path: Path) -> None:
     assert truths(read_matrix, path) == [[0], [4], [2, 3]]
     savemat(path, {"pairs": np.array([[2, 5], [1, 1], [3, 2]])})
     assert truths(read_matrix, path) == [[0], [4], [1]]
+    cell = np.empty((3, 1), object)
+    cell[:, 0] = [np.array([[1, 2]]), np.array([[3]]), np.array([[5]])]
+    savemat(path, {"cell": cell})
+    assert truths(read_matrix, path) == [[0, 1], [2], [4]]
+    savemat(path, {"from_0": np.array([[0, 1], [2, 3], [4, 4]])})
+    assert truths(read_matrix, path) == [[0, 1], [2, 3], [4]]
     savemat(path, {"rows": np.array([[1, 2], [3, 0], [9, 0]])})
     with pytest.raises(InvalidGroundTruth, match="names the reference 9, and 5 images are there"):
         truths(read_matrix, path)
