@@ -14,6 +14,8 @@ from core.evaluation.protocol.results import read_similarity
 from core.evaluation.protocol.trust import trust_figures
 
 MARK = "computed elsewhere"
+SHORT_MARK = "elsewhere"
+"""In charts, where there is little room."""
 
 
 def read_others(folder: Path, pair: TraversePair) -> list[Run]:
@@ -47,7 +49,7 @@ def _run(path: Path, pair: TraversePair) -> Run:
     matched = matched_scores(scores, pair.kept, pair.excluded)
     evaluation = evaluation.model_copy(update=trust_figures(matched, pair.kept, outcomes, evaluation.notes))
     return Run(
-        about=About(path.stem, f"{path.stem} ({MARK})", "not computed here", {"similarities": path.name}),
+        about=About(path.stem, f"{path.stem} ({SHORT_MARK})", "not computed here", {"similarities": path.name}),
         identity=f"{path.stem} ({MARK})",
         evaluation=evaluation,
         outcomes=outcomes,

@@ -233,7 +233,7 @@ def _of_matrix(matrix: NDArray[np.float64], path: Path, queries: int, references
         raise InvalidGroundTruth(f"{path.name} holds numbers that are not finite.")
     if set(np.unique(matrix)) <= {0.0, 1.0} and matrix.shape in ((queries, references), (references, queries)):
         turned = matrix.shape != (queries, references)
-        return _columns((matrix if turned else matrix.T) > 0)
+        return _truth(path, [set(true.tolist()) for true in _columns((matrix if turned else matrix.T) > 0)])
     rows = matrix if len(matrix) == queries else matrix.T
     if len(rows) != queries or (rows < 0).any() or (rows != np.round(rows)).any():
         raise InvalidGroundTruth(f"{path.name} holds no row of whole numbers for each of {queries} queries.")

@@ -38,8 +38,9 @@ def test_others_stand_beside_what_was_measured(pair: TraversePair, tmp_path: Pat
     np.save(folder / "Theirs.npy", scores)
     (folder / "notes.txt").write_text("no matrix")
     (other,) = read_others(folder, pair)
-    assert (other.about.name, other.about.title, other.elsewhere) == ("Theirs", "Theirs (computed elsewhere)", True)
+    assert (other.about.name, other.about.title, other.elsewhere) == ("Theirs", "Theirs (elsewhere)", True)
     assert [one.matched for one in other.outcomes] == [True, True, True, False]
+    assert other.identity == other.evaluation.encoder == "Theirs (computed elsewhere)"
     assert other.bytes_per_place is None and set(other.milliseconds.values()) == {None}
 
     ours = Lookup(np.eye(4, dtype=np.float32))

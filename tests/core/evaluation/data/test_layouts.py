@@ -251,9 +251,7 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     ):
         open_dataset(find_dataset("17-places.vpr-bench"), tmp_path)
     (tmp_path / "17places/ground_truth_new.npy").write_bytes(b"damaged")
-    with pytest.raises(
-        InvalidGroundTruth, match=r"whole NumPy file .* Or put its truth into .*ground_truth\.csv"
-    ):
+    with pytest.raises(InvalidGroundTruth, match=r"whole NumPy file .* Or put its truth into .*ground_truth\.csv"):
         open_dataset(find_dataset("17-places.vpr-bench"), tmp_path)
     (tmp_path / "17places/ground_truth.csv").write_text("0,3\n")
     assert open_dataset(find_dataset("17-places.vpr-bench"), tmp_path).truth[0].tolist() == [3]
