@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from os.path import isfile
 from pathlib import Path
 
 from core.errors import InvalidTraverse
@@ -156,27 +157,31 @@ def vpr_tutorial(name: str, references: str, queries: str, masks: bool = False) 
     return Layout(found.publisher, found.home, (*found.holds, ("GT.npz",)), read, "GT.npz")
 
 
+def located(root: Path, name: str) -> Path | None:
+    """The image of a name below ``root``; None where it is missing, or where the name leads out of ``root``.
+
+    The lists of Tokyo 24/7 say .jpg where its files are .png.
+    """
+    relative = Path(name.strip())
+    if relative.is_absolute() or ".." in relative.parts or not relative.name:
+        return None
+    path = root / relative
+    return next((one for one in (path, path.with_suffix(".png"), path.with_suffix(".jpg")) if isfile(one)), None)
+
+
 def existing(root: Path, names: Sequence[str], listed_by: Path) -> list[Path]:
     """The images of a list, below ``root``.
 
     Raises:
-        InvalidTraverse: a name leads out of ``root``, or images are missing; the text says how many and names one.
+        InvalidTraverse: there is none, or some are missing; the text says how many and names one.
     """
-    images, missing = [], []
-    for name in names:
-        relative = Path(name.strip())
-        if relative.is_absolute() or ".." in relative.parts:
-            raise InvalidTraverse(f"{listed_by.name} lists {name[:80]!r}, which is no image below {root}.")
-        # The lists of Tokyo 24/7 say .jpg where its files are .png.
-        path = root / relative
-        found = next((one for one in (path, path.with_suffix(".png"), path.with_suffix(".jpg")) if one.is_file()), None)
-        images.append(found or path)
-        if found is None:
-            missing.append(path)
+    found = [(name, located(root, name)) for name in names]
+    missing = [name for name, path in found if path is None]
     if missing:
         raise InvalidTraverse(
-            f"{len(missing)} of {len(names)} images that {listed_by} lists are missing; the first is {missing[0]}."
+            f"{len(missing)} of {len(names)} images that {listed_by} lists are missing below {root}; the first is "
+            f"{missing[0][:200]!r}."
         )
-    if not images:
+    if not found:
         raise InvalidTraverse(f"{listed_by} lists no image.")
-    return images
+    return [path for _, path in found if path is not None]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.errors import InvalidGroundTruth, InvalidModel, InvalidTraverse
-from core.evaluation.data.layouts import Layout, Names, Traverses, existing, present
+from core.evaluation.data.layouts import Layout, Names, Traverses, existing, located, present
 from core.evaluation.data.poses import near
 from core.evaluation.data.truth_files import read_array, read_positions
 from core.frames.traverses import Truth
@@ -240,5 +240,4 @@ def _scalar(fields: dict[str, Any], name: str, path: Path) -> float:
 def _root(base: Path, names: Names, first: str) -> Path:
     """The folder that the names of images count from: the first that holds the first image, else the first."""
     roots = [base / name for name in names]
-    stem = str(Path(first).with_suffix("")) if not Path(first).is_absolute() else ""
-    return next((root for root in roots if stem and list(root.glob(f"{stem}.*"))), roots[0])
+    return next((root for root in roots if located(root, first) is not None), roots[0])

@@ -8,6 +8,7 @@ import pytest
 
 from core.errors import InvalidGroundTruth, InvalidTraverse
 from core.evaluation.data.datasets import find_dataset, open_dataset
+from core.evaluation.data.layouts import existing
 from core.evaluation.data.poses import near
 from core.evaluation.data.presets import CHEN, DATASETS, WEATHERS
 from core.evaluation.data.truth_files import read_positions
@@ -257,13 +258,17 @@ def test_what_is_missing_is_said(tmp_path: Path) -> None:
     assert open_dataset(find_dataset("17-places.vpr-bench"), tmp_path).truth[0].tolist() == [3]
     trees.patch_netvlad("tokyo247", "tokyo247")(tmp_path)
     (tmp_path / "tokyo247/index/images-00004.png").unlink()
-    with pytest.raises(
-        InvalidTraverse, match=r"1 of 12 images that .*index\.txt lists are missing; the first is .*00004"
-    ):
+    with pytest.raises(InvalidTraverse, match=r"1 of 12 images that .*index\.txt lists are missing below .*00004"):
         open_dataset(find_dataset("tokyo247"), tmp_path)
-    trees.text(tmp_path / "dataset_imagenames/tokyo247_imageNames_index.txt", "../secret.png")
-    with pytest.raises(InvalidTraverse, match=r"lists '\.\./secret\.png', which is no image below"):
-        open_dataset(find_dataset("tokyo247"), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "", ".", "a\0b.png", "x" * 300, "**/1.png"])
+def test_a_list_leads_nowhere_else(tmp_path: Path, name: str) -> None:
+    (tmp_path / "secret.png").touch()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/1.png").touch()
+    with pytest.raises(InvalidTraverse, match="1 of 2 images that list lists are missing"):
+        existing(tmp_path / "data", ["1.png", name], Path("list"))
 
 
 REAL = Path(__file__).parent / "patch_netvlad"
