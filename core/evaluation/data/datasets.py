@@ -90,6 +90,8 @@ def _read(dataset: Dataset, layout: Layout, base: Path) -> Traverses:
     try:
         return layout.read(base)
     except InvalidGroundTruth as error:
+        if not layout.optional_truth:
+            raise InvalidGroundTruth(f"{dataset.title}: {error}") from error
         raise _or_own(dataset, base, error) from error
 
 

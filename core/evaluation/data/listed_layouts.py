@@ -226,7 +226,8 @@ def _positions(fields: dict[str, Any], names: Names, count: int, path: Path) -> 
         if table.shape == (count, 2) and np.isfinite(table).all():
             return table
     raise InvalidGroundTruth(
-        f"{path.name}: {names[0]} of dbStruct has the shape {value.shape}; {count} images have 2 x {count} metres."
+        f"{path.name}: {names[0]} of dbStruct is not 2 x {count} finite metres, for {count} images; it has the shape "
+        f"{value.shape}."
     )
 
 
