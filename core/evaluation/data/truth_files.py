@@ -11,7 +11,7 @@ import re
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -101,16 +101,23 @@ def read_matrix(path: Path, queries: Sequence[Path], references: Sequence[Path])
         variables = read_mat(path)
     except InvalidModel as error:
         raise InvalidGroundTruth(f"The truth cannot be read: {error}") from error
-    sizes = {len(queries), len(references)}
+    return truth_of_variables(variables, path, len(queries), len(references))
+
+
+def truth_of_variables(variables: Mapping[str, Any], path: Path, queries: int, references: int) -> Truth:
+    """The truth of the first variable of a MATLAB file that fits so many queries and references.
+
+    Raises:
+        InvalidGroundTruth: none fits.
+    """
     for value in variables.values():
-        if isinstance(value, list) and len(value) == len(queries):
-            return _of_cell(value, path, len(references))
-        if isinstance(value, np.ndarray) and value.ndim == 2 and sizes & set(value.shape):
-            return _of_matrix(np.asarray(value, np.float64), path, len(queries), len(references))
+        if isinstance(value, list) and len(value) == queries:
+            return _of_cell(value, path, references)
+        if isinstance(value, np.ndarray) and value.ndim == 2 and {queries, references} & set(value.shape):
+            return _of_matrix(np.asarray(value, np.float64), path, queries, references)
     held = ", ".join(f"{name} {getattr(value, 'shape', '')}".strip() for name, value in list(variables.items())[:8])
     raise InvalidGroundTruth(
-        f"{path.name} holds no matrix for {len(queries)} queries and {len(references)} references, only "
-        f"{held or 'nothing'}."
+        f"{path.name} holds no matrix for {queries} queries and {references} references, only {held or 'nothing'}."
     )
 
 

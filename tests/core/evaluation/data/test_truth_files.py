@@ -10,7 +10,15 @@ from scipy.io import savemat
 
 from core.errors import InvalidGroundTruth
 from core.evaluation.data import object_arrays
-from core.evaluation.data.truth_files import Reader, read_array, read_masks, read_matrix, read_positions, read_table
+from core.evaluation.data.truth_files import (
+    Reader,
+    read_array,
+    read_masks,
+    read_matrix,
+    read_positions,
+    read_table,
+    truth_of_variables,
+)
 from tests.core.evaluation.data.trees import objects
 
 QUERIES = [Path(f"query/{number}.jpg") for number in range(3)]
@@ -119,27 +127,47 @@ def test_a_table_says_its_line(tmp_path: Path) -> None:
             truths(read_table(0, 2, 1), path)
 
 
-def test_matrices_of_matlab(tmp_path: Path) -> None:
-    """A mask either way round, rows of numbers from 1, pairs of a query and a reference; each read takes a second."""
-    path = tmp_path / "t.mat"
-    mask = np.zeros((5, 3), np.uint8)
-    mask[[0, 4, 2, 3], [0, 1, 2, 2]] = 1
-    savemat(path, {"about": "references by queries", "truth": mask})
-    assert truths(read_matrix, path) == [[0], [4], [2, 3]]
-    savemat(path, {"pairs": np.array([[2, 5], [1, 1], [3, 2]])})
-    assert truths(read_matrix, path) == [[0], [4], [1]]
-    cell = np.empty((3, 1), object)
+def test_a_file_of_matlab(tmp_path: Path) -> None:
+    """Each is read in a process of its own, which takes a second."""
+    path, cell = tmp_path / "t.mat", np.empty((3, 1), object)
     cell[:, 0] = [np.array([[1, 2]]), np.array([[3]]), np.array([[5]])]
-    savemat(path, {"cell": cell})
+    savemat(path, {"about": "references of each query", "truth": cell})
     assert truths(read_matrix, path) == [[0, 1], [2], [4]]
-    savemat(path, {"from_0": np.array([[0, 1], [2, 3], [4, 4]])})
-    assert truths(read_matrix, path) == [[0, 1], [2, 3], [4]]
-    savemat(path, {"rows": np.array([[1, 2], [3, 0], [9, 0]])})
-    with pytest.raises(InvalidGroundTruth, match="names the reference 9, and 5 images are there"):
-        truths(read_matrix, path)
     path.write_bytes(path.read_bytes()[:150])
     with pytest.raises(InvalidGroundTruth, match=r"The truth cannot be read: t\.mat"):
         truths(read_matrix, path)
+
+
+@pytest.mark.parametrize(
+    ("values", "true"),
+    [
+        ([[1, 0, 0, 0, 0], [0, 0, 0, 0, 1], [0, 0, 1, 1, 0]], [[0], [4], [2, 3]]),  # queries by references
+        ([[1, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 1], [0, 1, 0]], [[0], [4], [2, 3]]),  # and turned
+        ([[2, 5], [1, 1], [3, 2]], [[0], [4], [1]]),  # pairs of a query and its reference
+        ([[1, 2], [3, 0], [5, 0]], [[0, 1], [2], [4]]),  # filled up with 0
+        ([[0, 1], [2, 3], [4, 4]], [[0, 1], [2, 3], [4]]),  # counted from 0
+        ([[5, 3, 1]], [[4], [2], [0]]),  # a row in place of a column
+    ],
+)
+def test_matrices_of_matlab(values: list[list[int]], true: list[list[int]]) -> None:
+    found = truth_of_variables({"about": "text", "truth": np.array(values)}, Path("t.mat"), 3, 5)
+    assert [one.tolist() for one in found] == true
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (np.array([[1, 2], [3, 0], [9, 0]]), "names the reference 9, and 5 images are there"),
+        (np.array([[1.5], [2], [3]]), "no row of whole numbers"),
+        (np.array([[np.inf], [2], [3]]), "not finite"),
+        (np.zeros((3, 5)), "names no true reference"),
+        (np.zeros((7, 2)), r"holds no matrix for 3 queries and 5 references, only truth \(7, 2\)"),
+        (["a", "b", "c"], "a cell of something other than numbers"),
+    ],
+)
+def test_other_matrices_of_matlab_are_refused(value: object, said: str) -> None:
+    with pytest.raises(InvalidGroundTruth, match=said):
+        truth_of_variables({"truth": value}, Path("t.mat"), 3, 5)
 
 
 def test_masks_and_positions_of_numpy(tmp_path: Path) -> None:
