@@ -52,11 +52,13 @@ CANDIDATES = 10
 def map_sizes(subject: Subject, cache: EvaluationCache, seed: int = 0) -> list[SizePoint]:
     """The points of one system by rising size; none for a system that ships no probabilities.
 
+    There are none, either, where queries are not matched against all references: a map has no such exceptions.
+
     Args:
         seed: of the draw of maps and queries.
     """
     system = subject.system
-    if not isinstance(system, EncoderSystem) or system.encoder.calibration.curve is None:
+    if not isinstance(system, EncoderSystem) or system.encoder.calibration.curve is None or subject.pair.excluded:
         return []
     key = subject.key(
         "map-sizes",

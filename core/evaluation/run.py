@@ -17,10 +17,11 @@ from core.baselines.encoders import EncoderSystem
 from core.baselines.system import System
 from core.evaluation.cache import CacheEntry, EvaluationCache
 from core.evaluation.data.pairs import TraversePair
+from core.evaluation.data.published import published_figures
 from core.evaluation.map_sizes import map_sizes
 from core.evaluation.protocol.comparison import Comparison, Run, ScalePoint, SeverityCurve, SizePoint
 from core.evaluation.protocol.figures import STAGES, summarize
-from core.evaluation.protocol.outcomes import judge
+from core.evaluation.protocol.outcomes import judge, matched_scores
 from core.evaluation.protocol.trust import trust_figures
 from core.evaluation.scalability import scalability, scale_steps
 from core.evaluation.severity import severity, severity_steps
@@ -58,11 +59,13 @@ def compare_systems(
     cache: EvaluationCache,
     watch: Watch,
     extras: Extras = Extras(),
+    others: Sequence[Run] = (),
 ) -> Comparison:
     """Evaluate each system in turn; each result is cached as soon as it exists.
 
     Args:
         load: decodes an image; what it raises ends the run.
+        others: runs whose scores were computed elsewhere.
 
     Raises:
         InvalidModel: a system gives no finite scores, or cannot learn from the images of ``training``.
@@ -82,7 +85,7 @@ def compare_systems(
         if extras.severity:
             curves += severity(subject, cache, seed=extras.seed)
         watch.end()
-    ranked = best_first(runs)
+    ranked = best_first([*runs, *others])
     seeing = _best_encoder(systems, ranked)
     return Comparison(
         name=pair.name,
@@ -97,6 +100,7 @@ def compare_systems(
         map_sizes=sizes if extras.map_sizes else None,
         severity=curves if extras.severity else None,
         notes=list(pair.notes),
+        published=published_figures(pair.protocol),
     )
 
 
@@ -108,7 +112,7 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
     if measured is None:
         measured = measure(subject)
         cache.store(key, _entry(measured))
-    outcomes = judge(measured.scores, subject.pair.kept, subject.pair.truth)
+    outcomes = judge(measured.scores, subject.pair.kept, subject.pair.truth, subject.pair.excluded)
     evaluation = summarize(
         measured.identity,
         outcomes,
@@ -118,7 +122,8 @@ def evaluate(subject: Subject, cache: EvaluationCache) -> Run:
         bytes_per_place=measured.bytes_per_place,
         trained_on=subject.trained_on,
     )
-    trusted = trust_figures(measured.scores, subject.pair.kept, outcomes, evaluation.notes)
+    matched = matched_scores(measured.scores, subject.pair.kept, subject.pair.excluded)
+    trusted = trust_figures(matched, subject.pair.kept, outcomes, evaluation.notes)
     evaluation = evaluation.model_copy(update=trusted)
     return Run(
         about=subject.about,

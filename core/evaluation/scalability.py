@@ -6,7 +6,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
+from core.evaluation.cache import CacheEntry, EvaluationCache
 from core.evaluation.data.pairs import TraversePair
 from core.evaluation.protocol.comparison import ScalePoint
 from core.evaluation.protocol.figures import recall_at_k
@@ -33,9 +33,7 @@ def scalability(subject: Subject, cache: EvaluationCache) -> list[ScalePoint]:
     traverses grow together, and no query becomes a new place because its reference is not reached.
     """
     sizes = scale_sizes(len(subject.pair.kept))
-    key = subject.key(
-        "scalability", sizes=sizes, truth=arrays_digest(subject.pair.truth), kept=subject.pair.kept.tolist()
-    )
+    key = subject.key("scalability", sizes=sizes, kept=subject.pair.kept.tolist(), **subject.judged_by)
     entry = cache.load(key)
     if entry is not None:
         return [ScalePoint(**point) for point in entry.values["points"]]
@@ -60,7 +58,9 @@ def _point(subject: Subject, size: int) -> ScalePoint:
     kept, asked = subject.pair.kept[:size], _asked(subject.pair, size)
     index = subject.system.index(subject.references.descriptions[:size])
     scored = subject.score(index, [subject.queries.descriptions[number] for number in asked])
-    outcomes = judge(scored.scores, kept, [subject.pair.truth[number] for number in asked])
+    truth, excluded = subject.pair.truth, subject.pair.excluded
+    left_out = None if excluded is None else [excluded[number] for number in asked]
+    outcomes = judge(scored.scores, kept, [truth[number] for number in asked], left_out)
     return ScalePoint(
         system=subject.about.name,
         references=size,

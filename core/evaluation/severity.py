@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from core.baselines.system import Index
-from core.evaluation.cache import CacheEntry, EvaluationCache, arrays_digest
+from core.evaluation.cache import CacheEntry, EvaluationCache
 from core.evaluation.data.disturbances import DISTURBANCES, Disturbance
 from core.evaluation.protocol.comparison import SeverityCurve
 from core.evaluation.protocol.figures import recall_at_k
@@ -28,8 +28,8 @@ def severity(
             disturbance=disturbance.name,
             levels=disturbance.levels,
             seed=seed,
-            truth=arrays_digest(subject.pair.truth),
             kept=subject.pair.kept.tolist(),
+            **subject.judged_by,
         )
         curve = _loaded(cache.load(key), disturbance, subject)
         if curve is None:
@@ -69,7 +69,7 @@ def _disturbed(subject: Subject, disturbance: Disturbance, level: float, seed: i
 def _point(subject: Subject, index: Index, queries: Described) -> tuple[float, float]:
     """recall@1 (0 where no query has a true reference) and AUC-PR."""
     scores = subject.score(index, queries.descriptions).scores
-    outcomes = judge(scores, subject.pair.kept, subject.pair.truth)
+    outcomes = judge(scores, subject.pair.kept, subject.pair.truth, subject.pair.excluded)
     area = auc_pr(best_scores(outcomes), best_matched(outcomes))
     return recall_at_k(outcomes, 1) or 0.0, area
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from core.baselines.system import About, Description, Index, System, Trainable
 from core.errors import InvalidModel
-from core.evaluation.cache import cache_key, files_digest
+from core.evaluation.cache import arrays_digest, cache_key, files_digest
 from core.evaluation.data.pairs import TraversePair
 from core.frames.preprocessing import Pixels
 from core.threads import keep_numpy_single_threaded
@@ -111,6 +111,12 @@ class Subject:
             queries=files_digest(self.pair.queries),
             **parts,
         )
+
+    @property
+    def judged_by(self) -> dict[str, str]:
+        """What a judgement depends on, as parts of a cache key: the truth, and the references that are left out."""
+        excluded = {} if self.pair.excluded is None else {"excluded": arrays_digest(self.pair.excluded)}
+        return {"truth": arrays_digest(self.pair.truth), **excluded}
 
     @cached_property
     def references(self) -> Described:

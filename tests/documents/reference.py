@@ -1,5 +1,5 @@
 """The generated pages of ``docs/reference``: settings, command line, HTTP operations and problems,
-the Python client.
+the Python client, the protocols of evaluation.
 
     python -m tests.documents.reference     # writes them; so does scripts/reference
 
@@ -15,6 +15,8 @@ from typing import Any
 
 import typer.main
 
+from core.evaluation.data.presets import DATASETS
+from core.evaluation.data.published import PUBLISHED, RECALLS
 from service.commands.application import application
 from service.errors.problems import BY_STATUS, KINDS, TYPE_PREFIX
 from service.settings import PREFIX, Settings
@@ -49,6 +51,26 @@ OPERATIONS = """
 This page is for everyone who writes a client. It lists every operation with the role that its key needs, and every
 kind of problem. Parameters and bodies are at `/docs` of a running service and in
 [`openapi.json`](../../openapi.json). [HTTP conventions](http.md) describes what all operations share.
+"""
+
+PROTOCOLS = """
+# Protocols
+
+This page is for researchers. It lists the data sets and protocols that `placerec evaluate --dataset NAME --data DIR`
+knows: which traverse is the reference and which the query, what is true, what a query is not matched against, and how
+many images there should be. [Evaluate place recognition](../how-to/evaluate.md) shows how to use them.
+
+`DIR` holds the folders of the two traverses, or is any folder of one of the published trees below: the folders above
+those in braces may be left out. A file `ground_truth.csv` with rows `query,reference` beside the traverses says what is
+true in place of the rule. Counts that differ from the published ones are said in a remark.
+"""
+
+PUBLISHED_FIGURES = """
+## Published figures
+
+These are recalls that others have published of these protocols, in percent. Nothing in this table was measured here. A
+report shows those of its protocol in a table of their own. Figures that could not be read in a source are left out:
+those of BoQ and MegaLoc, and those that were measured by another protocol.
 """
 
 METHODS = ("get", "post", "put", "patch", "delete")
@@ -169,6 +191,35 @@ def paragraphs(text: str) -> list[str]:
     ]
 
 
+def protocols() -> str:
+    """The page of all data sets and protocols, and of what others have published of them."""
+    lines = [
+        REMARK + PROTOCOLS,
+        "## Data sets",
+        "",
+        "| name | data set | reference | query | true | queries, references | protocol of |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for dataset in DATASETS:
+        sides = [f"`{names[0]}`" if names else "the frames" for names in (dataset.references, dataset.queries)]
+        sizes = dataset.sizes
+        counts = "" if sizes is None else f"{sizes.queries}, {sizes.references} ({sizes.source})"
+        true = f"{dataset.truth}; left out: {dataset.excluded}" if dataset.excluded else dataset.truth
+        cells = (f"`{dataset.name}`", dataset.title, *sides, true, counts, dataset.source)
+        lines.append(f"| {' | '.join(map(cell, cells))} |")
+    lines += ["", "## Published trees", "", "| name | publisher | holds | truth |", "|---|---|---|---|"]
+    for dataset in DATASETS:
+        for layout in dataset.layouts:
+            held = layout.looked_for().removesuffix(f" ({layout.publisher})")
+            truth = f"`{layout.truth_file}`" if layout.truth_file else ""
+            lines.append(f"| `{dataset.name}` | {layout.publisher} | `{held}` | {truth} |")
+    lines += [PUBLISHED_FIGURES, "| name | system | R@1 | R@5 | R@10 | source |", "|---|---|---|---|---|---|"]
+    for one in sorted(PUBLISHED, key=lambda one: (one.protocol, -one.recall_at[0])):
+        recalls = [f"{100 * recall:.1f}" for recall in one.recall_at] + [""] * (len(RECALLS) - len(one.recall_at))
+        lines.append(f"| `{one.protocol}` | {one.system} | {' | '.join(recalls)} | {cell(one.source)} |")
+    return "\n".join([*lines, ""])
+
+
 def client() -> str:
     """The page of the Python client."""
     return REMARK + "\n" + client_reference.page()
@@ -179,6 +230,7 @@ PAGES = {
     "command-line.md": command_line,
     "http-operations.md": operations,
     "client.md": client,
+    "protocols.md": protocols,
 }
 
 

@@ -1,176 +1,15 @@
-"""Benchmark data sets, ready to be pointed at a folder: traverses, order, truth, reduced references.
-
-Names, sizes and tolerances are those of the thesis (section 2.4, Tables 2.2 and 2.3); folder names
-are those under which its authors and VPR-Bench hand the sets out.
-"""
+"""Opening a data set by its name: its traverses are found in a folder, checked and counted, and given their truth."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from core.errors import InvalidGroundTruth, InvalidTraverse
+from core.evaluation.data.layouts import TRUTH_FILE, Layout, Traverses, folders
 from core.evaluation.data.pairs import TraversePair, all_references, count_negatives, leave_run_out
-from core.evaluation.data.poses import nearest_truth, read_poses, within_truth
-from core.frames.traverses import Truth, find_images, read_ground_truth, tolerance_truth
-
-TRUTH_FILE = "ground_truth.csv"
-
-Rule = Callable[[Sequence[Path], Sequence[Path]], Truth]
-"""Truth from the images of queries and references, in that order."""
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """T, R, and with reduced references T' and R' (Table 2.2)."""
-
-    queries: int
-    references: int
-    answerable: int | None = None
-    kept: int | None = None
-
-
-@dataclass(frozen=True)
-class Dataset:
-    """One data set.
-
-    references, queries: names that the folder of a traverse goes by; the first that is there is taken.
-    rule: what is true where no ``ground_truth.csv`` lies beside the traverses; None where one must.
-    truth: the rule, in words.
-    sizes: those of the thesis; None where it has none.
-    """
-
-    name: str
-    title: str
-    references: tuple[str, ...]
-    queries: tuple[str, ...]
-    truth: str
-    rule: Rule | None = None
-    sizes: Sizes | None = None
-
-
-def frames(tolerance: int) -> Rule:
-    """Query i is true at the references i - ``tolerance`` to i + ``tolerance``."""
-    return lambda queries, references: tolerance_truth(len(queries), len(references), tolerance)
-
-
-def nearest(tolerance: int) -> Rule:
-    """A query is true at the reference nearest to its geotag and ``tolerance`` frames around that."""
-    return lambda queries, references: nearest_truth(read_poses(queries), read_poses(references), tolerance)
-
-
-def within(metres: float) -> Rule:
-    """A query is true at the references within ``metres`` of its position."""
-    return lambda queries, references: within_truth(read_poses(queries), read_poses(references), metres, None)
-
-
-def groups(queries: Sequence[Path], references: Sequence[Path]) -> Truth:
-    """Query i is true at the i-th group of references, all groups of one size.
-
-    Raises:
-        InvalidTraverse: the references cannot be shared out evenly.
-    """
-    size, rest = divmod(len(references), len(queries))
-    if rest or not size:
-        raise InvalidTraverse(
-            f"{len(references)} references cannot be shared out evenly over {len(queries)} queries: some are missing."
-        )
-    return [np.arange(index * size, (index + 1) * size, dtype=np.int64) for index in range(len(queries))]
-
-
-def _berlin(name: str, title: str, folder: str, known: int, asked: int, sizes: Sizes) -> Dataset:
-    return Dataset(
-        name,
-        title,
-        (f"{folder}_{known}", "reference", "ref"),
-        (f"{folder}_{asked}", "query"),
-        "the reference nearest to the query's geotag, ±2 frames",
-        nearest(2),
-        sizes,
-    )
-
-
-DATASETS: tuple[Dataset, ...] = (
-    Dataset(
-        "gardens-point",
-        "Gardens Point Walking",
-        ("night_right", "reference", "ref"),
-        ("day_left", "query"),
-        "±3 frames",
-        frames(3),
-        Sizes(200, 200, 152, 150),
-    ),
-    Dataset(
-        "synthesized-nordland",
-        "Synthesized Nordland",
-        ("summer", "summer_ref", "reference", "ref"),
-        ("winter", "winter_test", "query"),
-        "±2 frames",
-        frames(2),
-        Sizes(1622, 1622, 1221, 1217),
-    ),
-    Dataset(
-        "nordland",
-        "Nordland",
-        ("summer", "reference", "ref"),
-        ("winter", "query"),
-        "±2 frames",
-        frames(2),
-    ),
-    Dataset(
-        "st-lucia",
-        "St Lucia",
-        ("190809_0845_Ref", "190809_0845_ref", "190809_0845", "reference", "ref"),
-        ("100909_1410_Test", "100909_1410_test", "100909_1410", "query"),
-        "within 25 m by GPS (the distance is ours: the thesis names none)",
-        within(25.0),
-        Sizes(1249, 1249),
-    ),
-    Dataset(
-        "spedtest",
-        "SPEDTest",
-        ("refer", "reference", "ref"),
-        ("query",),
-        "the i-th three references (in VPR-Bench's form the i-th one)",
-        groups,
-        Sizes(607, 1821),
-    ),
-    _berlin("berlin-a100", "Berlin A100", "berlin_A100", 2, 1, Sizes(81, 85, 70, 64)),
-    _berlin(
-        "berlin-halenseestrasse",
-        "Berlin Halenseestrasse",
-        "berlin_halenseestrasse",
-        2,
-        1,
-        Sizes(67, 157, 50, 138),
-    ),
-    _berlin("berlin-kudamm", "Berlin Kudamm", "berlin_kudamm", 1, 2, Sizes(222, 201, 166, 151)),
-    Dataset(
-        "tokyo247",
-        "Tokyo 24/7 (Query247)",
-        ("database", "reference", "ref"),
-        ("queries", "query"),
-        "within 25 m of the query",
-        within(25.0),
-    ),
-    Dataset(
-        "corridor",
-        "Corridor",
-        ("ref", "reference"),
-        ("query",),
-        f"the rows of {TRUTH_FILE}",
-    ),
-    Dataset(
-        "lip6",
-        "Lip6 outdoor",
-        ("reference", "ref"),
-        ("query",),
-        f"the rows of {TRUTH_FILE}",
-    ),
-)
+from core.evaluation.data.presets import DATASETS, Dataset
+from core.frames.traverses import Truth, read_ground_truth
 
 
 def find_dataset(name: str) -> Dataset:
@@ -189,61 +28,124 @@ def open_dataset(dataset: Dataset, folder: Path, reduced: bool = False, seed: in
     """The traverses of a data set in ``folder``, in natural order, with their truth.
 
     Args:
-        folder: holds the folders of the traverses.
+        folder: holds the folders of the traverses, or is any folder of a published tree above or around them.
         reduced: leave references out until Table 2.2's R' are kept; ``seed`` draws which.
 
     Raises:
-        InvalidTraverse: a folder is missing or empty, or has another size than the reduced references are for.
+        InvalidTraverse: a folder or an image is missing, or the traverses have another size than the reduced
+            references are for.
         InvalidGroundTruth: the file or the poses that say what is true are missing or malformed.
     """
-    references = find_images(_traverse(dataset, folder, dataset.references, "references"))
-    queries = find_images(_traverse(dataset, folder, dataset.queries, "queries"))
-    truth = _truth(dataset, folder, queries, references)
-    notes = _size_notes(dataset, queries, references)
-    if not reduced:
-        return TraversePair(dataset.title, references, queries, truth, all_references(references), notes)
-    answerable, keep = _reduced_sizes(dataset, queries, references)
-    kept = leave_run_out(truth, len(references), keep, answerable, seed)
-    left = len(queries) - count_negatives(truth, kept)
-    notes.append(
-        f"{keep} of {len(references)} references are kept, and {left} queries keep a true one (Table 2.2: {keep} and "
-        f"{answerable}): one contiguous run is left out. The table gives counts only; which run is our choice, drawn "
-        f"with the seed {seed}."
+    layout, base = _find(dataset, folder)
+    found = _read(dataset, layout, base)
+    queries, references = found.queries, found.references
+    truth = _truth(dataset, layout, base, found)
+    excluded = found.excluded if dataset.exclude is None else dataset.exclude(queries, references)
+    _check_matched(dataset, excluded, references)
+    notes = [*_size_notes(dataset, base, queries, references), *found.notes]
+    if excluded is not None:
+        notes.append(f"A query is not matched against {dataset.excluded}.")
+    kept = all_references(references)
+    if reduced:
+        answerable, keep = _reduced_sizes(dataset, queries, references)
+        kept = leave_run_out(truth, len(references), keep, answerable, seed)
+        left = len(queries) - count_negatives(truth, kept)
+        notes.append(
+            f"{keep} of {len(references)} references are kept, and {left} queries keep a true one (Table 2.2: {keep} "
+            f"and {answerable}): one contiguous run is left out. The table gives counts only; which run is our choice, "
+            f"drawn with the seed {seed}."
+        )
+    return TraversePair(dataset.title, references, queries, truth, kept, notes, excluded, dataset.name)
+
+
+def _find(dataset: Dataset, folder: Path) -> tuple[Layout, Path]:
+    """The layout in which the data set lies there, and the folder that holds it."""
+    plain = () if not dataset.references else (folders("two folders", "", dataset.references, dataset.queries),)
+    # The layout with a truth of its own comes before the folders alone.
+    layouts = sorted((*dataset.layouts, *plain), key=lambda layout: not layout.truth_file)
+    found = [(layout, base) for layout in layouts if (base := layout.find(folder)) is not None]
+    for layout, base in found:
+        if not layout.truth_file or not layout.optional_truth or any(base.glob(layout.truth_file)):
+            return layout, base
+    if found:
+        return found[0]
+    raise InvalidTraverse(_missing(dataset, folder))
+
+
+def _missing(dataset: Dataset, folder: Path) -> str:
+    """What is missing, and where it was looked for."""
+    said = f"nothing of it is in the folder {folder}."
+    for names, what in ((dataset.references, "references"), (dataset.queries, "queries")):
+        if names and not any(path.is_dir() for name in names for path in folder.glob(name)):
+            more = f" (or {', '.join(names[1:])} in its place)" if names[1:] else ""
+            said = f"its {what} are expected in the folder {folder / names[0]}{more}."
+            break
+    others = "; ".join(layout.looked_for() for layout in dataset.layouts)
+    return f"{dataset.title}: {said}" + (
+        f" Also looked for, with or without the folders above: {others}." * bool(others)
     )
-    return TraversePair(dataset.title, references, queries, truth, kept, notes)
 
 
-def _traverse(dataset: Dataset, folder: Path, names: tuple[str, ...], what: str) -> Path:
-    for name in names:
-        if (folder / name).is_dir():
-            return folder / name
-    others = f" (or {', '.join(names[1:])} in its place)" if names[1:] else ""
-    raise InvalidTraverse(f"{dataset.title}: its {what} are expected in the folder {folder / names[0]}{others}.")
+def _read(dataset: Dataset, layout: Layout, base: Path) -> Traverses:
+    try:
+        return layout.read(base)
+    except InvalidGroundTruth as error:
+        if not layout.optional_truth:
+            raise InvalidGroundTruth(f"{dataset.title}: {error}") from error
+        raise _or_own(dataset, base, error) from error
 
 
-def _truth(dataset: Dataset, folder: Path, queries: Sequence[Path], references: Sequence[Path]) -> Truth:
-    path = folder / TRUTH_FILE
+def _or_own(dataset: Dataset, base: Path, error: InvalidGroundTruth) -> InvalidGroundTruth:
+    """The same error with the way out of it."""
+    where = base / TRUTH_FILE
+    return InvalidGroundTruth(f"{dataset.title}: {error} Or put its truth into {where}, with rows query,reference.")
+
+
+def _truth(dataset: Dataset, layout: Layout, base: Path, found: Traverses) -> Truth:
+    path = base / TRUTH_FILE
     if path.is_file():
-        return read_ground_truth(path, len(queries), len(references))
+        return read_ground_truth(path, len(found.queries), len(found.references))
+    if found.truth is not None:
+        return found.truth
     if dataset.rule is None:
+        where = " or ".join(str(base / name) for name in _truth_files(dataset, layout))
         raise InvalidGroundTruth(
-            f"{dataset.title}: its truth is expected in the file {path}, with rows query,reference."
+            f"{dataset.title}: its truth is expected in the file {path}, with rows query,reference"
+            + (f", or in {where}, as published." if where else ".")
         )
     try:
-        return dataset.rule(queries, references)
+        return dataset.rule(found.queries, found.references)
     except InvalidGroundTruth as error:
-        raise InvalidGroundTruth(
-            f"{dataset.title}: {error} Or put its truth into {path}, with rows query,reference."
-        ) from error
+        raise _or_own(dataset, base, error) from error
 
 
-def _size_notes(dataset: Dataset, queries: Sequence[Path], references: Sequence[Path]) -> list[str]:
+def _truth_files(dataset: Dataset, layout: Layout) -> list[str]:
+    """The files in which publishers keep the truth."""
+    return list(dict.fromkeys(one.truth_file for one in (layout, *dataset.layouts) if one.truth_file))
+
+
+def _check_matched(dataset: Dataset, excluded: Truth | None, references: Sequence[Path]) -> None:
+    for query, left_out in enumerate(excluded or []):
+        if len(left_out) == len(references):
+            raise InvalidTraverse(
+                f"{dataset.title}: nothing is left to match query {query} against: {dataset.excluded} do not count, "
+                f"and there are {len(references)} images."
+            )
+
+
+def _size_notes(dataset: Dataset, base: Path, queries: Sequence[Path], references: Sequence[Path]) -> list[str]:
     sizes = dataset.sizes
     if sizes is None or (sizes.queries, sizes.references) == (len(queries), len(references)):
         return []
+    lacks = [
+        f"{wanted - len(images)} {what}"
+        for wanted, images, what in ((sizes.queries, queries, "queries"), (sizes.references, references, "references"))
+        if wanted > len(images)
+    ]
+    missing = f" ({' and '.join(lacks)} are missing in {base})" if lacks else ""
     return [
-        f"The thesis counts {sizes.queries} queries and {sizes.references} references of {dataset.title}; here are "
-        f"{len(queries)} and {len(references)}, so its figures do not compare."
+        f"{sizes.source} counts {sizes.queries} queries and {sizes.references} references of {dataset.title}; here are "
+        f"{len(queries)} and {len(references)}{missing}, so its figures do not compare."
     ]
 
 

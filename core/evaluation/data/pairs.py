@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from core.errors import InvalidGroundTruth
+from core.errors import InvalidGroundTruth, InvalidTraverse
 from core.frames.traverses import Truth
 
 
@@ -21,6 +21,8 @@ class TraversePair:
     truth: of each query, indices into ``references``, kept or not.
     kept: int64 [R'], ascending, indices of the references to match against.
     notes: sentences about the data that a reader of the figures must know.
+    excluded: of each query, indices into ``references`` that it is not matched against; None where there are none.
+    protocol: the name of the data set that ``placerec evaluate --list`` shows; empty for two folders.
     """
 
     name: str
@@ -29,6 +31,8 @@ class TraversePair:
     truth: Truth
     kept: NDArray[np.int64]
     notes: list[str] = field(default_factory=list)
+    excluded: Truth | None = None
+    protocol: str = ""
 
     @property
     def kept_references(self) -> list[Path]:
@@ -43,6 +47,21 @@ class TraversePair:
 def all_references(references: list[Path]) -> NDArray[np.int64]:
     """The indices of all references, int64 [R]."""
     return np.arange(len(references), dtype=np.int64)
+
+
+def limit(pair: TraversePair, kept: NDArray[np.int64]) -> TraversePair:
+    """The pair with other kept references.
+
+    Args:
+        kept: int64 [R'], ascending.
+
+    Raises:
+        InvalidTraverse: a query would be matched against none of them.
+    """
+    for query, left_out in enumerate(pair.excluded or []):
+        if np.isin(kept, left_out).all():
+            raise InvalidTraverse(f"query {query} is matched against none of the {len(kept)} references that are kept.")
+    return replace(pair, kept=kept)
 
 
 def count_negatives(truth: Truth, kept: NDArray[np.int64]) -> int:

@@ -54,16 +54,32 @@ def within_truth(queries: Sequence[Pose], references: Sequence[Pose], metres: fl
     Raises:
         InvalidGroundTruth: poses are in two frames, one has no heading that needs one, or none is near another.
     """
-    distances = _distances(queries, references)
-    near = distances <= metres  # Q x R
+    asked, known = _positions(queries, references)
+    truth, closest = near(asked, known, metres)
     if degrees is not None:
-        near &= _turns(queries, references) <= degrees
-    if not near.any():
+        truth = [
+            found[_turns([query], [references[index] for index in found])[0] <= degrees] if len(found) else found
+            for query, found in zip(queries, truth, strict=True)
+        ]
+    if not any(len(found) for found in truth):
         raise InvalidGroundTruth(
-            f"no query lies within {metres:g} m of a reference (the nearest {distances.min():.1f} m off)"
+            f"no query lies within {metres:g} m of a reference (the nearest {closest:.1f} m off)"
             + ("." if degrees is None else f" and looks the same way within {degrees:g}°.")
         )
-    return [np.flatnonzero(row) for row in near]
+    return truth
+
+
+def near(asked: NDArray[np.float64], known: NDArray[np.float64], metres: float) -> tuple[Truth, float]:
+    """The references within ``metres`` of each query, and the least distance of any two.
+
+    Args:
+        asked, known: positions of queries and references, float64 [Q, d] and [R, d].
+    """
+    from scipy.spatial import KDTree
+
+    tree = KDTree(known)
+    found = [np.array(sorted(row), np.int64) for row in tree.query_ball_point(asked, metres * (1 + 1e-12), workers=1)]
+    return found, float(tree.query(asked)[0].min())
 
 
 def nearest_truth(queries: Sequence[Pose], references: Sequence[Pose], frames: int) -> Truth:
@@ -72,20 +88,19 @@ def nearest_truth(queries: Sequence[Pose], references: Sequence[Pose], frames: i
     Raises:
         InvalidGroundTruth: poses are in two frames.
     """
-    nearest = _distances(queries, references).argmin(axis=1)
+    asked, known = _positions(queries, references)
+    # A row at a time: Q x R differences of long traverses would not fit into memory.
+    nearest = [int(np.linalg.norm(known - position, axis=1).argmin()) for position in asked]
     return [
         np.arange(max(0, index - frames), min(len(references), index + frames + 1), dtype=np.int64) for index in nearest
     ]
 
 
-def _distances(queries: Sequence[Pose], references: Sequence[Pose]) -> NDArray[np.float64]:
-    """Metres between each query and each reference, float64 [Q, R]."""
+def _positions(queries: Sequence[Pose], references: Sequence[Pose]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The positions of queries and references, float64 [Q, 3] and [R, 3]."""
     if len({pose.kind() for pose in [*queries, *references]}) > 1:
         raise InvalidGroundTruth("some poses are in metres and others in degrees: they cannot be compared.")
-    asked = np.stack([pose.position() for pose in queries])
-    known = np.stack([pose.position() for pose in references])
-    # A row at a time: Q x R x 3 differences of long traverses would not fit into memory.
-    return np.stack([np.linalg.norm(known - position, axis=1) for position in asked])
+    return np.stack([pose.position() for pose in queries]), np.stack([pose.position() for pose in references])
 
 
 def _turns(queries: Sequence[Pose], references: Sequence[Pose]) -> NDArray[np.float64]:

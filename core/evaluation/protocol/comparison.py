@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from core.evaluation.data.published import Published
 from core.evaluation.protocol.figures import Evaluation
 from core.evaluation.protocol.outcomes import Outcome
 from core.frames.traverses import Truth
@@ -26,10 +27,11 @@ class Run:
     identity: of the system, ``<name>@<sha256>``.
     outcomes: one for each query, in their order.
     scores: float32 [Q, R'], higher is more alike; column j belongs to reference ``kept[j]`` of the comparison.
-    bytes_per_place: mean over the kept references.
+    bytes_per_place: mean over the kept references; None where the scores were computed elsewhere.
     milliseconds: medians per query, by stage; ``match`` is one query against all kept references.  None
         for a stage that the system lacks.
     cached: the figures, times included, are those of an earlier run.
+    elsewhere: the scores were not computed here but read from a file.
     """
 
     about: About
@@ -37,9 +39,10 @@ class Run:
     evaluation: Evaluation
     outcomes: list[Outcome]
     scores: NDArray[np.float32]
-    bytes_per_place: int
+    bytes_per_place: int | None
     milliseconds: dict[str, float | None]
     cached: bool = False
+    elsewhere: bool = False
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,7 @@ class Comparison:
     regions: gives the regions of interest of an image, by the best run whose system has some; None without one.
     regions_of: identity of that run; only its matches are shown with regions.
     notes: sentences about the data that a reader must know, such as how references were chosen.
+    published: figures that others have published of this protocol; nothing of them was measured here.
     """
 
     name: str
@@ -123,3 +127,4 @@ class Comparison:
     map_sizes: list[SizePoint] | None = None
     severity: list[SeverityCurve] | None = None
     notes: list[str] = field(default_factory=list)
+    published: list[Published] = field(default_factory=list)

@@ -52,15 +52,41 @@ def judge_ranking(scores: Scores, kept: NDArray[np.int64], true: NDArray[np.int6
     return Outcome(int(kept[best]), float(scores[best]), rank == 1, rank)
 
 
-def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth) -> list[Outcome]:
+def judge(scores: Scores, kept: NDArray[np.int64], truth: Truth, excluded: Truth | None = None) -> list[Outcome]:
     """The outcomes of all queries.
 
     Args:
         scores: [Q, R'].
         kept: int64 [R'], ascending.
         truth: of each query.
+        excluded: of each query, the references that it is not matched against.
+
+    Raises:
+        ValueError: a query is matched against no reference, or a score is not finite.
     """
-    return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
+    if excluded is None:
+        return [judge_ranking(row, kept, true) for row, true in zip(scores, truth, strict=True)]
+    outcomes = []
+    for row, true, left_out in zip(scores, truth, excluded, strict=True):
+        matched = ~np.isin(kept, left_out)
+        outcomes.append(judge_ranking(row[matched], kept[matched], true))
+    return outcomes
+
+
+def matched_scores(scores: Scores, kept: NDArray[np.int64], excluded: Truth | None) -> Scores:
+    """The scores with -inf for the references that a query is not matched against; the array itself without any.
+
+    Args:
+        scores: [Q, R'].
+        kept: int64 [R'].
+        excluded: of each query.
+    """
+    if excluded is None:
+        return scores
+    matched = scores.copy()
+    for row, left_out in zip(matched, excluded, strict=True):
+        row[np.isin(kept, left_out)] = -np.inf
+    return matched
 
 
 def best_scores(outcomes: Sequence[Outcome]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+import tokenize
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +117,7 @@ def read_similarity(path: Path, transposed: bool = False) -> NDArray[np.float64]
         matrix = np.load(path, allow_pickle=False)
     except OSError as error:
         raise InvalidResults(f"{path} cannot be read: {error.strerror or 'it is no .npy file'}.") from error
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, SyntaxError, tokenize.TokenError) as error:
         raise InvalidResults(
             f"{path.name} is not a plain .npy array; save the matrix alone: np.save(file, matrix.astype('float32'))."
         ) from error

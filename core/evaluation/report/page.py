@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from core.errors import MissingExtra, StorageFailure, StorageFull
+from core.evaluation.data.published import RECALLS
 from core.evaluation.report.charts import Chart
 from core.evaluation.report.closeup import closeup
 from core.evaluation.report.curves import plot_pr, plot_recall, plot_reliability, plot_roc, trusted
@@ -79,6 +80,8 @@ def write_report(folder: Path, comparison: Comparison) -> None:
         remarks=_remarks(comparison, cast),
         columns=shown,
         groups=list(Counter(column.group for column in shown).items()),
+        recalls=RECALLS,
+        elsewhere=[mark.label for run, mark in zip(runs, cast.runs, strict=True) if run.elsewhere],
         cached=[mark.label for run, mark in zip(runs, cast.runs, strict=True) if run.cached],
         trusted=trusted(runs, cast),
         closeups=closeups,

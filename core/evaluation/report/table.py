@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from core.evaluation import DEPTHS, STAGES
-from core.evaluation.report.text import milliseconds, number, size
+from core.evaluation.report.text import MISSING, milliseconds, number, size
 from core.evaluation.report.trends import time_per_query
 
 if TYPE_CHECKING:
@@ -89,4 +89,4 @@ def _stage_column(stage: str) -> Column:
 
 
 def _size(value: float | None) -> str:
-    return size(int(value or 0))
+    return MISSING if value is None else size(int(value))

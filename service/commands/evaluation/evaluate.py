@@ -17,6 +17,7 @@ from service.commands.evaluation.output import (
     remark_notes,
     show_costs,
     show_figures,
+    show_published,
     show_thresholds,
     show_trends,
     write_json,
@@ -71,12 +72,27 @@ def evaluate(
     ] = None,
     dataset: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="A known data set instead; see --list.", rich_help_panel=TRAVERSES),
+        typer.Option(
+            metavar="NAME",
+            help="A data set under a protocol by its name instead; see --list.",
+            rich_help_panel=TRAVERSES,
+        ),
     ] = None,
     data: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="The directory that holds the data set's traverses.", rich_help_panel=TRAVERSES
+            metavar="DIR",
+            help="The directory that holds the data set's traverses, or any directory of its published tree.",
+            rich_help_panel=TRAVERSES,
+        ),
+    ] = None,
+    others: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="With --dataset: also judge the similarities that others have computed, NAME.npy for each system, "
+            "queries by references; they are marked as computed elsewhere.",
+            rich_help_panel=SYSTEMS,
         ),
     ] = None,
     reduced: Annotated[
@@ -272,7 +288,7 @@ def evaluate(
         saved = SavedOptions(from_results or [], from_similarity or [], transposed, truth, limit_references)
         needs_images = {"reference": reference, "query": query, "dataset": dataset, "data": data, "reduced": reduced}
         needs_systems = {"encoder": encoder, "all": every, "weights": weights, "training": training}
-        needs_both = {"report": report, "scalability": scalability, "severity": severity}
+        needs_both = {"others": others, "report": report, "scalability": scalability, "severity": severity}
         saved.check({**needs_images, **needs_systems, **needs_both}, results)
         saved.show(json_file, results)
         return
@@ -289,25 +305,29 @@ def evaluate(
     asked = RecordingOptions(query_topic, query_pose_topic, query_trajectory, query_trajectory_times, *ways)
     options = TraverseOptions(reference, query, truth, dataset, data, reduced, limit_references, seed, taken, asked)
     options.check()
+    if others is not None and dataset is None:
+        raise typer.BadParameter("--others goes with --dataset: the matrices belong to its queries and references")
     files = parse_weights(weights or [])
 
     # Imported here because they take a second.
     from core.evaluation.cache import EvaluationCache, default_folder
+    from core.evaluation.elsewhere import read_others
     from core.evaluation.run import Extras, compare_systems
 
     with ExitStack() as stack:
         pair = options.open(stack, encoder[0] if encoder else None)
+        elsewhere = [] if others is None else read_others(others, pair)
         lessons = choose_training(training, pair, seed)
         systems = build_systems(encoder or [], every, files, open_catalogue(models_dir))
         kept = EvaluationCache(None if no_cache else cache or default_folder())
         with progress() as bar:
             extras = Extras(scalability, severity, seed, map_sizes=report is not None)
-            comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras)
+            comparison = compare_systems(systems, pair, lessons, load_image, kept, _Bar(bar), extras, elsewhere)
         _show(comparison, kept)
-        by_name = {run.about.name: run for run in comparison.runs}
+        by_name = {run.about.name: run for run in comparison.runs if not run.elsewhere}
         runs = [by_name[system.about.name] for system in systems]  # in the order of the command line
         if json_file is not None:
-            write_json(json_file, comparison_json(comparison, runs))
+            write_json(json_file, comparison_json(comparison, [*runs, *elsewhere]))
         if results is not None:
             write_results(results, [(run.identity, run.outcomes) for run in runs])
         if report is not None:
@@ -340,9 +360,10 @@ def _show(comparison: Comparison, cache: EvaluationCache) -> None:
     figures = [run.evaluation for run in comparison.runs]
     first = figures[0]
     show_figures(figures, f"{comparison.name}: {first.queries} queries against {first.references} references")
-    show_costs(figures)
+    show_costs([run.evaluation for run in comparison.runs if not run.elsewhere])
     show_thresholds(figures)
     show_trends(comparison)
+    show_published(comparison.published)
     remark_notes(figures, comparison.notes, [run.about.name for run in comparison.runs if run.cached])
     if not cache.writable:
         remark(f"Nothing was kept for a next run: {cache.folder} cannot be written; choose another with --cache.")

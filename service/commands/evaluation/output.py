@@ -11,6 +11,7 @@ from typing import Any
 from rich.markup import escape
 
 from core.evaluation import DEPTHS, Comparison, Evaluation, Outcome, Run
+from core.evaluation.data.published import RECALLS, Published
 from core.evaluation.protocol.results import results_csv
 from service.commands.console import number, remark, show, table, write_file
 from service.commands.model import name_of
@@ -79,6 +80,18 @@ def remark_notes(figures: Sequence[Evaluation], notes: Iterable[str], cached: Se
         remark(f"Taken from the cache, times included: {', '.join(cached)}.")
 
 
+def show_published(published: Sequence[Published]) -> None:
+    """A table of what others have published of the protocol; nothing where nobody has."""
+    heads = (f"#recall@{depth}" for depth in RECALLS)
+    title = "Published by others of this protocol; not measured here"
+    shown = table("system", *heads, "#year", "source", title=title)
+    for one in published:
+        recalls = [*one.recall_at, *(None for _ in RECALLS[len(one.recall_at) :])]
+        shown.add_row(escape(one.system), *map(number, recalls), str(one.year), escape(one.source))
+    if shown.row_count:
+        show(shown)
+
+
 def show_trends(comparison: Comparison) -> None:
     """Tables of growing traverses and of disturbed queries, where they were measured."""
     if comparison.scalability:
@@ -104,7 +117,8 @@ def show_trends(comparison: Comparison) -> None:
 def run_json(run: Run) -> dict[str, Any]:
     """The figures of a run and its system."""
     about = {"title": run.about.title, "paper": run.about.paper, "configuration": dict(run.about.configuration)}
-    return {**run.evaluation.model_dump(), **about, "cached": run.cached}
+    marks = {"cached": run.cached, **({"elsewhere": True} if run.elsewhere else {})}
+    return {**run.evaluation.model_dump(), **about, **marks}
 
 
 def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, Any]:
@@ -121,6 +135,8 @@ def comparison_json(comparison: Comparison, runs: Sequence[Run]) -> dict[str, An
         trends["map_sizes"] = [asdict(point) for point in comparison.map_sizes]
     if comparison.severity is not None:
         trends["severity"] = [asdict(curve) for curve in comparison.severity]
+    if comparison.published:
+        trends["published"] = [asdict(one) for one in comparison.published]
     if comparison.notes:
         trends["remarks"] = comparison.notes
     return {**every[0], "encoders": every, **trends}

@@ -68,7 +68,7 @@ def build_systems(names: list[str], every: bool, weights: dict[str, Path], model
 def show_list(models: EncoderCatalogue) -> None:
     """Write name, paper, configuration and weights of all systems, then the data sets."""
     from core.baselines.registry import systems
-    from core.evaluation.data.datasets import DATASETS
+    from core.evaluation.data.presets import DATASETS
 
     shown = table("name", "system and paper", "configuration", "weights", title="Systems, for --encoder")
     if output.is_terminal:  # there a system takes many lines; elsewhere one, which can be searched
@@ -79,9 +79,11 @@ def show_list(models: EncoderCatalogue) -> None:
         needed = "none" if about.weights is None else f"--weights {about.name}=FILE: {about.weights}"
         shown.add_row(*map(escape, (about.name, f"{about.title}. {about.paper}", _configuration(about), needed)))
     show(shown)
-    sets = table("name", "data set", "references", "queries", "true", title="Data sets, for --dataset")
+    columns = ("name", "data set", "references", "queries", "true", "left out", "protocol of")
+    sets = table(*columns, title="Data sets, for --dataset")
     for dataset in DATASETS:
-        sets.add_row(dataset.name, dataset.title, dataset.references[0], dataset.queries[0], dataset.truth)
+        sides = [names[0] if names else "the frames" for names in (dataset.references, dataset.queries)]
+        sets.add_row(dataset.name, dataset.title, *sides, dataset.truth, dataset.excluded, dataset.source)
     show(sets)
 
 

@@ -117,7 +117,7 @@ class TraverseOptions:
             InvalidTraverse, InvalidGroundTruth: something is missing or malformed.
         """
         from core.evaluation.data.datasets import find_dataset, open_dataset
-        from core.evaluation.data.pairs import TraversePair, all_references
+        from core.evaluation.data.pairs import TraversePair, all_references, limit
 
         if self.dataset is not None:
             assert self.data is not None, "checked"
@@ -131,7 +131,7 @@ class TraverseOptions:
         if self.limit_references is None:
             return pair
         kept = read_kept_references(self.limit_references, len(pair.references))
-        return TraversePair(pair.name, pair.references, pair.queries, pair.truth, kept, pair.notes)
+        return limit(pair, kept)
 
 
 def _images(path: Path, options: RecordingOptions, stack: ExitStack, encoder: str | None) -> list[Path]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from core.evaluation.protocol.outcomes import Outcome, answerable, judge, judge_ranking
+from core.evaluation.protocol.outcomes import Outcome, answerable, judge, judge_ranking, matched_scores
 
 ALL = np.arange(4)
 
@@ -50,3 +50,15 @@ def test_a_matrix_is_judged_row_by_row() -> None:
     outcomes = judge(scores, indices(0, 3), [indices(3), indices(3, 5), indices(1)])
     assert [(outcome.retrieved, outcome.rank) for outcome in outcomes] == [(3, 1), (0, 2), (3, None)]
     assert answerable(outcomes) == outcomes[:2]
+
+
+def test_what_is_left_out_is_not_matched_against() -> None:
+    """Query 0 would find itself; without it and its neighbour, 3 is best and right, and 2 is second."""
+    scores = np.stack([ranking(1.0, 0.9, 0.2, 0.4), ranking(0.1, 0.2, 0.3, 0.4)])
+    excluded = [indices(0, 1), indices()]
+    outcomes = judge(scores, ALL, [indices(2), indices(3)], excluded)
+    assert [(one.retrieved, one.rank) for one in outcomes] == [(3, 2), (3, 1)]
+    assert matched_scores(scores, ALL, excluded)[0].tolist() == [-np.inf, -np.inf, scores[0, 2], scores[0, 3]]
+    assert matched_scores(scores, ALL, None) is scores
+    with pytest.raises(ValueError, match="at least one score"):
+        judge(scores, ALL, [indices(), indices()], [indices(0, 1, 2, 3), indices()])

@@ -322,3 +322,13 @@ def test_failed_rename_leaves_no_temporary_file(tmp_path: Path) -> None:
     with pytest.raises(StorageFailure):
         write_files(tmp_path, {"pr.png": b"png", "index.html": b"new"})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["index.html", "pr.png"]
+
+
+def test_what_was_not_measured_here_stands_apart(written: Written) -> None:
+    """Published figures are in one table of their own, and similarities from elsewhere say that they are."""
+    (row,) = [row.text for row in written.page.named("tr") if "Ghost" in row.text]
+    assert row == "Ghost <net>0.5000.750–2024Some paper, Table 1"
+    assert written.html.count("Ghost") == 1  # in no chart and no other table
+    assert "Nothing in this table was measured here" in written.html
+    (other,) = [run for run in written.comparison.runs if run.elsewhere]
+    assert f"only judged here: {other.about.title}." in written.html

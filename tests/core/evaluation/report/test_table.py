@@ -53,3 +53,12 @@ def test_sorted_as_it_comes(written: Written) -> None:
     sorted_heads = [head for head in page.named("th") if "aria-sort" in head.attributes]
     assert [(head.text, head.attributes["aria-sort"]) for head in sorted_heads] == [("AUC-PR", "descending")]
     assert len(page.named("button")) == len(columns(written.comparison.runs)) + 1
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    """A run whose scores were computed elsewhere has no memory beside one that has."""
+    kept = np.arange(2)
+    ours = make_run("ours", np.eye(2, dtype=np.float32), kept, tolerance_truth(2, 2, 0))
+    theirs = replace(ours, bytes_per_place=None, elsewhere=True)
+    (memory,) = [column for column in columns([ours, theirs]) if column.group == "Memory"]
+    assert [memory.form(memory.value(run)) for run in (ours, theirs)] == ["1.5\N{NO-BREAK SPACE}KB", "–"]

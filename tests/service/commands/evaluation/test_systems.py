@@ -8,7 +8,7 @@ import pytest
 import typer
 
 from core.baselines.registry import systems
-from core.evaluation.data.datasets import DATASETS
+from core.evaluation.data.presets import DATASETS
 from core.method.catalogue import EncoderCatalogue
 from service.commands.evaluation.systems import build_systems, parse_weights
 from tests.service.commands.conftest import Placerec

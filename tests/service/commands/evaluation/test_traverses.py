@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
+from core.evaluation.data.datasets import find_dataset, open_dataset
 from service.commands.evaluation.traverses import name_pair
+from tests.core.evaluation.data.test_layouts import TREES
 from tests.service.commands.conftest import Placerec
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 
@@ -105,3 +107,39 @@ def test_hog_on_the_corridor_comes_near_what_was_published(placerec: Placerec, t
     found = figures(placerec, tmp_path, "--dataset", "corridor", "--data", EVAL / "corridor")
     assert found["auc_pr"] == pytest.approx(0.697, abs=0.05)
     assert (found["queries"], found["references"]) == (111, 111)
+
+
+OTHERS = {"AMOSNet": (0.954, 0.847), "NetVLAD": (0.822, 0.676), "RegionVLAD": (0.686, 0.432), "CoHOG": (0.687, 0.622)}
+"""AUC-PR and recall@1 of VPR-Bench's stored matrices, as the data sets' README has them."""
+
+
+@pytest.mark.skipif(not EVAL.is_dir(), reason="the traverses of ../shared/datasets are not here")
+def test_what_others_have_computed_stands_beside_what_was_measured(placerec: Placerec, tmp_path: Path) -> None:
+    corridor = EVAL / "corridor"
+    words = ("--dataset", "corridor", "--data", corridor, "--others", corridor / "others")
+    found = figures(placerec, tmp_path, *words)
+    marked = {one["encoder"]: one for one in found["encoders"] if one.get("elsewhere")}
+    assert len(marked) == 10 and len(found["encoders"]) == 11 and "elsewhere" not in found["encoders"][0]
+    for name, (area, recall) in OTHERS.items():
+        one = marked[f"{name} (computed elsewhere)"]
+        assert (one["auc_pr"], one["recall_at"]["1"]) == pytest.approx((area, recall), abs=6e-4)
+
+
+def test_others_belong_to_a_data_set(placerec: Placerec, gardens: Path, tmp_path: Path) -> None:
+    both = ("--reference", gardens / "night_right", "--query", gardens / "day_left", "--tolerance", 0)
+    assert "--others goes with --dataset" in placerec("evaluate", *both, "--others", tmp_path, status=2).stderr
+
+
+@pytest.mark.parametrize("name", ["berlin-kudamm", "17-places.vpr-bench", "gardens-point.vpr-tutorial"])
+def test_a_published_tree_is_evaluated(placerec: Placerec, tmp_path: Path, name: str) -> None:
+    dataset = find_dataset(name)
+    builds = [build for (known, _), (_, build) in TREES.items() if known == name]
+    builds[-1](tmp_path / "top")
+    pair = open_dataset(dataset, tmp_path / "top")
+    for place in range(len(pair.queries)):
+        pair.references[place].write_bytes(jpeg(place))
+        pair.queries[place].write_bytes(encoded(seen_again(scene(place))))
+    found = figures(placerec, tmp_path, "--dataset", name, "--data", tmp_path / "top")
+    assert (found["queries"], found["recall_at"]["1"]) == (12, 1.0)
+    published = [one["system"] for one in found.get("published", [])]
+    assert published == []  # none of these three has figures that could be read in a source
