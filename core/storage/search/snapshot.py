@@ -384,8 +384,7 @@ class SearchScope:
         places that the prior favours are searched a second time alone, and the rankings are merged.
         """
         rankings = self.snapshot.search_batch(descriptors, self.allowed)
-        favoured = self.favoured
-        if favoured is None or len(rankings[0][0]) >= len(self.snapshot):
+        if len(rankings[0][0]) >= len(self.snapshot) or (favoured := self.favoured) is None:
             return rankings
         more = self.snapshot.search_batch(descriptors, favoured)
         return [merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
