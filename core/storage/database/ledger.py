@@ -274,7 +274,7 @@ def _drop_if_empty(connection: sqlite3.Connection, code: int) -> None:
     connection.execute(query, (code,))
 
 
-def _picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
+def picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
     """What is kept of a frame, and its bytes."""
     if keep == "image" and item.image is not None:
         return keep, item.image
@@ -295,7 +295,7 @@ def insert(
 ) -> StoredPlace:
     """Insert a new place at the end of its sequence."""
     code = _sequence_code(connection, item.fields.sequence)
-    picture, content = _picture_of(item, keep)
+    picture, content = picture_of(item, keep)
     columns = {
         "id": item.id,
         "row": row,
@@ -332,7 +332,7 @@ def replace_descriptor(
     keep: Keep,
 ) -> None:
     """Give a place another frame, whose descriptor is in another row."""
-    picture, content = _picture_of(item, keep)
+    picture, content = picture_of(item, keep)
     connection.execute("DELETE FROM pictures WHERE place = ?", (stored.number,))
     _put_picture(connection, stored.number, content)
     _set(
