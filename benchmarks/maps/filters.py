@@ -25,11 +25,11 @@ from benchmarks.maps.opening import built
 from benchmarks.process import median
 from benchmarks.report import report, verdict
 from core.evaluation.samples import fill_map, sample_descriptors, sample_frame
+from core.maps.selection import Selection
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import locate
-from core.recognition.selection import WHOLE_MAP, Selection
 from core.storage import Atlas, Map
 from service.queries.parameters import FilterParameters
 
@@ -85,7 +85,7 @@ def queries(encoder: Encoder, count: int) -> list[Encoding]:
 
 def measured(map_: Map, encoder: Encoder, rounds: int) -> dict[str, dict[str, float]]:
     """Milliseconds of a query and share of the places by kind."""
-    snapshot, kinds = map_.snapshot(), selections(map_.count_places())
+    kinds = selections(map_.count_places())
     times: dict[str, list[float]] = {name: [] for name in kinds}
     choosing: dict[str, list[float]] = {name: [] for name in kinds}
     shares: dict[str, float] = {}
@@ -94,7 +94,7 @@ def measured(map_: Map, encoder: Encoder, rounds: int) -> dict[str, dict[str, fl
         for _ in range(TRIES):
             for name, selection in kinds.items():
                 began = time.perf_counter()
-                scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
+                scope = map_.scope(selection)
                 chosen = time.perf_counter()
                 locate(map_, encoder, [encoding], 5, selection)
                 tries[name].append((1e3 * (time.perf_counter() - chosen), 1e3 * (chosen - began)))

@@ -20,13 +20,11 @@ from core.judgement.background import GUARD_FACTOR
 from core.judgement.calibration import FittedCalibration, Target, adjust_calibration, fit_map_calibration
 from core.judgement.trials import Trial, Trials, gathered, joined
 from core.judgement.verdict import Calibration, judge
+from core.maps import Map, PlaceFilter, Ranking, Scope, Snapshot
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import NO_POSE, Neighborhood
-from core.recognition.selection import SearchScope
 from core.recognition.stages import agree, neighborhood_of
-from core.storage import Map, Ranking, Snapshot
-from core.storage.place_filter import PlaceFilter
 
 Item = TypeVar("Item")
 Flags = NDArray[np.bool_]
@@ -217,17 +215,19 @@ def run_trials(
         descriptors = np.stack([query.descriptor for query in batch])
         living = snapshot.alive if queries.allowed is None else snapshot.alive & queries.allowed
         places = int(np.count_nonzero(living))
-        for query, ranking in zip(batch, snapshot.search_batch(descriptors, queries.allowed), strict=True):
+        for query, ranking in zip(batch, snapshot.among(living).search(descriptors), strict=True):
             there = query.true & snapshot.alive & ~query.absent
             cases = [query.absent]
             if without_place and there.any():
                 cases.append(query.absent | query.around)
             for left_out in cases:
+                allowed = living & ~left_out
+                scope = snapshot.among(allowed)
                 if len(ranking[0]) < places and left_out[ranking[0]].any():  # a shortlist, others take their places
-                    ranking = snapshot.search(query.descriptor, living & ~left_out)
+                    (ranking,) = scope.search(query.descriptor[np.newaxis])
+                kept = allowed[ranking[0]]
                 known = bool((there & ~left_out).any())
-                scope = SearchScope(living & ~left_out)
-                found += _trial(map_, encoder, snapshot, query, ranking, scope, base, known, number)
+                found += _trial(map_, encoder, scope, query, (ranking[0][kept], ranking[1][kept]), base, known, number)
             number += 1
             advance(number, queries.count)
     return gathered(found)
@@ -320,21 +320,17 @@ class _SamePlace:
 def _trial(
     map_: Map,
     encoder: Encoder,
-    snapshot: Snapshot,
+    scope: Scope,
     query: LabelledQuery,
     ranking: Ranking,
-    scope: SearchScope,
     base: Calibration,
     known: bool,
     number: int,
 ) -> list[Trial]:
-    """The answer to one query in the map of the places that ``scope`` allows; empty if there is none."""
-    assert scope.allowed is not None
-    kept = scope.allowed[ranking[0]]
-    remaining: Ranking = ranking[0][kept], ranking[1][kept]
-    if not len(remaining[0]):
+    """The answer to one query in the map of the places of ``scope``, by their ranking; empty if there is none."""
+    if not len(ranking[0]):
         return []
-    candidates = agree(map_, encoder, snapshot, query.descriptor, query.local, remaining, scope)
+    candidates = agree(map_, encoder, scope, query.descriptor, query.local, ranking)
     judgement = judge(candidates.ordered, candidates.whereabouts, base, neighborhood_of(map_), candidates.examined)
     return [Trial(judgement, known, known and bool(query.true[candidates.rows[0]]), number)]
 

@@ -26,10 +26,10 @@ from core.geometry.pose import RelativeView
 from core.judgement.position import PoseEstimate, estimate_pose
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Calibration, Judgement, judge
+from core.maps import Enrolment, Map, Selection
 from core.method.encoder import Encoder, Encoding
 from core.networks.xfeat import packaged_xfeat
 from core.places import NO_POSE, Place, PlaceFields
-from core.recognition.selection import Selection
 from core.recognition.stages import Candidates, calibration_of, likeness, neighborhood_of, rank_places
 from core.recognition.verification import (
     NOT_VERIFIED,
@@ -39,7 +39,6 @@ from core.recognition.verification import (
     relative_views,
     third_stage,
 )
-from core.storage import Enrolment, Map
 
 ATTEMPTS = 3
 """How often a query is searched for if places that it finds are deleted in the meantime."""

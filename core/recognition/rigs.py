@@ -11,12 +11,11 @@ import numpy as np
 from core.judgement.fusion import Fused, View, fuse
 from core.judgement.position import estimate_pose
 from core.judgement.priors import decision_slope
+from core.maps import Map, Selection
 from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import ATTEMPTS, Answer, locate
-from core.recognition.selection import Selection
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of, rank_places
 from core.recognition.verification import Verifier
-from core.storage import Map
 
 
 def locate_rig(

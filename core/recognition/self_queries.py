@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from core.maps import Map
+from core.maps.records import Outline
 from core.method.agreement import Cells
 from core.method.encoder import Encoder
 from core.recognition.stages import neighborhood_of
-from core.storage import Map
-from core.storage.transfer import Outline
 
 Positions = NDArray[np.int64]
 
@@ -81,13 +81,13 @@ class SelfQueries:
             For each query its position, the positions of the best other places, int64 [n], best first, and their
             scores, float32 [n].
         """
-        allowed = None
+        allowed = self.snapshot.alive
         if references is not None:
             allowed = np.zeros(self.snapshot.rows, np.bool_)
             allowed[self.rows[references]] = True
         chosen = np.asarray(positions, np.int64)
         descriptors = self.snapshot.descriptors_at(self.rows[chosen])
-        for position, (rows, products) in zip(positions, self.snapshot.search_batch(descriptors, allowed), strict=True):
+        for position, (rows, products) in zip(positions, self.snapshot.among(allowed).search(descriptors), strict=True):
             found = self._position[rows[: HEAD + 1]]
             others = (found >= 0) & (found != position)
             scores = self.encoder.scores_from_inner_products(products[: HEAD + 1])

@@ -22,11 +22,11 @@ from core.geometry.verification import Verification
 from core.judgement.geometry import Geometry, final_values
 from core.judgement.priors import Values, weighed
 from core.judgement.verdict import TOP_PLACES, Calibration
+from core.maps import Map, MapSettings, Ranking, Scope, Selection
+from core.maps.store import merged
 from core.method.agreement import Cells
 from core.method.encoder import Encoder, Encoding
 from core.places import Neighborhood, Whereabouts
-from core.recognition.selection import WHOLE_MAP, SearchScope, Selection
-from core.storage import Map, MapSettings, Ranking, Snapshot
 
 Array = NDArray[np.float32]
 Positions = NDArray[np.int64]
@@ -114,51 +114,21 @@ def rank_places(
     Raises:
         StorageFailure: the map's files cannot be read.
     """
-    snapshot = map_.snapshot()
-    scope = selection.scope(map_, snapshot) if selection else WHOLE_MAP
-    rankings = search(snapshot, np.stack([encoding.descriptor for encoding in encodings]), scope)
+    scope = map_.scope(selection)
+    rankings = scope.search(np.stack([encoding.descriptor for encoding in encodings]))
     return [
-        agree(map_, encoder, snapshot, encoding.descriptor, encoding.local, ranking, scope)
+        agree(map_, encoder, scope, encoding.descriptor, encoding.local, ranking)
         for encoding, ranking in zip(encodings, rankings, strict=True)
     ]
-
-
-def search(snapshot: Snapshot, descriptors: Array, scope: SearchScope = WHOLE_MAP) -> list[Ranking]:
-    """The first stage: rank the places of a map by the inner products of descriptors (equation 3.12).
-
-    A large map returns only its best places, among which a place that a prior favours may be missing.  So the places
-    that the prior favours are searched a second time alone, and the rankings are merged.
-
-    Args:
-        descriptors: the queries, float32 [B, D].
-        scope: the places that may be found, and their prior weights.
-
-    Returns:
-        For each query rows, int64 [n], and inner products, float32 [n], best first.
-    """
-    rankings = snapshot.search_batch(descriptors, scope.allowed)
-    favoured = scope.favoured
-    if favoured is None or len(rankings[0][0]) >= len(snapshot):
-        return rankings
-    more = snapshot.search_batch(descriptors, favoured)
-    return [_merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
-
-
-def _merged(a: Ranking, b: Ranking) -> Ranking:
-    rows, first = np.unique(np.concatenate([a[0], b[0]]), return_index=True)
-    products = np.concatenate([a[1], b[1]])[first]
-    order = np.argsort(-products, kind="stable")
-    return rows[order], products[order]
 
 
 def agree(
     map_: Map,
     encoder: Encoder,
-    snapshot: Snapshot,
+    scope: Scope,
     descriptor: Array,
     local: Cells,
     ranking: Ranking,
-    scope: SearchScope = WHOLE_MAP,
 ) -> Candidates:
     """The second stage: apply the prior, then compare the best places of a ranking with the query cell by cell.
 
@@ -166,10 +136,10 @@ def agree(
     without them, for the other places that a verdict needs.
 
     Args:
+        scope: the places that the query may find.
         descriptor: the query's, float32 [D].
         local: the query's local descriptors, int8 [C, L].
-        ranking: the result of :func:`search`, rows int64 [n] and inner products float32 [n].
-        scope: the scope of that search.
+        ranking: what a search of the scope returned, rows int64 [n] and inner products float32 [n].
 
     Returns:
         The first ``HEAD`` places of the ranking if a verdict needs no more, else all of them.
@@ -178,28 +148,21 @@ def agree(
         StorageFailure: local descriptors cannot be read from disk.
     """
     neighborhood = neighborhood_of(map_)
-    candidates = _examined(map_, encoder, snapshot, local, ranking, scope)
+    candidates = _examined(map_, encoder, scope, local, ranking)
     if not len(candidates.rows) or _is_enough(candidates, neighborhood, encoder.candidates > 0):
         return candidates
-    elsewhere = snapshot.alive & ~snapshot.whereabouts.near(int(candidates.rows[0]), neighborhood)
-    elsewhere[ranking[0]] = False
-    if scope.allowed is not None:
-        elsewhere &= scope.allowed
-    if not elsewhere.any():  # the ranking has all places
+    more = scope.search_elsewhere(descriptor, ranking, int(candidates.rows[0]), neighborhood)
+    if not len(more[0]):  # the ranking has all places
         return candidates
-    more = snapshot.search(descriptor, elsewhere)
-    return _examined(map_, encoder, snapshot, local, _merged(ranking, more), scope)
+    return _examined(map_, encoder, scope, local, merged(ranking, more))
 
 
-def _examined(
-    map_: Map, encoder: Encoder, snapshot: Snapshot, local: Cells, ranking: Ranking, scope: SearchScope
-) -> Candidates:
+def _examined(map_: Map, encoder: Encoder, scope: Scope, local: Cells, ranking: Ranking) -> Candidates:
     """The second stage over one ranking, see :func:`agree`."""
     calibration, neighborhood = calibration_of(map_, encoder), neighborhood_of(map_)
     scores = encoder.scores_from_inner_products(ranking[1])
-    rows, ordered, weights = ranking[0], scores, None
-    if scope.weights is not None:
-        weights = scope.weights[rows]
+    snapshot, rows, ordered = scope.snapshot, ranking[0], scores
+    if (weights := scope.weights_at(rows)) is not None:
         ordered = weighed(scores, weights, calibration)
         order = np.argsort(-ordered, kind="stable")
         rows, scores, ordered, weights = rows[order], scores[order], ordered[order], weights[order]

@@ -21,10 +21,10 @@ from core.geometry.pose import RelativeView, relative_view
 from core.geometry.verification import LEAST_MATCHES, Verification, verify
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.verdict import Judgement, worth_verifying
+from core.maps import Map
 from core.method.encoder import Encoder
 from core.places import NO_POSE
 from core.recognition.stages import Candidates, calibration_of, neighborhood_of
-from core.storage import Map
 
 Verify = Literal["auto", "always", "never"]
 """When a query's candidates are verified."""

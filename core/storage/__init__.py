@@ -1,9 +1,6 @@
 """Durable maps: a write that has returned is on disk, whatever is read from disk is checked, searches run in memory."""
 
-from core.storage.atlas import Atlas
-from core.storage.files.row_formats import Precision
-from core.storage.map import Map
-from core.storage.records import (
+from core.maps.records import (
     Change,
     Enrolment,
     History,
@@ -11,14 +8,19 @@ from core.storage.records import (
     KeptFrame,
     MapRecord,
     MapSettings,
+    Precision,
     ReviewSetting,
     SameFrame,
     SequenceSummary,
+    TierSetting,
     VerifyReport,
 )
+from core.maps.store import Ranking
+from core.storage.atlas import Atlas
+from core.storage.map import Map
 from core.storage.review import ReviewFrame
-from core.storage.search.snapshot import Ranking, Snapshot
-from core.storage.search.tiers import IndexStatus, Recall, StorageStatus, TierSetting
+from core.storage.search.snapshot import Snapshot
+from core.storage.search.tiers import IndexStatus, Recall, StorageStatus
 
 __all__ = [
     "Atlas",

@@ -22,13 +22,13 @@ from pathlib import Path
 
 from core.disk.files import Damage, FolderLock, disk_errors, make_folder, sync_file, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
 from core.places import check_map_id
-from core.storage.files.row_formats import HALF, Precision
+from core.storage.files.row_formats import HALF
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.pagination import Listing, decode_name, encode_cursor
-from core.storage.records import MapRecord, MapSettings, VerifyReport
 from core.storage.verification import Progress, inspect_folder, no_progress
 
 log = logging.getLogger(__name__)

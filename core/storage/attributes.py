@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 from numpy.typing import NDArray
 
-Scalar = str | int | float | bool | None
+from core.maps.place_filter import Scalar
 
 FEW = 5000
 """Up to so many rows are looked up one by one, which is faster than reading all rows with a value."""

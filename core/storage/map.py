@@ -25,19 +25,8 @@ from core.errors import (
 )
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints
-from core.places import Place, PlaceFields
-from core.storage.archives.exporter import Exporter
-from core.storage.attributes import Attributes
-from core.storage.cameras import Cameras
-from core.storage.counterparts import Counterparts
-from core.storage.database import keypoints, ledger
-from core.storage.database.connections import DatabaseClosed
-from core.storage.database.ledger import SegmentEntry, segment_entries
-from core.storage.opening import OpenMap, open_map
-from core.storage.pagination import page_of_places, page_of_sequences
-from core.storage.place_filter import EVERY_PLACE, PlaceFilter
-from core.storage.plan import Plan
-from core.storage.records import (
+from core.maps.place_filter import EVERY_PLACE, PlaceFilter
+from core.maps.records import (
     Change,
     Enrolment,
     KeptFrame,
@@ -48,10 +37,23 @@ from core.storage.records import (
     patched_fields,
     patched_record,
 )
+from core.maps.selection import Selection
+from core.places import Place, PlaceFields
+from core.storage.archives.exporter import Exporter
+from core.storage.attributes import Attributes
+from core.storage.cameras import Cameras
+from core.storage.counterparts import Counterparts
+from core.storage.database import keypoints, ledger
+from core.storage.database.connections import DatabaseClosed
+from core.storage.database.ledger import SegmentEntry, segment_entries
+from core.storage.opening import OpenMap, open_map
+from core.storage.pagination import page_of_places, page_of_sequences
+from core.storage.plan import Plan
 from core.storage.review import FILE as REVIEW_FILE
 from core.storage.review import ReviewFrames
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
-from core.storage.search.snapshot import Snapshot
+from core.storage.search.scopes import Chooser
+from core.storage.search.snapshot import SearchScope, Snapshot
 from core.storage.search.tiers import IndexStatus, KeypointsStatus, StorageStatus, storage_of, unopened
 from core.storage.transfer import Transfer
 from core.storage.verification import Progress, inspect, no_progress
@@ -447,6 +449,11 @@ class Map:
         while (snapshot := self._snapshot) is None:
             self._expect_open()
         return snapshot
+
+    def scope(self, selection: Selection | None = None) -> SearchScope:
+        """The places that a query may find at this moment; None: all."""
+        snapshot = self.snapshot()
+        return Chooser(snapshot, self.attributes, self.rows_of).scope(selection) if selection else SearchScope(snapshot)
 
     def count_places(self) -> int:
         """How many places the map has; this does not read it from disk."""

@@ -20,6 +20,7 @@ from core.disk.sqlite_file import transaction
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.index.table import LARGEST_BLOCK
+from core.maps.records import MapRecord, validation_message
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
@@ -38,7 +39,6 @@ from core.storage.files.array_files import StaleArrays
 from core.storage.files.row_formats import HALF
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import Layout
-from core.storage.records import MapRecord, validation_message
 from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.segment import Held, Segment

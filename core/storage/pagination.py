@@ -12,10 +12,11 @@ import json
 import sqlite3
 
 from core.errors import InvalidCursor
+from core.maps.place_filter import PlaceFilter
+from core.maps.records import SequenceSummary
 from core.places import Place
 from core.storage.database import ledger
-from core.storage.place_filter import PlaceFilter
-from core.storage.records import SequenceSummary
+from core.storage.database.conditions import text_of
 
 Listing = list[str | None]
 """Names a listing, such as ``["places", "lab", "monday"]``; a cursor of another listing is refused."""
@@ -71,7 +72,7 @@ def page_of_places(
         InvalidCursor.
     """
     listing: Listing = ["places", map_id, wanted.sequence]
-    listing += [] if (others := wanted.text()) is None else [others]
+    listing += [] if (others := text_of(wanted)) is None else [others]
     after = decode_number(listing, cursor)
     found = ledger.places_after(connection, after, _one_more(limit), wanted)
     more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None

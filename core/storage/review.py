@@ -24,8 +24,8 @@ from typing import Any
 from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
+from core.maps.records import ReviewSetting
 from core.storage.database.ledger import moment_text
-from core.storage.records import ReviewSetting
 
 FILE = "review.sqlite"
 

@@ -6,48 +6,12 @@ import sqlite3
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
+from core.maps.records import Enrolment, History, Outline
 from core.places import Place
 from core.storage.cameras import Access
 from core.storage.database import ledger
-from core.storage.records import Enrolment, History, Keep
 from core.storage.writing import Write
-
-
-@dataclass(frozen=True)
-class Outline:
-    """A place in brief: enough to see whether two maps hold the same place in the same state.
-
-    number: grows in the order of enrolment.
-    row: of its descriptor.
-    digest: SHA-256 of its image, 32 bytes.
-    picture: what is kept of its frame.
-    ordinal: its position in its sequence.
-    """
-
-    number: int
-    id: str
-    row: int
-    digest: bytes
-    picture: Keep
-    camera: str | None
-    sequence: str | None
-    ordinal: int
-    updated_at: str
-
-    def same_as(self, other: Outline) -> bool:
-        """Whether both are the same place in the same state; they may be of different maps."""
-        return self.same_frame(other) and (self.sequence, self.ordinal, self.updated_at) == (
-            other.sequence,
-            other.ordinal,
-            other.updated_at,
-        )
-
-    def same_frame(self, other: Outline) -> bool:
-        """Whether both were encoded from the same bytes under the same camera's mask."""
-        return (self.id, self.digest, self.camera) == (other.id, other.digest, other.camera)
-
 
 _OUTLINE = (
     "SELECT p.number, p.id, p.row, p.digest, p.picture, p.camera, s.name, p.ordinal, p.updated_at"

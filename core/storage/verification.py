@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from core.disk.files import Damage
 from core.index.flat import vectors
+from core.maps.records import VerifyReport
 from core.storage.database import keypoints, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
@@ -22,7 +23,6 @@ from core.storage.database.write_ahead_log import check_log
 from core.storage.files import segment_files as descriptors
 from core.storage.files.segment_files import Layout
 from core.storage.opening import read_layout
-from core.storage.records import VerifyReport
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.segment import Segment
 from core.storage.search.snapshot import Snapshot

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from core.disk.files import Damage, primary_code
 from core.errors import NoRegions
 from core.geometry.keypoints import Keypoints
+from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_TIME, Place, PlaceFields, Pose, check_place_id, microseconds
 from core.storage.database import keypoints, ledger
 from core.storage.database.ledger import StoredPlace, segment_entries
@@ -21,7 +22,6 @@ from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import Layout
 from core.storage.opening import OpenMap
-from core.storage.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
 from core.storage.search.segment import Location
 from core.storage.search.snapshot import Snapshot
 

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.judgement.alignment import LARGEST_STEP, SharedStretch, of_matrix, shared_stretches
+from core.maps import Snapshot
 from core.method.encoder import Encoder
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
-from core.storage import Snapshot
 
 Rows = NDArray[np.int64]
 

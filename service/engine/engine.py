@@ -15,10 +15,10 @@ from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMa
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
+from core.maps.selection import Selection
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
-from core.recognition.selection import Selection
 from core.recognition.verification import Verify
 from core.storage import Atlas, Map, MapRecord
 from service.engine.encoder_threads import AfterEncoding, Encoded

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 from anyio import to_thread
 
+from core.maps.selection import Selection
 from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import Answer, locate
-from core.recognition.selection import Selection
 from core.recognition.verification import Verifier, Verify
 from core.storage import Map
 from core.threads import cores

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 from fastapi import Query
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from core.maps.place_filter import PlaceFilter, Scalar
 from core.places import Camera, Sequence, Timestamp
-from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
-from core.storage.place_filter import PlaceFilter
 from service.errors.faults import InvalidRequest
 from service.http.schemas import PageParameters
 

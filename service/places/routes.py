@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from core import errors
-from core.storage.records import merge_patch
+from core.maps.records import merge_patch
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import (

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, TypeAdapter, ValidationError
 
 from core.judgement.priors import Box, Constraint, Disc, Facing, Period
+from core.maps.place_filter import Scalar
+from core.maps.selection import TRUST, Conditions, RecentFrames, Selection
 from core.places import Camera, Pose, Sequence, Timestamp, check_map_id, microseconds
-from core.recognition.selection import TRUST, Conditions, RecentFrames, Selection
-from core.storage.attributes import Scalar
 from core.storage.database.schema import LONGEST_INDEXED
 from service.errors.faults import InvalidRequest
 from service.http.schemas import EncoderAssertion, Matches, Verification, validated

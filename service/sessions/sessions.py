@@ -21,7 +21,7 @@ from pydantic import ValidationError
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
 from core.disk.files import disk_errors
 from core.errors import UnknownSequence
-from core.recognition.selection import Conditions, Selection
+from core.maps.selection import Conditions, Selection
 from core.recognition.stages import neighborhood_of
 from core.storage import Map, Snapshot
 from service.access.audit import ASKER
@@ -354,10 +354,9 @@ class Sessions:
             snapshot, known, now = map_.snapshot(), self._graphs.get(key), time.monotonic()
             if known is not None and known.graph.neighborhood == neighborhood and known.serves(snapshot, now):
                 return known.graph
-            living = snapshot.alive
-            if selection is not None:
-                allowed = selection.scope(map_, snapshot).allowed
-                living = living if allowed is None else living & allowed
+            scope = map_.scope(selection)
+            snapshot = scope.snapshot
+            living = snapshot.alive if scope.allowed is None else snapshot.alive & scope.allowed
             graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
             done = time.monotonic()
             self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.alignment import LARGEST_STEP, LEAST_FRAMES, shared_stretches
+from core.maps.records import Outline
 from core.places import NO_POSE
 from core.storage import Map, Snapshot
 from core.storage.counterparts import Correspondence
-from core.storage.transfer import Outline
 from core.upkeep.correspondence import common_stations, handed_over, on_its_own
 from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames

@@ -106,6 +106,7 @@ OF_ROS = {NODE, ROOT / "tests/clients/ros2/peer.py"}
 
 EXTRAS = {
     "core/evaluation/report": {"report"},
+    "core/milvus": {"milvus"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
     "training": {"report"},

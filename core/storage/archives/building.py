@@ -18,6 +18,7 @@ from core.disk.files import Damage, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage, InvalidKeypoints
 from core.geometry.keypoints import MOST, keypoints_of, record_bytes
+from core.maps.records import MapRecord
 from core.places import NO_SEQUENCE
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
@@ -30,7 +31,6 @@ from core.storage.files import segment_files as descriptors
 from core.storage.files.row_formats import LARGEST_HALF
 from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
 from core.storage.opening import create_folder
-from core.storage.records import MapRecord
 from core.storage.writing import record_appended
 
 CHUNK_BYTES = 16 << 20

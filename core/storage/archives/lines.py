@@ -13,9 +13,9 @@ from core.errors import InvalidArchive
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.geometry.keypoints import MOST, count_of
+from core.maps.records import validation_message
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
 from core.storage.archives.manifest import expect_names, strict_json
-from core.storage.records import validation_message
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to accept more."""

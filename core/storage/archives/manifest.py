@@ -30,8 +30,8 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from core.errors import ArchiveTooNew, InvalidArchive, InvalidIdentifier
 from core.judgement.probability import Curve
 from core.judgement.verdict import Calibration
+from core.maps.records import MapRecord, validation_message
 from core.places import check_map_id
-from core.storage.records import MapRecord, validation_message
 
 FORMAT = "placerec map"
 VERSION = 2

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 
 from core.errors import InvalidKeypoints, StorageFailure
 from core.geometry.keypoints import Keypoints, keypoints_of
-from core.storage.records import KeptFrame
+from core.maps.records import KeptFrame
 
 log = logging.getLogger(__name__)
 

@@ -15,12 +15,13 @@ from typing import Any
 
 from core.disk.files import Damage
 from core.errors import InvalidField, StorageFailure, UnknownPlace
+from core.maps.place_filter import PlaceFilter
+from core.maps.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 from core.places import NO_SEQUENCE, Place, PlaceFields, Pose
 from core.storage.database import row_checksums
+from core.storage.database.conditions import conditions
 from core.storage.database.row_checksums import CHECKED
 from core.storage.files.segment_files import Layout
-from core.storage.place_filter import PlaceFilter
-from core.storage.records import Enrolment, History, Keep, MapRecord, SequenceSummary
 
 DEEPEST_METADATA = 64
 """Most levels of nesting; deeper metadata could be stored but not sent."""
@@ -169,18 +170,18 @@ def expect(connection: sqlite3.Connection, place_id: str) -> StoredPlace:
 
 def places_after(connection: sqlite3.Connection, after: int, limit: int, wanted: PlaceFilter) -> list[StoredPlace]:
     """Up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
-    conditions = wanted.conditions()
-    also = "".join(f" AND {condition}" for condition in conditions)
+    wanted_by = conditions(wanted)
+    also = "".join(f" AND {condition}" for condition in wanted_by)
     query = f"{_PLACE}WHERE p.number > ?{also} ORDER BY p.number LIMIT ?"
-    return [_stored(row) for row in connection.execute(query, (after, *conditions.values(), limit)).fetchall()]
+    return [_stored(row) for row in connection.execute(query, (after, *wanted_by.values(), limit)).fetchall()]
 
 
 def ids_of(connection: sqlite3.Connection, wanted: PlaceFilter, limit: int) -> list[str]:
     """The ids of up to ``limit`` places that fulfil some conditions, in the order of their enrolment."""
-    conditions = wanted.conditions()
-    where = f" WHERE {' AND '.join(conditions)}" if conditions else ""
+    wanted_by = conditions(wanted)
+    where = f" WHERE {' AND '.join(wanted_by)}" if wanted_by else ""
     query = f"SELECT p.id FROM places p JOIN sequences s ON s.code = p.sequence{where} ORDER BY p.number LIMIT ?"
-    return [place_id for (place_id,) in connection.execute(query, (*conditions.values(), limit)).fetchall()]
+    return [place_id for (place_id,) in connection.execute(query, (*wanted_by.values(), limit)).fetchall()]
 
 
 def places_of_rows(connection: sqlite3.Connection, rows: list[int]) -> dict[int, Place]:
@@ -273,7 +274,7 @@ def _drop_if_empty(connection: sqlite3.Connection, code: int) -> None:
     connection.execute(query, (code,))
 
 
-def _picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
+def picture_of(item: Enrolment, keep: Keep) -> tuple[Keep, bytes | None]:
     """What is kept of a frame, and its bytes."""
     if keep == "image" and item.image is not None:
         return keep, item.image
@@ -294,7 +295,7 @@ def insert(
 ) -> StoredPlace:
     """Insert a new place at the end of its sequence."""
     code = _sequence_code(connection, item.fields.sequence)
-    picture, content = _picture_of(item, keep)
+    picture, content = picture_of(item, keep)
     columns = {
         "id": item.id,
         "row": row,
@@ -331,7 +332,7 @@ def replace_descriptor(
     keep: Keep,
 ) -> None:
     """Give a place another frame, whose descriptor is in another row."""
-    picture, content = _picture_of(item, keep)
+    picture, content = picture_of(item, keep)
     connection.execute("DELETE FROM pictures WHERE place = ?", (stored.number,))
     _put_picture(connection, stored.number, content)
     _set(

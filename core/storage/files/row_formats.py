@@ -11,19 +11,18 @@ precision represents with 11 bits.  Searches and comparisons use what is stored,
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.index.flat import flat_index, products, vectors
 from core.kernels.packed import packed_products
+from core.maps.records import Precision
 
 Descriptor = NDArray[np.float32]
 Local = NDArray[np.int8]
 """Local descriptors of one frame, [C, L]; [0, 0] where the encoder has no second stage."""
-
-Precision = Literal["half", "compressed"]
 
 HALF: Precision = "half"
 COMPRESSED: Precision = "compressed"

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from core.disk.files import Damage, missing, sync_folder, write_at
+from core.maps.records import Precision
 from core.storage.files.row_formats import (
     HALF,
     Descriptor,
     Local,
-    Precision,
     pack_descriptors,
     pack_local,
     resting_types,

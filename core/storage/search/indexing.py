@@ -21,6 +21,7 @@ from core.disk.files import Damage
 from core.errors import MapQuarantined, UnknownMap
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
+from core.maps.records import TierSetting
 from core.storage.database.ledger import SegmentEntry
 from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
@@ -28,7 +29,7 @@ from core.storage.search.rebuilding import codes_of, extended, rebuilt
 from core.storage.search.recall import measure_recall
 from core.storage.search.segment import Held
 from core.storage.search.snapshot import Snapshot, threads
-from core.storage.search.tiers import IndexStatus, Recall, Tier, TierSetting, holds_for, tier_for
+from core.storage.search.tiers import IndexStatus, Recall, Tier, holds_for, tier_for
 
 log = logging.getLogger(__name__)
 

@@ -26,17 +26,15 @@ from core.errors import UnknownPlace
 from core.index import Codes, CodeTable
 from core.index.flat import Vectors, ranked, vectors
 from core.index.table import Block
-from core.places import Whereabouts
+from core.maps.store import Ranking, merged
+from core.places import Neighborhood, Whereabouts
 from core.storage.files.row_formats import Descriptor, Local
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import NO_LOCAL
 from core.storage.search.segment import Held, Location, Segment, whereabouts_of
 from core.threads import cores, in_turns, keep_to
 
-__all__ = ["SHORTLIST", "Location", "Ranking", "Segment", "Snapshot"]
-
-Ranking = tuple[NDArray[np.int64], NDArray[np.float32]]
-"""Rows, best first, and their inner products."""
+__all__ = ["SHORTLIST", "Location", "SearchScope", "Segment", "Snapshot"]
 
 SHORTLIST = 100
 """Places of a map with codes whose descriptors are compared exactly; rankings of such a map hold only these."""
@@ -180,6 +178,10 @@ class Snapshot:
             products = np.concatenate([self._compared(query, short)[0], products])
             rankings.append(ranked(np.concatenate([short, later]), products))
         return rankings
+
+    def among(self, allowed: NDArray[np.bool_]) -> SearchScope:
+        """The places of some rows, bool [rows], as a scope without a prior."""
+        return SearchScope(self, allowed)
 
     def _compared(self, queries: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
         """Inner products of queries with ascending rows, wherever they are: float32 [B, k]."""
@@ -353,6 +355,55 @@ class Snapshot:
             return self
         segments[number] = replace(segments[number], held=held)
         return replace(self, segments=tuple(segments))
+
+
+@dataclass(frozen=True, eq=False)
+class SearchScope:
+    """The rows of a snapshot that a query may find, and their prior weights (:class:`core.maps.store.Scope`).
+
+    allowed: bool [rows]; None: all rows.
+    weights: float64 [rows], at most 0, the log prior that is added to the log odds of a place; None: no prior.
+    """
+
+    snapshot: Snapshot
+    allowed: NDArray[np.bool_] | None = None
+    weights: NDArray[np.float64] | None = None
+
+    @property
+    def favoured(self) -> NDArray[np.bool_] | None:
+        """The allowed rows that the prior favours, whose weight is nearer to 0 than to the lowest; None if no prior."""
+        if self.weights is None:
+            return None
+        favoured = self.weights >= self.weights.min() / 2
+        return favoured if self.allowed is None else favoured & self.allowed
+
+    def search(self, descriptors: NDArray[np.float32]) -> list[Ranking]:
+        """Rank the places of the scope by inner product, for each of the queries, float32 [B, D].
+
+        A large map returns only its best places, among which a place that the prior favours may be missing.  So the
+        places that the prior favours are searched a second time alone, and the rankings are merged.
+        """
+        rankings = self.snapshot.search_batch(descriptors, self.allowed)
+        if len(rankings[0][0]) >= len(self.snapshot) or (favoured := self.favoured) is None:
+            return rankings
+        more = self.snapshot.search_batch(descriptors, favoured)
+        return [merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
+
+    def search_elsewhere(
+        self, descriptor: Descriptor, ranking: Ranking, best: int, neighborhood: Neighborhood
+    ) -> Ranking:
+        """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are."""
+        elsewhere = self.snapshot.alive & ~self.snapshot.whereabouts.near(best, neighborhood)
+        elsewhere[ranking[0]] = False
+        if self.allowed is not None:
+            elsewhere &= self.allowed
+        if not elsewhere.any():
+            return np.empty(0, np.int64), np.empty(0, np.float32)
+        return self.snapshot.search(descriptor, elsewhere)
+
+    def weights_at(self, rows: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """The log prior of rows, float64 [n]; None if there is no prior."""
+        return None if self.weights is None else self.weights[rows]
 
 
 def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) -> Ranking:

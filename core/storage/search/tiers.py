@@ -9,14 +9,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from core.storage.files.row_formats import Precision
+from core.maps.records import COMPACT_FROM, Precision, TierSetting
 
 Tier = Literal["exact", "compact"]
-TierSetting = Literal["auto", "exact", "compact", "inverted"]
-"""``inverted``, which settings of earlier versions may have, is another name of ``compact``."""
-
-COMPACT_FROM = 256
-"""From so many places on codes are used; with fewer all are compared in less than a millisecond."""
 
 ON_DISK_FROM = 4096
 """From so many places on descriptors are not held in memory, where the default encoder's take 65 KB a place."""

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from core.maps.place_filter import Scalar
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map
-from core.storage.attributes import Scalar
 from core.storage.database.connections import FILE
 from core.storage.database.schema import LONGEST_INDEXED
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.maps.records import Precision
 from core.storage.files.row_formats import (
     BLOCK,
-    Precision,
     inner_products,
     pack_descriptors,
     pack_local,

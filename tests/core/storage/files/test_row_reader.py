@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from core.disk.files import Damage
-from core.storage.files.row_formats import Precision
+from core.maps.records import Precision
 from core.storage.files.row_reader import RowReader
 from core.storage.files.segment_files import HEADER_BYTES, Layout, append, segment_name
 from tests.core.storage.frames import descriptor_of, local_of, packed

@@ -7,9 +7,9 @@ import pytest
 
 from core.errors import InvalidField
 from core.judgement.verdict import Calibration
+from core.maps.records import merge_patch, patched_fields, patched_record
 from core.places import PlaceFields, Pose
 from core.storage import MapRecord
-from core.storage.records import merge_patch, patched_fields, patched_record
 
 # The examples of RFC 7396, appendix A: target, patch, result.
 RFC_7396 = [

@@ -15,11 +15,16 @@ from core.errors import InvalidField
 from core.geometry.keypoints import Keypoints
 from core.judgement.verdict import Calibration, Verdict
 from core.places import PlaceFields, Timestamp
-from core.storage.files.row_formats import Precision
-from core.storage.search.tiers import COMPACT_FROM, TierSetting
 
 Change = Literal["created", "unchanged", "updated", "replaced"]
 Keep = Literal["none", "thumbnail", "image"]
+Precision = Literal["half", "compressed"]
+
+TierSetting = Literal["auto", "exact", "compact", "inverted"]
+"""``inverted``, which settings of earlier versions may have, is another name of ``compact``."""
+
+COMPACT_FROM = 256
+"""From so many places on codes are used; with fewer all are compared in less than a millisecond."""
 
 
 class ReviewSetting(BaseModel):
@@ -170,6 +175,40 @@ class History:
     ordinal: int | None
     created_at: datetime
     updated_at: datetime
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A place in brief: enough to see whether two maps hold the same place in the same state.
+
+    number: grows in the order of enrolment.
+    row: of its descriptor.
+    digest: SHA-256 of its image, 32 bytes.
+    picture: what is kept of its frame.
+    ordinal: its position in its sequence.
+    """
+
+    number: int
+    id: str
+    row: int
+    digest: bytes
+    picture: Keep
+    camera: str | None
+    sequence: str | None
+    ordinal: int
+    updated_at: str
+
+    def same_as(self, other: Outline) -> bool:
+        """Whether both are the same place in the same state; they may be of different maps."""
+        return self.same_frame(other) and (self.sequence, self.ordinal, self.updated_at) == (
+            other.sequence,
+            other.ordinal,
+            other.updated_at,
+        )
+
+    def same_frame(self, other: Outline) -> bool:
+        """Whether both were encoded from the same bytes under the same camera's mask."""
+        return (self.id, self.digest, self.camera) == (other.id, other.digest, other.camera)
 
 
 class VerifyReport(BaseModel):

@@ -1,0 +1,93 @@
+"""The cameras of a map in PostgreSQL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from datetime import UTC, datetime
+from typing import Any
+
+from psycopg import Connection
+
+from core.errors import InvalidField, UnknownCamera
+from core.frames.intrinsics import Intrinsics
+from core.frames.masks import Mask
+from core.storage.cameras import MOST_CAMERAS, CameraRecord
+
+Access = Callable[[], AbstractContextManager[Connection[Any]]]
+
+
+class MilvusCameras:
+    """All cameras of one map.  Any thread may use it.
+
+    Args:
+        map_number: of the map.
+        reading, writing: begin a transaction that reads the map, and one that has locked it.
+    """
+
+    def __init__(self, map_number: int, reading: Access, writing: Access) -> None:
+        self._map, self._reading, self._writing = map_number, reading, writing
+
+    def all(self) -> list[CameraRecord]:
+        """All cameras by name."""
+        with self._reading() as connection:
+            found = connection.execute("SELECT record FROM cameras WHERE map = %s ORDER BY name", (self._map,))
+            return [CameraRecord.model_validate_json(text) for (text,) in found]
+
+    def _find(self, name: str) -> CameraRecord | None:
+        with self._reading() as connection:
+            query = "SELECT record FROM cameras WHERE map = %s AND name = %s"
+            found = connection.execute(query, (self._map, name)).fetchone()
+        return None if found is None else CameraRecord.model_validate_json(found[0])
+
+    def find(self, name: str) -> CameraRecord:
+        """One camera.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        if (found := self._find(name)) is None:
+            raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
+        return found
+
+    def mask(self, name: str | None) -> Mask | None:
+        """What to ignore in a frame of a camera; None without a name.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        return None if name is None else self.find(name).mask
+
+    def intrinsics(self, name: str | None) -> Intrinsics | None:
+        """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name."""
+        found = None if name is None else self._find(name)
+        return None if found is None else found.intrinsics
+
+    def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.
+
+        Raises:
+            InvalidField: the map has too many cameras.
+        """
+        made = CameraRecord(name=name, mask=mask, intrinsics=intrinsics, updated_at=datetime.now(UTC))
+        with self._writing() as connection:
+            known = {known for (known,) in connection.execute("SELECT name FROM cameras WHERE map = %s", (self._map,))}
+            if name not in known and len(known) >= MOST_CAMERAS:
+                raise InvalidField(f"A map has at most {MOST_CAMERAS} cameras.")
+            query = (
+                "INSERT INTO cameras (map, name, record) VALUES (%s, %s, %s)"
+                " ON CONFLICT (map, name) DO UPDATE SET record = excluded.record"
+            )
+            connection.execute(query, (self._map, name, made.model_dump_json()))
+        return made, name not in known
+
+    def forget(self, name: str) -> None:
+        """Delete a camera; its places stay as they are.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """
+        with self._writing() as connection:
+            query = "DELETE FROM cameras WHERE map = %s AND name = %s"
+            if not connection.execute(query, (self._map, name)).rowcount:
+                raise UnknownCamera(f"The map has no camera {name[:80]!r}.")

@@ -1,0 +1,341 @@
+"""The statements that read and write maps in PostgreSQL.
+
+Every function takes a connection of its caller, within the transaction to which the statements shall belong.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psycopg
+from psycopg import Connection
+
+from core.errors import MapExists, StorageFailure, StorageFull, UnknownMap
+from core.maps.place_filter import PlaceFilter
+from core.maps.records import MapRecord, Outline
+from core.milvus.tokens import tokens_of
+from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
+
+TABLES = (Path(__file__).parent / "tables.sql").read_text()
+
+LEFT_SECONDS = 60
+"""What no place names any more is deleted after so many seconds; a query that still needs it has ended by then."""
+
+LEAVINGS_AT_ONCE = 1000
+
+
+@contextmanager
+def postgres_errors(action: str) -> Iterator[None]:
+    """Turn what PostgreSQL refuses into our errors."""
+    try:
+        yield
+    except psycopg.errors.DiskFull as error:
+        raise StorageFull(f"PostgreSQL has no room left to {action}.") from error
+    except psycopg.Error as error:
+        raise StorageFailure(f"PostgreSQL refuses to {action}: {str(error).strip()[:300]}") from error
+
+
+@dataclass(frozen=True)
+class MapState:
+    """What PostgreSQL has of a map itself.
+
+    number: never used for another map, also of the same id.
+    places, rows: how many places there are; all their rows are below ``rows``.
+    writes: grows with every write.
+    inserted: the timestamp from which on Milvus sees all descriptors that count.
+    """
+
+    number: int
+    record: MapRecord
+    places: int
+    rows: int
+    writes: int
+    inserted: int
+
+
+@dataclass(frozen=True)
+class PlaceEntry:
+    """A place as it is stored.
+
+    number: grows in the order of enrolment.
+    row: of its frame.
+    key: of its entity in Milvus.
+    digest: SHA-256 of its image, 32 bytes.
+    sequence: code of its sequence, NO_SEQUENCE without one.
+    ordinal: its position in its sequence.
+    """
+
+    number: int
+    row: int
+    key: int
+    digest: bytes
+    sequence: int
+    ordinal: int
+    place: Place
+
+    def whereabouts(self) -> Whereabouts:
+        """Where and when its frame was taken."""
+        return whereabouts_of([self])
+
+    def outline(self) -> Outline:
+        """The place in brief."""
+        place = self.place
+        return Outline(
+            self.number, place.id, self.row, self.digest, place.picture, place.camera, place.sequence, self.ordinal,
+            place.updated_at.isoformat(timespec="microseconds"),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is kept of a frame beside its place: descriptor float16 [D], local descriptors int8 [C, L], in bytes."""
+
+    descriptor: bytes
+    local: bytes
+    keypoints: bytes | None
+    picture: bytes | None
+
+
+def whereabouts_of(entries: Sequence[PlaceEntry]) -> Whereabouts:
+    """Where and when the frames of places were taken."""
+    poses = [entry.place.pose for entry in entries]
+    moments = [entry.place.timestamp for entry in entries]
+    return Whereabouts(
+        np.array(
+            [NO_POSE if pose is None else METRIC if pose.kind() == "metric" else GEOGRAPHIC for pose in poses], np.int8
+        ),
+        np.array([np.zeros(3) if pose is None else pose.position() for pose in poses]).reshape(-1, 3),
+        np.array([entry.sequence for entry in entries], np.int32),
+        np.array([entry.ordinal for entry in entries], np.int64),
+        np.array([nan if pose is None or pose.heading is None else pose.heading for pose in poses], np.float32),
+        np.array([NO_TIME if moment is None else microseconds(moment) for moment in moments], np.int64),
+    )
+
+
+# Maps
+
+
+def create(connection: Connection[Any], record: MapRecord) -> None:
+    """Insert a map without places.
+
+    Raises:
+        MapExists: the id is taken.
+    """
+    query = "INSERT INTO maps (id, record) VALUES (%s, %s) ON CONFLICT DO NOTHING RETURNING number"
+    made = connection.execute(query, (record.id, record.model_dump_json())).fetchone()
+    if made is None:
+        raise MapExists(f"There is already a map {record.id!r}.")
+    connection.execute("INSERT INTO sequences (map, code) VALUES (%s, %s)", (made[0], NO_SEQUENCE))
+
+
+def state_of(connection: Connection[Any], map_id: str, number: int | None = None, locked: bool = False) -> MapState:
+    """A map.
+
+    Args:
+        number: of the map that is meant; None: whichever has the id now.
+        locked: whether to keep others from writing to it until the transaction ends.
+
+    Raises:
+        UnknownMap: there is none.
+    """
+    query = "SELECT number, record, places, rows, writes, inserted FROM maps WHERE id = %s"
+    found = connection.execute(query + (" FOR UPDATE" if locked else ""), (map_id,)).fetchone()
+    if found is None or number not in (None, found[0]):
+        raise UnknownMap(f"There is no map {map_id[:80]!r}.")
+    return MapState(found[0], MapRecord.model_validate_json(found[1]), *found[2:])
+
+
+def records_after(connection: Connection[Any], after: str, limit: int) -> list[MapRecord]:
+    """Up to ``limit`` records by id."""
+    query = "SELECT record FROM maps WHERE id > %s ORDER BY id LIMIT %s"
+    return [MapRecord.model_validate_json(text) for (text,) in connection.execute(query, (after, limit))]
+
+
+def delete(connection: Connection[Any], map_id: str) -> list[int]:
+    """Delete a map and all that belongs to it; returns the keys of its entities in Milvus.
+
+    Raises:
+        UnknownMap: there is none.
+    """
+    state = state_of(connection, map_id, locked=True)
+    query = "SELECT key FROM places WHERE map = %s UNION SELECT key FROM leavings WHERE map = %s"
+    keys = [key for (key,) in connection.execute(query, (state.number, state.number))]
+    connection.execute("DELETE FROM maps WHERE number = %s", (state.number,))
+    return keys
+
+
+def update(connection: Connection[Any], state: MapState) -> None:
+    """Store what a write has changed of the map itself."""
+    query = "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s WHERE number = %s"
+    record = state.record.model_dump_json()
+    connection.execute(query, (record, state.places, state.rows, state.writes, state.inserted, state.number))
+
+
+# Places
+
+_ENTRY = "SELECT number, row, key, digest, sequence, ordinal, place FROM places WHERE map = %s"
+
+
+def _entry(values: tuple[Any, ...]) -> PlaceEntry:
+    number, row, key, digest, sequence, ordinal, text = values
+    return PlaceEntry(number, row, key, digest, sequence, ordinal, Place.model_validate(json.loads(text)))
+
+
+def find(connection: Connection[Any], map_number: int, place_id: str) -> PlaceEntry | None:
+    """The place of this id; None if there is none."""
+    values = connection.execute(f"{_ENTRY} AND id = %s", (map_number, place_id)).fetchone()
+    return None if values is None else _entry(values)
+
+
+def entries_by(connection: Connection[Any], map_number: int, column: str, values: Sequence[Any]) -> list[PlaceEntry]:
+    """The places with one of some values in a column, ``id``, ``row`` or ``key``, in any order."""
+    query = f"{_ENTRY} AND {column} = ANY(%s)"
+    return [_entry(found) for found in connection.execute(query, (map_number, list(values)))]
+
+
+def entries_after(
+    connection: Connection[Any], map_number: int, after: int, limit: int | None, wanted: PlaceFilter
+) -> list[PlaceEntry]:
+    """Up to ``limit`` places that fulfil some conditions, in the order of their enrolment; None: all."""
+    of_sequence = "sequence = (SELECT s.code FROM sequences s WHERE s.map = places.map AND s.name = %s)"
+    given: dict[str, Any] = {
+        "number > %s": after,
+        "id = ANY(%s)": None if wanted.ids is None else list(wanted.ids),
+        of_sequence: wanted.sequence,
+        "camera = %s": wanted.camera,
+        "moment >= %s": None if wanted.after is None else microseconds(wanted.after),
+        "moment <= %s": None if wanted.before is None else microseconds(wanted.before),
+        "tokens @> %s::text[]": tokens_of(wanted.metadata) if wanted.metadata else None,
+    }
+    conditions = {condition: value for condition, value in given.items() if value is not None}
+    also = "".join(f" AND {condition}" for condition in conditions)
+    query = f"{_ENTRY}{also} ORDER BY number LIMIT %s"
+    return [_entry(found) for found in connection.execute(query, (map_number, *conditions.values(), limit))]
+
+
+def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
+    """Store a place, in the place of what is stored under its number."""
+    place = entry.place
+    columns = {
+        "map": map_number, "number": entry.number, "id": place.id, "row": entry.row, "key": entry.key,
+        "digest": entry.digest, "place": json.dumps(place.model_dump(mode="json")), "sequence": entry.sequence,
+        "ordinal": entry.ordinal, "camera": place.camera,
+        "moment": None if place.timestamp is None else microseconds(place.timestamp),
+        "tokens": tokens_of(place.metadata),
+    }  # fmt: skip
+    names, marks = ", ".join(columns), ", ".join(["%s"] * len(columns))
+    again = ", ".join(f"{name} = excluded.{name}" for name in columns if name not in ("map", "number", "id"))
+    query = f"INSERT INTO places ({names}) VALUES ({marks}) ON CONFLICT (map, number) DO UPDATE SET {again}"
+    connection.execute(query, tuple(columns.values()))
+
+
+def remove(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
+    """Remove a place; what belongs to it is left for a while."""
+    connection.execute("DELETE FROM places WHERE map = %s AND number = %s", (map_number, entry.number))
+
+
+def new_key(connection: Connection[Any]) -> int:
+    """A number that was never used before."""
+    ((key,),) = connection.execute("SELECT nextval('keys')").fetchall()
+    return int(key)
+
+
+# Sequences
+
+
+def sequence_codes(connection: Connection[Any], map_number: int, names: Sequence[str]) -> dict[str, int]:
+    """The codes of sequences by name; names that do not exist are left out."""
+    query = "SELECT name, code FROM sequences WHERE map = %s AND name = ANY(%s)"
+    return dict(connection.execute(query, (map_number, list(names))).fetchall())
+
+
+def next_in_sequence(connection: Connection[Any], map_number: int, name: str | None) -> tuple[int, int]:
+    """The code of a sequence, which is made if there is none, and the ordinal of its next place."""
+    code = NO_SEQUENCE if name is None else sequence_codes(connection, map_number, [name]).get(name)
+    if code is None:
+        query = "UPDATE maps SET codes = codes + 1 WHERE number = %s RETURNING codes - 1"
+        ((code,),) = connection.execute(query, (map_number,)).fetchall()
+        connection.execute("INSERT INTO sequences (map, code, name) VALUES (%s, %s, %s)", (map_number, code, name))
+    query = (
+        "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE map = %s AND code = %s RETURNING next_ordinal - 1"
+    )
+    ((ordinal,),) = connection.execute(query, (map_number, code)).fetchall()
+    return int(code), int(ordinal)
+
+
+def drop_if_empty(connection: Connection[Any], map_number: int, code: int) -> None:
+    """Remove a sequence without places; its code is never used again."""
+    query = (
+        "DELETE FROM sequences WHERE map = %s AND code = %s AND name IS NOT NULL"
+        " AND NOT EXISTS (SELECT 1 FROM places p WHERE p.map = sequences.map AND p.sequence = sequences.code)"
+    )
+    connection.execute(query, (map_number, code))
+
+
+def oldest_of_last(connection: Connection[Any], map_number: int, code: int, frames: int) -> int | None:
+    """The smallest ordinal among the last ``frames`` places of a sequence; None if it has no places."""
+    query = (
+        "SELECT min(ordinal) FROM (SELECT ordinal FROM places WHERE map = %s AND sequence = %s"
+        " ORDER BY ordinal DESC LIMIT %s) AS last"
+    )
+    ((ordinal,),) = connection.execute(query, (map_number, code, frames)).fetchall()
+    return None if ordinal is None else int(ordinal)
+
+
+# Frames
+
+
+def put_frame(connection: Connection[Any], map_number: int, row: int, frame: Frame) -> None:
+    """Store a frame."""
+    query = "INSERT INTO frames (map, row, descriptor, local, keypoints, picture) VALUES (%s, %s, %s, %s, %s, %s)"
+    values = (map_number, row, frame.descriptor, frame.local, frame.keypoints, frame.picture)
+    connection.execute(query, values)
+
+
+def put_keypoints(connection: Connection[Any], map_number: int, row: int, keypoints: bytes) -> None:
+    """Store the keypoints of a frame that has none."""
+    query = "UPDATE frames SET keypoints = %s WHERE map = %s AND row = %s AND keypoints IS NULL"
+    connection.execute(query, (keypoints, map_number, row))
+
+
+def of_frames(connection: Connection[Any], map_number: int, column: str, rows: Sequence[int]) -> dict[int, Any]:
+    """A column of frames by row; rows that are gone are left out."""
+    query = f"SELECT row, {column} FROM frames WHERE map = %s AND row = ANY(%s)"
+    return dict(connection.execute(query, (map_number, list(rows))).fetchall())
+
+
+# What is left over
+
+
+def leave(connection: Connection[Any], map_number: int, key: int, row: int | None) -> None:
+    """Note that an entity, and the frame of a row, are no place's any more."""
+    connection.execute("INSERT INTO leavings (map, key, row) VALUES (%s, %s, %s)", (map_number, key, row))
+
+
+def leavings(connection: Connection[Any], map_number: int) -> list[int]:
+    """The keys of the entities that are no place's any more."""
+    query = "SELECT key FROM leavings WHERE map = %s ORDER BY since DESC LIMIT %s"
+    return [key for (key,) in connection.execute(query, (map_number, LEAVINGS_AT_ONCE))]
+
+
+def old_leavings(connection: Connection[Any], map_number: int) -> list[int]:
+    """The keys of some that can be deleted; others, who delete too, get other ones."""
+    query = (
+        "SELECT key FROM leavings WHERE map = %s AND since < now() - make_interval(secs => %s)"
+        " ORDER BY since LIMIT %s FOR UPDATE SKIP LOCKED"
+    )
+    return [key for (key,) in connection.execute(query, (map_number, LEFT_SECONDS, LEAVINGS_AT_ONCE))]
+
+
+def clear(connection: Connection[Any], map_number: int, keys: Sequence[int]) -> None:
+    """Delete the frames of leavings, whose entities are deleted, and forget these."""
+    query = "DELETE FROM leavings WHERE map = %s AND key = ANY(%s) RETURNING row"
+    rows = [row for (row,) in connection.execute(query, (map_number, list(keys))) if row is not None]
+    connection.execute("DELETE FROM frames WHERE map = %s AND row = ANY(%s)", (map_number, rows))

@@ -1,0 +1,299 @@
+"""Searching a map that is in PostgreSQL and Milvus."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from psycopg import Connection
+
+from core.errors import UnknownPlace
+from core.judgement.priors import LARGEST_TRUST, Constraint, InSequences, NotLately, Values, holding, log_weights
+from core.maps.place_filter import EVERY_PLACE
+from core.maps.records import COMPACT_FROM
+from core.maps.selection import Conditions, Selection
+from core.maps.store import Ranking, Rows, merged
+from core.milvus import ledger
+from core.milvus.collection import MOST_FOUND, Collection
+from core.milvus.database import Database
+from core.milvus.expressions import all_of, any_row, bounds_of, with_tokens
+from core.milvus.ledger import MapState, PlaceEntry, whereabouts_of
+from core.milvus.tokens import tokens_of
+from core.places import NO_POSE, Neighborhood, Whereabouts
+
+SHORTLIST = 100
+"""Places of a large map that a search finds, as in a data directory; below ``COMPACT_FROM`` places it finds all."""
+
+_SPARE = 1.25  # that more entities are asked for, because some are no place's any more or beyond an edge
+_MORE = 4  # by this factor, if these were too few
+
+Keep = Callable[[list[PlaceEntry]], NDArray[np.bool_]]
+"""Which of some places fulfil conditions; bool [n]."""
+
+
+@dataclass(frozen=True, eq=False)
+class MilvusSnapshot:
+    """The places of a map at one moment (:class:`core.maps.store.Snapshot`).
+
+    What was written to the map since may show in what is read by row for the first time: a row belongs to the same
+    frame for ever, but its place may have got another pose.
+
+    state: of the map at that moment.
+    leavings: the keys of entities that were no place's any more.
+    """
+
+    database: Database
+    collection: Collection
+    state: MapState
+    leavings: tuple[int, ...] = ()
+    _known: dict[int, PlaceEntry] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return self.state.places
+
+    @property
+    def rows(self) -> int:
+        """All rows are below this number."""
+        return self.state.rows
+
+    def entries_at(self, rows: Rows) -> list[PlaceEntry]:
+        """The places of rows that a search found, as it found them, and else as they are now.
+
+        Raises:
+            UnknownPlace: the place of a row was deleted, or got another frame, before it was asked for.
+        """
+        if missing := [row for row in rows.tolist() if row not in self._known]:
+            with self.database.reading() as connection:
+                self.note(ledger.entries_by(connection, self.state.number, "row", missing))
+        try:
+            return [self._known[row] for row in rows.tolist()]
+        except KeyError:
+            raise UnknownPlace("A place was deleted while it was read.") from None
+
+    def note(self, entries: Sequence[PlaceEntry]) -> None:
+        """Remember places that were read."""
+        for entry in entries:
+            self._known.setdefault(entry.row, entry)
+
+    def whereabouts_at(self, rows: Rows) -> Whereabouts:
+        """Where and when the frames of some rows were taken."""
+        return whereabouts_of(self.entries_at(rows))
+
+    def descriptors_at(self, rows: Rows) -> NDArray[np.float32]:
+        """The descriptors of rows: float32 [k, D]."""
+        found = self._of_frames("descriptor", rows)
+        halves = np.frombuffer(b"".join(found), "<f2").reshape(len(rows), self.state.record.dimension)
+        return halves.astype(np.float32)
+
+    def locals_at(self, rows: Rows) -> NDArray[np.int8]:
+        """The local descriptors of rows: int8 [k, C, L]."""
+        shape = len(rows), *self.state.record.local_shape
+        return np.frombuffer(b"".join(self._of_frames("local", rows)), np.int8).reshape(shape)
+
+    def _of_frames(self, column: str, rows: Rows) -> list[bytes]:
+        with self.database.reading() as connection:
+            found = ledger.of_frames(connection, self.state.number, column, np.unique(rows).tolist())
+        try:
+            return [found[row] for row in rows.tolist()]
+        except KeyError:
+            raise UnknownPlace("A place was deleted while it was read.") from None
+
+    @cached_property
+    def _entries(self) -> list[PlaceEntry]:
+        """All places of the rows of the snapshot."""
+        with self.database.reading() as connection:
+            entries = ledger.entries_after(connection, self.state.number, -1, None, EVERY_PLACE)
+        found = [entry for entry in entries if entry.row < self.rows]
+        self.note(found)
+        return found
+
+    @cached_property
+    def alive(self) -> NDArray[np.bool_]:
+        """Whether each row belongs to a place: bool [rows]."""
+        alive = np.zeros(self.rows, np.bool_)
+        alive[[entry.row for entry in self._entries]] = True
+        return alive
+
+    @cached_property
+    def whereabouts(self) -> Whereabouts:
+        """Where and when the frames of all rows were taken; rows of no place have no pose and no sequence."""
+        where = Whereabouts.along_sequence(np.zeros(self.rows, np.int64)).take(np.arange(self.rows))
+        columns = {name: column.copy() for name, column in vars(where).items()}
+        columns["sequence"][:] = columns["track"][:] = -1
+        found = whereabouts_of(self._entries)
+        for name, column in columns.items():
+            column[[entry.row for entry in self._entries]] = getattr(found, name)
+        return Whereabouts(**columns)
+
+    def among(self, allowed: NDArray[np.bool_]) -> MilvusScope:
+        """The places of some rows, bool [rows], as a scope without a prior."""
+        inside, outside = np.flatnonzero(allowed & self.alive), np.flatnonzero(~allowed & self.alive)
+        few = any_row(inside.tolist()) if len(inside) <= len(outside) else f"not ({any_row(outside.tolist())})"
+        return MilvusScope(self, (few,), lambda entries: allowed[[entry.row for entry in entries]])
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What is known of a place with some probability.
+
+    constraints: on pose, time and sequence.
+    tokens: of values that its metadata has.
+    """
+
+    constraints: tuple[Constraint, ...]
+    tokens: tuple[str, ...]
+    with_metadata: bool
+    trust: float
+
+
+def everything(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+    """All of some places; bool [n]."""
+    return np.ones(len(entries), np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class MilvusScope:
+    """The places of a snapshot that a query may find (:class:`core.maps.store.Scope`).
+
+    expressions: hold of these places, and maybe of others.
+    keep: which of the places that Milvus finds by them belong to the scope.
+    """
+
+    snapshot: MilvusSnapshot
+    expressions: tuple[str, ...] = ()
+    keep: Keep = everything
+    prior: Prior | None = None
+
+    def search(self, descriptors: NDArray[np.float32]) -> list[Ranking]:
+        """Rank the places of the scope by inner product, for each of the queries, float32 [B, D]."""
+        rankings = self._ranked(descriptors, self.expressions, self.keep)
+        if self.prior is None or len(self.snapshot) < COMPACT_FROM:
+            return rankings
+        bounds = filter(None, map(bounds_of, self.prior.constraints))
+        favoured = (*self.expressions, *bounds, *with_tokens(self.prior.tokens))
+        more = self._ranked(descriptors, favoured, self.keep)
+        return [merged(ranking, other) for ranking, other in zip(rankings, more, strict=True)]
+
+    def search_elsewhere(
+        self, descriptor: NDArray[np.float32], ranking: Ranking, best: int, neighborhood: Neighborhood
+    ) -> Ranking:
+        """The best places that are neither in a ranking nor the same place as the row ``best``; no rows if none are."""
+        (there,) = self.snapshot.entries_at(np.array([best]))
+        listed = set(ranking[0].tolist())
+
+        def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+            near = whereabouts_of([there, *entries]).near(0, neighborhood)[1:]
+            return self.keep(entries) & ~near & np.array([entry.row not in listed for entry in entries], np.bool_)
+
+        expressions = [*self.expressions, f"not ({any_row([*listed, best])})"]
+        where = there.whereabouts()
+        if where.kind[0] != NO_POSE:  # within the cube in the ball of its neighbours
+            side = neighborhood.radius / 2
+            inside = [
+                f"{axis} >= {at - side!r} and {axis} <= {at + side!r}"
+                for axis, at in zip("xyz", where.position[0].tolist(), strict=True)
+            ]
+            expressions.append(f"not (kind == {where.kind[0]} and {all_of(inside)})")
+        return self._ranked(descriptor[np.newaxis], expressions, keep)[0]
+
+    def weights_at(self, rows: Rows) -> Values | None:
+        """The log prior of rows, float64 [n]; None if there is no prior."""
+        prior = self.prior
+        if prior is None:
+            return None
+        entries = self.snapshot.entries_at(rows)
+        where = whereabouts_of(entries)
+        fits = [constraint.fit(where) for constraint in prior.constraints]
+        if prior.with_metadata:
+            wanted = set(prior.tokens)
+            fits.append(np.array([wanted <= set(tokens_of(entry.place.metadata)) for entry in entries], np.float64))
+        return log_weights(fits, min(prior.trust, LARGEST_TRUST))
+
+    def _ranked(self, descriptors: NDArray[np.float32], expressions: Sequence[str], keep: Keep) -> list[Ranking]:
+        """The best places that Milvus finds by expressions and ``keep`` keeps, by inner product, equal ones by row."""
+        snapshot = self.snapshot
+        queries = np.ascontiguousarray(descriptors, np.float32)
+        if queries.ndim != 2 or queries.shape[1] != snapshot.state.record.dimension or not np.isfinite(queries).all():
+            raise ValueError(f"a query is {snapshot.state.record.dimension} finite values")
+        nothing: Ranking = np.empty(0, np.int64), np.empty(0, np.float32)
+        if not len(queries) or not len(snapshot):
+            return [nothing] * len(queries)
+        wanted = len(snapshot) if len(snapshot) < COMPACT_FROM else SHORTLIST
+        unused = (f"not (key in {list(snapshot.leavings)})",) if snapshot.leavings else ()
+        bounds = f"row < {snapshot.rows}"
+        expression = all_of((f"map == {snapshot.state.number}", bounds, *unused, *expressions))
+        limit = min(MOST_FOUND, int(_SPARE * wanted) + 10)
+        while True:
+            hits = snapshot.collection.search(queries, expression, limit, snapshot.state.inserted)
+            rankings = self._kept(hits, keep)
+            enough = all(
+                len(keys) < limit or len(ranking[0]) >= wanted
+                for (keys, _), ranking in zip(hits, rankings, strict=True)
+            )
+            if enough or limit == MOST_FOUND:
+                return [(rows[:wanted], products[:wanted]) for rows, products in rankings]
+            limit = min(MOST_FOUND, _MORE * limit)
+
+    def _kept(self, hits: Sequence[tuple[NDArray[np.int64], NDArray[np.float32]]], keep: Keep) -> list[Ranking]:
+        """The rows of the keys that are places' of the scope."""
+        snapshot = self.snapshot
+        keys = np.unique(np.concatenate([found for found, _ in hits])).tolist()
+        with snapshot.database.reading() as connection:
+            entries = ledger.entries_by(connection, snapshot.state.number, "key", keys)
+        kept = [entry for entry, stays in zip(entries, keep(entries), strict=True) if stays] if entries else []
+        snapshot.note(kept)
+        rows = {entry.key: entry.row for entry in kept}
+        rankings = []
+        for found, products in hits:
+            there = np.array([key in rows for key in found.tolist()], np.bool_)
+            row = np.array([rows[key] for key in found[there].tolist()], np.int64)
+            order = np.lexsort((row, -products[there]))
+            rankings.append((row[order], products[there][order]))
+        return rankings
+
+
+def scope_of(connection: Connection[Any], snapshot: MilvusSnapshot, selection: Selection | None) -> MilvusScope:
+    """The places of a snapshot that a query may find by what its caller knows."""
+    whole = MilvusScope(snapshot)
+    if not selection:
+        return whole
+    filters, number = selection.filters, snapshot.state.number
+    constraints = _constraints(connection, number, filters)
+    recent = selection.recent
+    if recent is not None:
+        code = ledger.sequence_codes(connection, number, [recent.sequence]).get(recent.sequence)
+        if code is not None:
+            oldest = ledger.oldest_of_last(connection, number, code, recent.frames) if recent.frames else None
+            moment = recent.moment if recent.seconds else None
+            constraints.append(NotLately(code, oldest, moment, round(1e6 * recent.seconds)))
+    expressions = [bounds for constraint in constraints if (bounds := bounds_of(constraint)) is not None]
+    tokens = tokens_of(filters.metadata)
+    expressions += with_tokens(tokens)
+    if selection.excluded is not None:
+        entry = ledger.find(connection, number, selection.excluded)
+        expressions += [] if entry is None else [f"row != {entry.row}"]
+
+    def keep(entries: list[PlaceEntry]) -> NDArray[np.bool_]:
+        wanted = set(tokens)
+        has = [wanted <= set(tokens_of(entry.place.metadata)) for entry in entries]
+        named = [entry.place.id != selection.excluded for entry in entries]
+        return holding(constraints, whereabouts_of(entries)) & np.array(has, np.bool_) & np.array(named, np.bool_)
+
+    prior = None
+    if selection.prior:
+        known = tuple(_constraints(connection, number, selection.prior)), tuple(tokens_of(selection.prior.metadata))
+        prior = Prior(*known, bool(selection.prior.metadata), selection.trust)
+    return replace(whole, expressions=tuple(expressions), keep=keep, prior=prior)
+
+
+def _constraints(connection: Connection[Any], map_number: int, conditions: Conditions) -> list[Constraint]:
+    """The conditions on pose, time and sequence."""
+    found = list(conditions.geometry)
+    if conditions.sequences is not None:
+        codes = ledger.sequence_codes(connection, map_number, conditions.sequences)
+        found.insert(0, InSequences(tuple(codes.values())))
+    return found

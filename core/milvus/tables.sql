@@ -1,0 +1,73 @@
+-- What PostgreSQL has of the maps (core.milvus.ledger has the statements).
+
+CREATE TABLE IF NOT EXISTS maps (
+    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    id text COLLATE "C" NOT NULL UNIQUE,
+    record text NOT NULL,               -- MapRecord as JSON
+    places bigint NOT NULL DEFAULT 0,   -- how many there are
+    rows bigint NOT NULL DEFAULT 0,     -- the number of the next row
+    codes integer NOT NULL DEFAULT 0,   -- the code of the next sequence
+    writes bigint NOT NULL DEFAULT 0,   -- grows with every write
+    inserted bigint NOT NULL DEFAULT 0  -- Milvus's timestamp of the last insertion that counts
+);
+
+-- The code of the places without a sequence is -1, and their sequence has no name.
+CREATE TABLE IF NOT EXISTS sequences (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    code integer NOT NULL,
+    name text COLLATE "C",
+    next_ordinal bigint NOT NULL DEFAULT 0,
+    PRIMARY KEY (map, code),
+    UNIQUE (map, name)
+);
+
+-- The numbers of places and the keys of Milvus's entities are never used twice, also if their transaction fails.
+CREATE SEQUENCE IF NOT EXISTS keys;
+
+CREATE TABLE IF NOT EXISTS places (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    number bigint NOT NULL,             -- grows in the order of enrolment
+    id text COLLATE "C" NOT NULL,
+    row bigint NOT NULL,                -- of its frame
+    key bigint NOT NULL UNIQUE,         -- of its entity in Milvus
+    digest bytea NOT NULL,
+    place text NOT NULL,                -- Place as JSON
+    sequence integer NOT NULL,
+    ordinal bigint NOT NULL,
+    camera text COLLATE "C",
+    moment bigint,                      -- its timestamp, microseconds since 1970
+    tokens text[] NOT NULL,             -- of its metadata
+    PRIMARY KEY (map, number),
+    UNIQUE (map, id),
+    UNIQUE (map, row)
+);
+CREATE INDEX IF NOT EXISTS places_of_sequence ON places (map, sequence, ordinal);
+CREATE INDEX IF NOT EXISTS places_by_metadata ON places USING gin (tokens);
+
+-- Apart from the places, so that a listing need not read them.
+CREATE TABLE IF NOT EXISTS frames (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    row bigint NOT NULL,
+    descriptor bytea NOT NULL,          -- float16 [D]
+    local bytea NOT NULL,               -- int8 [C, L]
+    keypoints bytea,
+    picture bytea,
+    PRIMARY KEY (map, row)
+);
+ALTER TABLE frames ALTER COLUMN descriptor SET STORAGE EXTERNAL; -- compressing them would only take time
+
+-- What no place names any more; it is deleted a while later, for a query may still need it.
+CREATE TABLE IF NOT EXISTS leavings (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    key bigint PRIMARY KEY,
+    row bigint,                         -- of a frame that can be deleted; NULL: the frame is still a place's
+    since timestamptz NOT NULL DEFAULT now()
+);
+CREATE INDEX IF NOT EXISTS leavings_of_map ON leavings (map, since);
+
+CREATE TABLE IF NOT EXISTS cameras (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    name text COLLATE "C" NOT NULL,
+    record text NOT NULL,               -- CameraRecord as JSON
+    PRIMARY KEY (map, name)
+);

@@ -1,0 +1,40 @@
+"""The conditions of a listing in SQL."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import Any
+
+from core.maps.place_filter import PlaceFilter
+from core.storage.attributes import WANTED
+
+_HAS_VALUES = (
+    "NOT EXISTS (SELECT 1 FROM json_each(?) f WHERE NOT EXISTS (SELECT 1 FROM place_values v WHERE"
+    f"{WANTED} AND v.row = p.row))"
+)
+
+
+def conditions(wanted: PlaceFilter) -> dict[str, str]:
+    """Conditions in SQL on a place ``p`` of a sequence ``s``, each with one parameter and the value of it."""
+    given: dict[str, Any] = {
+        "p.id IN (SELECT value FROM json_each(?))": None if wanted.ids is None else json.dumps(wanted.ids),
+        "s.name = ?": wanted.sequence,
+        "p.camera = ?": wanted.camera,
+        "p.timestamp >= ?": _moment(wanted.after),
+        "p.timestamp <= ?": _moment(wanted.before),
+        _HAS_VALUES: json.dumps(dict(wanted.metadata)) if wanted.metadata else None,
+    }
+    return {condition: value for condition, value in given.items() if value is not None}
+
+
+def text_of(wanted: PlaceFilter) -> str | None:
+    """Text that is the same for the same conditions; None without any but ``sequence``."""
+    others = [value for condition, value in conditions(wanted).items() if condition != "s.name = ?"]
+    named = [wanted.camera is not None, wanted.after is not None, wanted.before is not None, *others]
+    return json.dumps(named) if others else None
+
+
+def _moment(moment: datetime | None) -> str | None:
+    """A moment as it is stored."""
+    return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")

@@ -1,0 +1,88 @@
+"""The rows of a map that a query may find, from what its caller knows of the place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.judgement.priors import Constraint, Flags, InSequences, NotLately, Values, holding, log_weights
+from core.maps.place_filter import Scalar
+from core.maps.selection import Conditions, Selection
+from core.storage.attributes import Attributes
+from core.storage.search.snapshot import SearchScope, Snapshot
+
+
+class Chooser:
+    """Chooses the rows of one map at one moment; only metadata is read from disk.
+
+    Args:
+        rows_of: the rows of places, by their ids.
+    """
+
+    def __init__(
+        self, snapshot: Snapshot, attributes: Attributes, rows_of: Callable[[Sequence[str]], list[int | None]]
+    ) -> None:
+        self._snapshot, self._attributes, self._rows_of = snapshot, attributes, rows_of
+
+    def scope(self, selection: Selection) -> SearchScope:
+        """Which rows may be found, and their weights.
+
+        Raises:
+            StorageFailure: the metadata cannot be read.
+        """
+        return SearchScope(self._snapshot, self._allowed(selection), self._weights(selection))
+
+    def _constraints(self, conditions: Conditions) -> list[Constraint]:
+        """The conditions on pose, time and sequence as constraints on rows."""
+        found = list(conditions.geometry)
+        if conditions.sequences is not None:
+            found.insert(0, InSequences(tuple(self._attributes.sequence_codes(conditions.sequences).values())))
+        return found
+
+    def _allowed(self, selection: Selection) -> Flags | None:
+        filters, snapshot = selection.filters, self._snapshot
+        if not (filters or selection.recent or selection.excluded):
+            return None
+        constraints = self._constraints(filters)
+        if (not_recent := self._not_recent(selection)) is not None:
+            constraints.append(not_recent)
+        allowed = holding(constraints, snapshot.whereabouts)
+        if filters.metadata:
+            # The constraints, which are in memory, come first: fewer rows are then looked up on disk.
+            rows = self._rows_with(filters.metadata, np.flatnonzero(allowed) if constraints else None)
+            among, allowed = allowed, np.zeros(snapshot.rows, np.bool_)
+            allowed[rows] = among[rows]
+        if selection.excluded is not None:
+            (row,) = self._rows_of([selection.excluded])
+            if row is not None and row < len(allowed):
+                allowed[row] = False
+        return allowed
+
+    def _not_recent(self, selection: Selection) -> NotLately | None:
+        recent = selection.recent
+        if recent is None:
+            return None
+        code = self._attributes.sequence_codes([recent.sequence]).get(recent.sequence)
+        if code is None:
+            return None  # the map has no place of the sequence yet
+        oldest = self._attributes.oldest_of_last(code, recent.frames) if recent.frames else None
+        moment = recent.moment if recent.seconds else None
+        return NotLately(code, oldest, moment, round(1e6 * recent.seconds))
+
+    def _weights(self, selection: Selection) -> Values | None:
+        prior, snapshot = selection.prior, self._snapshot
+        if not prior:
+            return None
+        fits = [constraint.fit(snapshot.whereabouts) for constraint in self._constraints(prior)]
+        if prior.metadata:
+            fit = np.zeros(snapshot.rows)
+            fit[self._rows_with(prior.metadata)] = 1
+            fits.append(fit)
+        return log_weights(fits, selection.trust)
+
+    def _rows_with(self, metadata: Mapping[str, Scalar], among: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """The rows of the snapshot whose metadata has these values; places that were stored later are left out."""
+        rows = self._attributes.rows_with(metadata, among)
+        return rows[rows < self._snapshot.rows]

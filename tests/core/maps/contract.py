@@ -1,0 +1,327 @@
+"""What every store of maps has to do (:mod:`core.maps.store`): random writes and queries, with a model beside them.
+
+A suite of one store derives a class from :class:`StoreContract` that says how the store is opened.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from core import errors
+from core.judgement.priors import Disc, Period
+from core.maps import Map, PlaceFilter, SameFrame, Selection, Store
+from core.maps.selection import Conditions, RecentFrames
+from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, microseconds
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
+from tests.durability.contents import sha
+from tests.durability.model import MapModel, PlaceModel, Refused, changed, differences
+from tests.durability.storage.operations import DEFAULTS, enrolment, shown
+
+MAP = "lab"
+NAMES = ("monday", "tuesday")
+
+ids = st.sampled_from([f"p{number}" for number in range(9)])
+pictures = st.sampled_from([f"picture {number}" for number in range(12)])
+sequences = st.sampled_from([None, *NAMES])
+scalars = st.one_of(st.none(), st.booleans(), st.integers(0, 2), st.sampled_from([1.0, 0.5, "a", 'q"\\\u0000ü']))
+metadata = st.dictionaries(st.sampled_from(["floor", 'a "key"']), scalars | st.just([1]), max_size=2)
+times = st.sampled_from([f"2026-11-{day:02}T10:00:00Z" for day in (1, 2, 3)])
+metres = st.integers(0, 30)
+poses = st.one_of(
+    st.builds(lambda x, y, heading: {"x": x, "y": y, "heading": heading}, metres, metres, st.none() | st.just(90)),
+    st.builds(lambda latitude: {"latitude": latitude / 1e5, "longitude": 7.5}, metres),
+)
+fields = st.fixed_dictionaries(
+    {}, optional={"pose": poses, "sequence": sequences, "timestamp": times, "metadata": metadata,
+                  "camera": st.sampled_from(["front", "rear"])}
+)  # fmt: skip
+items = st.fixed_dictionaries({"id": ids, "picture": pictures, "fields": fields, "keypoints": st.booleans()})
+patches = st.one_of(
+    st.fixed_dictionaries({"sequence": sequences}),
+    st.fixed_dictionaries({"metadata": st.none() | metadata}),
+    st.just({"pose": None}),
+)
+conditions = st.builds(
+    Conditions,
+    st.lists(
+        st.one_of(
+            st.builds(lambda x, radius: Disc(Pose(x=x, y=10), radius), metres, st.integers(1, 20)),
+            st.builds(lambda latitude: Disc(Pose(latitude=latitude / 1e5, longitude=7.5), 8.0), metres),
+            st.builds(lambda day: Period(_moment(f"2026-11-{day:02}T10:00:00Z"), None), st.integers(1, 3)),
+        ),
+        max_size=2,
+    ).map(tuple),
+    st.none() | st.lists(st.sampled_from([*NAMES, "never"]), max_size=2).map(tuple),
+    st.dictionaries(st.sampled_from(["floor", 'a "key"']), scalars, max_size=1),
+)
+selections = st.builds(
+    Selection,
+    filters=conditions,
+    recent=st.none() | st.builds(RecentFrames, st.sampled_from(NAMES), st.integers(1, 2)),
+    excluded=st.none() | ids,
+)
+
+
+def _moment(text: str) -> int:
+    moment = PlaceFields.model_validate({"timestamp": text}).timestamp
+    assert moment is not None
+    return microseconds(moment)
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two values of metadata are the same: numbers as numbers, and true is not 1."""
+    return (type(a) in (int, float) and type(b) in (int, float) and a == b) or (type(a) is type(b) and a == b)
+
+
+class StoreContract(RuleBasedStateMachine):
+    """One map of a store, written to and searched at random."""
+
+    store: Store
+    model: MapModel
+
+    @abstractmethod
+    def opened(self) -> Store:
+        """The store, empty at the first call; at a later call with what was written to it before."""
+
+    @property
+    def map(self) -> Map:
+        return self.store.get(MAP)
+
+    @initialize(picture=pictures)
+    def begin(self, picture: str) -> None:
+        self.store = self.opened()
+        made = self.store.create(MAP, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        self.model = MapModel(dict(DEFAULTS))
+        assert made.record == self.map.record and self.map.record.revision == 1
+        with pytest.raises(errors.MapExists):
+            self.store.create(MAP, ENCODER, DIMENSION)
+        with pytest.raises(errors.UnknownMap):
+            self.store.get("nowhere")
+
+    def agree(self, of_model: Callable[[MapModel], Any], of_map: Callable[[Map], Any]) -> None:
+        """Do the same to the model and to the map, and compare the answers."""
+        world, expected = changed({MAP: self.model}, lambda world: of_model(world[MAP]))
+        try:
+            found = of_map(self.map)
+        except errors.PlacerecError as error:
+            found = {"error": type(error).__name__}
+        self.model = world[MAP]
+        assert found == expected
+
+    # Writes
+
+    @rule(batch=st.lists(items, min_size=1, max_size=4), blank=st.sampled_from([False] * 7 + [True]))
+    def enrol(self, batch: list[dict[str, Any]], blank: bool) -> None:
+        given = [enrolment(**item) for item in batch]
+        if blank:
+            with pytest.raises(errors.NoRegions):
+                self.map.enrol([*given, enrolment("blank", "blank", {}, False)])
+            return
+        self.agree(
+            lambda model: [
+                model.enrol(one["id"], of := shown(one["picture"]), one["fields"],
+                            keypoints=of.keypoints if one["keypoints"] else None)
+                for one in batch
+            ],
+            lambda lab: [change for _, change in lab.enrol(given)],
+        )  # fmt: skip
+
+    @rule(place_id=ids, picture=pictures, given=fields)
+    def enrol_same_frame(self, place_id: str, picture: str, given: dict[str, Any]) -> None:
+        item = SameFrame(place_id, PlaceFields.model_validate(given), bytes.fromhex(shown(picture).digest))
+        known = self.model.places.get(place_id)
+        same = known is not None and known.shown.digest == shown(picture).digest
+        self.agree(
+            lambda model: model.set_fields(place_id, given) if same else None,
+            lambda lab: None if (found := lab.enrol([item])[0]) is None else found[1],
+        )
+
+    @rule(place_id=ids, given=fields)
+    def set_fields(self, place_id: str, given: dict[str, Any]) -> None:
+        self.agree(
+            lambda model: model.set_fields(place_id, given),
+            lambda lab: lab.set_fields(place_id, PlaceFields.model_validate(given))[1],
+        )
+
+    @rule(place_id=ids, changes=patches)
+    def patch(self, place_id: str, changes: dict[str, Any]) -> None:
+        self.agree(
+            lambda model: (model.patch(place_id, changes), None)[1], lambda lab: (lab.patch(place_id, changes), None)[1]
+        )
+
+    @rule(place_id=ids)
+    def forget(self, place_id: str) -> None:
+        self.agree(lambda model: model.forget(place_id), lambda lab: lab.forget(place_id))
+
+    @rule(name=st.sampled_from(NAMES))
+    def forget_sequence(self, name: str) -> None:
+        self.agree(lambda model: model.forget_sequence(name), lambda lab: lab.forget_sequence(name))
+
+    @rule(camera=st.sampled_from(["front", "rear"]), where=st.dictionaries(st.just("floor"), scalars, max_size=1))
+    def forget_all(self, camera: str, where: dict[str, Any]) -> None:
+        wanted = PlaceFilter(camera=camera, metadata=where)
+
+        def forgotten(model: MapModel) -> list[str]:
+            found = [name for name, place in model.places.items()
+                     if place.fields.get("camera") == camera and _has(place, where)]  # fmt: skip
+            if len(found) > 2:
+                raise Refused("TooManyToForget")
+            for name in found:
+                model.forget(name)
+            return found
+
+        self.agree(forgotten, lambda lab: lab.forget_all(wanted, 2))
+
+    @rule(text=st.sampled_from(["a", "b"]), behind=st.integers(-1, 1))
+    def edit(self, text: str, behind: int) -> None:
+        expected = self.model.revision + behind
+
+        def edited(model: MapModel) -> int:
+            if behind:
+                raise Refused("RevisionMismatch")
+            return model.edit({"description": text})
+
+        self.agree(edited, lambda lab: lab.edit({"description": text}, expected).revision)
+
+    @rule()
+    def reopen(self) -> None:
+        """What was acknowledged is there after a restart."""
+        self.store.close()
+        self.store = self.opened()
+
+    @rule()
+    def delete(self) -> None:
+        self.store.delete(MAP)
+        for action in (self.store.get, self.store.delete):
+            with pytest.raises(errors.UnknownMap):
+                action(MAP)
+        self.store.create(MAP, ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        self.model = MapModel(dict(DEFAULTS))
+
+    # Reads
+
+    @rule(picture=pictures, selection=selections, cut=st.integers(1, 3))
+    def query(self, picture: str, selection: Selection, cut: int) -> None:
+        scope, asked = self.map.scope(selection), descriptor_of(picture)
+        ((rows, products),) = scope.search(asked[np.newaxis])
+        found = [place and place.id for place in self.map.places_at(rows.tolist())]
+        allowed = self._allowed(selection)
+        assert sorted(str(name) for name in found) == sorted(allowed)
+        exact = scope.snapshot.descriptors_at(rows) @ asked
+        assert np.allclose(products, exact, atol=1e-5) and (np.diff(products) <= 0).all()
+        assert scope.weights_at(rows) is None
+        if not len(rows):
+            return
+        neighborhood, where = Neighborhood(5.0, 1), scope.snapshot.whereabouts_at(rows)
+        others = ~where.near(0, neighborhood)
+        others[:cut] = False
+        more, _ = scope.search_elsewhere(asked, (rows[:cut], products[:cut]), int(rows[0]), neighborhood)
+        assert more.tolist() == rows[others].tolist()
+
+    @rule(sequence=st.sampled_from(NAMES), trust=st.sampled_from([0.5, 0.9]))
+    def weigh(self, sequence: str, trust: float) -> None:
+        scope = self.map.scope(Selection(prior=Conditions(sequences=(sequence,)), trust=trust))
+        ((rows, _),) = scope.search(descriptor_of("picture 0")[np.newaxis])
+        weights, places = scope.weights_at(rows), self.map.places_at(rows.tolist())
+        assert weights is not None and len(rows) == len(self.model.places)
+        expected = [0.0 if place and place.sequence == sequence else np.log(1 - trust) for place in places]
+        assert np.allclose(weights, expected)
+
+    @rule(limit=st.integers(1, 4), sequence=sequences)
+    def list_places(self, limit: int, sequence: str | None) -> None:
+        wanted, found, cursor = PlaceFilter(sequence=sequence), list[str](), None
+        while True:
+            page, cursor = self.map.places(cursor, limit, wanted)
+            found += [place.id for place in page]
+            assert len(page) == limit or cursor is None
+            if cursor is None:
+                break
+        every = self.model.places.items()
+        assert found == [name for name, place in every if sequence in (None, place.sequence)]
+        for malformed in ("?", "AAAA"):
+            with pytest.raises(errors.InvalidCursor):
+                self.map.places(malformed, limit)
+
+    @invariant()
+    def holds_what_the_model_holds(self) -> None:
+        expected, lab = self.model.expected(), self.map
+        assert [record.id for record in self.store.records(None, 10)[0]] == [MAP]
+        assert lab.record.revision == expected["revision"] and lab.count_places() == len(expected["places"])
+        found = _places(lab)
+        wanted = [{name: place[name] for name in found[0]} for place in expected["places"]] if found else []
+        assert len(found) == len(expected["places"])
+        assert not (wrong := differences(wanted, found)), "\n".join(wrong)
+        self.model.told(found)
+
+    def _allowed(self, selection: Selection) -> list[str]:
+        """The ids of the places that a query may find, by the model."""
+        filters, recent = selection.filters, selection.recent
+        lately: list[str] = []
+        if recent is not None:
+            along = [(place.ordinal, name) for name, place in self.model.places.items()
+                     if place.sequence == recent.sequence]  # fmt: skip
+            lately = [name for _, name in sorted(along)[-recent.frames :]]
+        return [
+            name
+            for name, place in self.model.places.items()
+            if name not in (selection.excluded, *lately)
+            and (filters.sequences is None or place.sequence in filters.sequences)
+            and _has(place, filters.metadata)
+            and all(_holds(one, place) for one in filters.geometry)
+        ]
+
+
+def _has(place: PlaceModel, where: Any) -> bool:
+    values = place.fields.get("metadata") or {}
+    return all(key in values and _same(values[key], value) for key, value in where.items())
+
+
+def _holds(condition: Any, place: PlaceModel) -> bool:
+    stored = PlaceFields.model_validate(place.fields)
+    if isinstance(condition, Period):
+        assert condition.after is not None
+        return stored.timestamp is not None and microseconds(stored.timestamp) >= condition.after
+    assert isinstance(condition, Disc)
+    if stored.pose is None or stored.pose.kind() != condition.centre.kind():
+        return False
+    apart = np.linalg.norm(stored.pose.position() - condition.centre.position())
+    return bool(apart <= condition.radius + 1e-6)
+
+
+def _places(lab: Map) -> list[dict[str, Any]]:
+    """All places of a map, as the model has them."""
+    outline, snapshot = lab.transfer.outline(), lab.snapshot()
+    assert len(snapshot) == len(outline)
+    rows = np.array([place.row for place in outline], np.int64)
+    listed, cursor = lab.places(None, 1000)
+    assert cursor is None and [place.id for place in listed] == [place.id for place in outline]
+    assert lab.places_at(rows.tolist()) == listed == [lab.place(place.id) for place in outline]
+    assert lab.rows_of([place.id for place in outline]) == rows.tolist()
+    assert np.flatnonzero(snapshot.alive).tolist() == sorted(rows.tolist()) and snapshot.rows > max(rows, default=-1)
+    descriptors, local, where = snapshot.descriptors_at(rows), snapshot.locals_at(rows), snapshot.whereabouts_at(rows)
+    keypoints = lab.keypoints_at(rows.tolist())
+    for at, place in enumerate(listed):
+        pose, moment = place.pose, place.timestamp
+        assert where.timestamp[at] == (NO_TIME if moment is None else microseconds(moment))
+        assert np.array_equal(where.position[at], np.zeros(3) if pose is None else pose.position())
+        heading = None if pose is None else pose.heading
+        assert np.isnan(where.heading[at]) if heading is None else where.heading[at] == np.float32(heading)
+    return [
+        {
+            **place.model_dump(mode="json"),
+            "digest": outline[at].digest.hex(),
+            "ordinal": int(where.ordinal[at]),
+            "kept": None if (picture := lab.picture(place.id)) is None else sha(picture),
+            "keypoints": None if (of_frame := keypoints[at]) is None else sha(of_frame.record()),
+            "descriptor": sha(descriptors[at].tobytes()),
+            "local": sha(local[at].tobytes()),
+        }
+        for at, place in enumerate(listed)
+    ]

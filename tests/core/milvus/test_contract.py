@@ -1,0 +1,48 @@
+"""The store of PostgreSQL and Milvus does what is asked of every store, while two clients of it take turns."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import ClassVar
+
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import run_state_machine_as_test
+
+from core.errors import UnknownMap
+from core.maps import Map
+from core.milvus import open_store
+from core.milvus.store import MilvusStore
+from tests.core.maps.contract import MAP, StoreContract
+from tests.core.milvus.servers import Servers
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+
+
+class Cluster(StoreContract):
+    """Two clients of real servers: what one writes, the other reads next."""
+
+    servers: ClassVar[Servers]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.other = self.opened()
+        with suppress(UnknownMap):
+            self.other.delete(MAP)
+
+    def opened(self) -> MilvusStore:
+        return open_store(self.servers.milvus_address, self.servers.postgres_address)
+
+    @property
+    def map(self) -> Map:
+        self.store, self.other = self.other, self.store
+        return self.store.get(MAP)
+
+    def teardown(self) -> None:
+        self.store.close()
+        self.other.close()
+
+
+def test_contract(servers: Servers) -> None:
+    Cluster.servers = servers
+    run_state_machine_as_test(Cluster, settings=settings(max_examples=15, stateful_step_count=20, deadline=None))
