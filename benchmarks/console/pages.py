@@ -6,9 +6,9 @@ A server of its own holds a map of made-up descriptors for the plan, and one wit
 traverses of ``--frames`` places are compared.  The browser is the system's Chromium, without a window and without a
 graphics processor: ``first paint`` is its own figure of the page of maps, with nothing in its cache; ``plan`` and
 ``matrix`` last from the address typed until the canvas is drawn; ``path`` is the way through the matrix, which is drawn
-later; ``frames a second`` are those of 120 steps of panning, each of which draws the whole plan.  ``requests`` are those
-of the plan's page.  Beside the seconds is the processor time that the service and the browser had meanwhile, which
-says more on a machine that others use.
+later; ``frames a second`` are those of 120 steps of panning, each of which draws the whole plan.  ``requests`` are
+those of the plan's page.  Beside the seconds is the processor time that the service and the browser had meanwhile,
+which says more on a machine that others use.
 """
 
 from __future__ import annotations
