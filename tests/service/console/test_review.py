@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.service.console import world
 from tests.service.console.conftest import Operator, Visit
@@ -57,7 +58,7 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     operator = visit("enrol")
     page = operator.go(f"maps/{doubtful}/review")
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
-    assert queue.count() == 3
+    expect(queue).to_have_count(3)
     panel = page.get_by_role("region", name="Frame to be labelled")
     assert (
         panel.get_by_role("img", name="The frame").evaluate("one => one.decode().then(() => one.naturalWidth)") == 320
@@ -98,10 +99,10 @@ def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
     page.get_by_role("button", name="Throw away").click()
     page.get_by_text("The frame is thrown away.").wait_for()
-    assert queue.count() == 2
+    expect(queue).to_have_count(2)
     page.get_by_role("button", name="Undo").click()
     page.get_by_text("The frame is thrown away.").wait_for(state="detached")
-    assert queue.count() == 3
+    expect(queue).to_have_count(3)
     page.get_by_role("button", name="Throw away").click()
     page.get_by_role("link", name="Places").click()  # whoever goes on means it
     page.get_by_role("heading", name="Places").wait_for()

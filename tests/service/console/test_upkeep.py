@@ -15,7 +15,7 @@ from tests.service.server import Server
 @pytest.fixture(scope="module")
 def yard(keyed: Server) -> Iterator[str]:
     """Another map of the drawn world, which these tests calibrate and align."""
-    world.fill(keyed, "yard")
+    world.copy(keyed, "yard")
     yield "yard"
     keyed.client.delete("/v1/maps/yard")
 
@@ -125,7 +125,7 @@ def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> No
 
 
 def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> None:
-    world.fill(keyed, "pruned")
+    world.copy(keyed, "pruned")
     page = admin.go("maps/pruned/health")
     page.get_by_text("The map has not been queried yet.").wait_for()
     prune = page.get_by_role("region", name="Prune")
