@@ -120,3 +120,29 @@ def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
     check_plain(admin)
     admin.go("audit")
     check_plain(admin)
+
+
+def test_names_that_kept_frames_and_recent_answers_may_bring(admin: Operator, keyed: Server) -> None:
+    answer = {"verdict": "unknown", "reason": MARKUP, "probability": 0.1, "score": 0.1, "decision": 0.1}
+    answer |= {"threshold": 0.2, "best": MARKUP, "matches": [{"place": MARKUP, "score": 0.1}], "revision": 1}
+    answer |= dict.fromkeys(("camera", "session", "file", "operation", "request_id", "key"), MARKUP)
+    kept = {"id": 1, "at": "2026-11-20T10:00:00Z", "sha256": "0", "bytes": 1, "answer": answer}
+    kept |= {"label": {"place": MARKUP, "new": None, "stranger": False}, "labelled_at": None, "labelled_by": MARKUP}
+    page = admin.page
+    page.route(
+        "**/review?*", lambda route: route.fulfill(json={"items": [kept], "next_cursor": None, "frames": 1, "bytes": 1})
+    )
+    found = {"at": "2026-11-20T10:00:00Z", "rank": 1, "frame": 7, "milliseconds": 1, "principal": MARKUP, **answer}
+    told = {"items": [found], "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
+    page.route("**/matches?*", lambda route: route.fulfill(json=told))
+    cameras = {"items": [{"name": MARKUP, "mask": None}], "next_cursor": None}
+    page.route("**/cameras", lambda route: route.fulfill(json=cameras))
+    admin.foresee("404", "422")  # there are no such pictures
+    admin.go(f"maps/{LAB}/review")
+    check_plain(admin)
+    for text in ("Camera", "Session", "Reason", "By"):
+        expect(page.get_by_role("region", name="Frame to be labelled")).to_contain_text(text + MARKUP)
+    admin.go(f"maps/{LAB}/places/monday-03")
+    row = page.get_by_role("region", name="Answers").get_by_role("row").nth(1)
+    expect(row).to_contain_text(MARKUP)
+    check_plain(admin, MARKUP[:8])

@@ -130,8 +130,7 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     keyed.client.patch("/v1/maps/day", json={"review": KEPT})
     asked = [encoded(seen_again(scene(number), seed=200 + number)) for number in range(world.PLACES)]
     asked += [world.foreign_frame(3000 + number) for number in range(world.PLACES)]
-    for data in asked:
-        keyed.query("day", data)
+    stated = [keyed.query("day", data)["probability"] for data in asked]
     wait_for_kept(keyed, "day", len(asked))
 
     # Each frame is labelled: by its best match where that is right, as a stranger otherwise.
@@ -159,6 +158,17 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     before.wait_for(state="detached")
     page.get_by_role("img", name=re.compile("Reliability diagram")).wait_for()
     assert keyed.client.get("/v1/maps/day").json()["calibration"]["source"] == "labels"
+
+    # The frame that was least certain is now as probable as the labels say.
+    doubted = min(range(len(asked)), key=lambda number: abs(stated[number] - 0.5))
+    (tmp_path / "frame.jpg").write_bytes(asked[doubted])
+    page = admin.go("maps/day/try")
+    page.get_by_label("Pictures").set_input_files(tmp_path / "frame.jpg")
+    answer = page.get_by_role("region", name="Answer")
+    answer.locator(".verdict").first.wait_for()
+    now = keyed.query("day", asked[doubted])["probability"]
+    assert f"{now:.1%}" != f"{stated[doubted]:.1%}"
+    expect(answer).to_contain_text(f"{100 * now:.1f}\u00a0%")
 
     # It is pruned, and saved.
     page = admin.go("maps/day/health")

@@ -9,7 +9,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Route, expect
 
-from tests.service.console.conftest import SIZES, Operator, Visit
+from tests.service.console.conftest import OUT_OF_PANEL, SIZES, Operator, Visit
 from tests.service.console.world import LAB
 from tests.service.server import Server
 from tests.service.wire import eventually
@@ -80,6 +80,7 @@ def test_an_admin_sees_every_view_in_light_and_dark_on_any_screen(visit: Visit, 
             page.set_viewport_size({"width": width, "height": height})
             wide, screen = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
             assert wide <= screen, (view, size, page.evaluate(TOO_WIDE))
+            assert page.evaluate(OUT_OF_PANEL) == [], (view, size)
         page.set_viewport_size({"width": SIZES["laptop"][0], "height": SIZES["laptop"][1]})
     expect(page.get_by_role("navigation", name="Views").get_by_role("link", name="Keys")).to_have_count(1)
     expect(page.locator(".identity")).to_contain_text(re.compile("^admin-key"))
@@ -107,6 +108,7 @@ def test_a_view_that_begins_on_this_screen_is_not_wider(visit: Visit, size: str)
         page = operator.go(view)
         wide, screen = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
         assert wide <= screen, (view, page.evaluate(TOO_WIDE))
+        assert page.evaluate(OUT_OF_PANEL) == [], view
 
 
 def test_on_a_phone_the_views_are_behind_a_button(visit: Visit) -> None:
