@@ -144,7 +144,8 @@ def main(
             page, requests = open_page(browser, f"{console}#/maps/lab/plan", ".plan-canvas canvas")
             plan = clock.read()
             rate = float(page.evaluate(PAN, STEPS))
-            page.close()
+            page.context.close()
+            time.sleep(1)  # until its process has ended, whose time would be missing at the end
             clock = Clock(server)
             page, _ = open_page(browser, f"{console}#/maps/two/traverses", ".matrix canvas")
             matrix = clock.read()
