@@ -39,6 +39,10 @@ class Process:
         """The most memory that it has had resident, in MB (10^6 bytes)."""
         return peak_memory(self.pid)
 
+    def processor_time(self) -> float:
+        """The processor time that it has had, in seconds."""
+        return processor_time(self.pid)
+
     def open_files(self) -> int:
         """How many file descriptors it has open."""
         return len(list(Path(f"/proc/{self.pid}/fd").iterdir()))
@@ -52,6 +56,35 @@ def memory(pid: int) -> float:
 def peak_memory(pid: int) -> float:
     """The most memory that a process has had resident, in MB (10^6 bytes); 0 if it has ended."""
     return _status(pid, "VmHWM")
+
+
+def processor_time(pid: int) -> float:
+    """The processor time that a process has had, in seconds; 0 if it has ended."""
+    fields = _stat(pid)
+    return sum(int(field) for field in fields[11:13]) / os.sysconf("SC_CLK_TCK") if fields else 0.0
+
+
+def descendants(pid: int) -> set[int]:
+    """The processes that a process has started, and those that these have."""
+    parents = {int(path.name): _stat(int(path.name)) for path in Path("/proc").iterdir() if path.name.isdigit()}
+    children: dict[int, list[int]] = {}
+    for child, fields in parents.items():
+        if fields:
+            children.setdefault(int(fields[1]), []).append(child)
+    found, waiting = set(), [pid]
+    while waiting:
+        some = children.get(waiting.pop(), [])
+        found.update(some)
+        waiting += some
+    return found
+
+
+def _stat(pid: int) -> list[str]:
+    """The fields of a process from its state on; none if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def _status(pid: int, name: str) -> float:

@@ -94,7 +94,7 @@ def ask(client: httpx.Client, map_id: str, frames: Sequence[Frame]) -> dict[str,
     """The Brier score of a map's answers to frames, and the shares that are recognized and rightly so."""
     squares, recognized, right = [], 0, 0
     for frame in frames:
-        answer = _query(client, map_id, frame.data)
+        answer = query(client, map_id, frame.data)
         best = answer["matches"][0]["place"]["id"] if answer["matches"] else None
         squares.append(((answer["probability"] or 0.0) - (best in frame.places)) ** 2)
         if answer["verdict"] == "recognized":
@@ -108,16 +108,17 @@ def ask(client: httpx.Client, map_id: str, frames: Sequence[Frame]) -> dict[str,
     }
 
 
-def _query(client: httpx.Client, map_id: str, data: bytes) -> dict[str, Any]:
+def query(client: httpx.Client, map_id: str, data: bytes) -> dict[str, Any]:
+    """How a map answers a frame."""
     kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
     response = client.post(f"/v1/maps/{map_id}/query", content=data, headers={"Content-Type": kind})
     answer: dict[str, Any] = response.raise_for_status().json()
     return answer
 
 
-def make_map(client: httpx.Client, map_id: str, of: Walk) -> None:
-    """A map of a walk that keeps every frame for review."""
-    review = {"verdicts": list(KEPT["all"]), "most_frames": 10_000}
+def make_map(client: httpx.Client, map_id: str, of: Walk, verdicts: Sequence[str] = KEPT["all"]) -> None:
+    """A map of a walk that keeps the frames with some verdicts for review."""
+    review = {"verdicts": list(verdicts), "most_frames": 10_000}
     client.post("/v1/maps", json={"id": map_id, "keep": "none", "review": review}).raise_for_status()
     for row, data in enumerate(of.references):
         kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
@@ -150,7 +151,7 @@ def measure(client: httpx.Client, of: Walk, other: Walk) -> list[dict[str, Any]]
         map_id = f"{of.name}-{turn}"
         make_map(client, map_id, of)
         for frame in asked:
-            _query(client, map_id, frame.data)
+            query(client, map_id, frame.data)
         time.sleep(2)  # the last frames are written a moment after their answers
         client.patch(f"/v1/maps/{map_id}", json={"review": None}).raise_for_status()
         for kept, verdicts in KEPT.items():

@@ -28,6 +28,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from core.kernels import paths as kernels
+
 Values = NDArray[np.float64]
 Frames = NDArray[np.int64]
 
@@ -160,7 +162,7 @@ def best_pairs(
     centred -= np.median(centred, axis=0, keepdims=True)
     spread = 1.4826 * float(np.median(np.abs(centred)))  # of a normal distribution, its standard deviation
     columns = np.empty((rows, 0), np.int64)
-    gains = np.empty((rows, 0), np.float64)
+    gains = np.empty((rows, 0), np.float32)
     for start in range(0, others, TILE):
         tile = np.arange(start, min(start + TILE, others))
         found = np.asarray(scores(tile), np.float32) - ordinary
@@ -173,7 +175,7 @@ def best_pairs(
             columns = np.take_along_axis(columns, best, axis=1)
             gains = np.take_along_axis(gains, best, axis=1)
         advance(found.size)
-    return Pairs(columns, gains, others, np.ones(rows, np.bool_))
+    return Pairs(columns, gains.astype(np.float64), others, np.ones(rows, np.bool_))
 
 
 def _stretches(pairs: Pairs) -> Iterator[SharedStretch]:
@@ -192,6 +194,14 @@ def best_path(pairs: Pairs) -> tuple[Frames, float]:
 
     A path goes through columns where its sum is positive; of each row only these are remembered.
     """
+    uneven = UNEVEN * np.abs(np.arange(LARGEST_STEP + 1) - 1.0)
+    columns, gains = np.ascontiguousarray(pairs.columns), np.ascontiguousarray(pairs.gains)
+    path, total = kernels.best_path(columns, gains, pairs.free, pairs.others, ORDINARY, uneven, _BEGINS)
+    return path, float(total)
+
+
+def best_path_by_rows(pairs: Pairs) -> tuple[Frames, float]:
+    """What :func:`best_path` computes, in NumPy."""
     columns, totals = np.empty(0, np.int64), np.empty(0)
     reached: list[tuple[Frames, NDArray[np.int8]]] = []
     best, end = 0.0, (-1, -1)

@@ -14,7 +14,7 @@ import logging
 import sqlite3
 import threading
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -89,6 +89,7 @@ class ReviewFrames:
         self._lock = threading.Lock()
         self._connection: sqlite3.Connection | None = None
         self._closed = False
+        self._held: set[int] = set()
 
     def close(self) -> None:
         """Close the file for good."""
@@ -118,14 +119,14 @@ class ReviewFrames:
             number = cursor.lastrowid
             connection.execute("INSERT INTO pictures VALUES (?, ?)", (number, data))
             _write_seal(connection, number)
-            _drop_oldest(connection, setting)
+            _drop_oldest(connection, setting, self._held)
         return True
 
     def shrink(self, setting: ReviewSetting) -> None:
         """Drop the oldest frames beyond new limits, and give back the room."""
         with self._using() as connection:
             with transaction(connection):
-                _drop_oldest(connection, setting)
+                _drop_oldest(connection, setting, self._held)
             connection.executescript("PRAGMA incremental_vacuum")  # execute() would stop after one page
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
@@ -176,6 +177,18 @@ class ReviewFrames:
             raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
         data: bytes = found[0]
         return data
+
+    @contextmanager
+    def held(self, number: int) -> Iterator[None]:
+        """Have a frame, if it is kept, not dropped for newer ones until the block ends; one at a time may hold it.
+
+        It does not wait for the disk.
+        """
+        self._held.add(number)
+        try:
+            yield
+        finally:
+            self._held.discard(number)
 
     def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
         """Say what a frame shows, in place of what was said before.
@@ -251,8 +264,11 @@ def _drop_unsound(connection: sqlite3.Connection) -> None:
             connection.executemany("DELETE FROM frames WHERE number = ?", unsound)
 
 
-def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting) -> None:
-    """Drop frames, those without a label first and the oldest of these first, until the limits are kept."""
+def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: Container[int]) -> None:
+    """Drop frames, those without a label first and the oldest of these first, until the limits are kept.
+
+    Those that are held stay.
+    """
     count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
     if count <= setting.most_frames and size <= setting.most_bytes:
         return
@@ -260,8 +276,9 @@ def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting) -> None
     for number, bytes_ in connection.execute("SELECT number, size FROM frames ORDER BY label IS NOT NULL, number"):
         if count <= setting.most_frames and size <= setting.most_bytes:
             break
-        going.append((number,))
-        count, size = count - 1, size - bytes_
+        if number not in held:
+            going.append((number,))
+            count, size = count - 1, size - bytes_
     connection.executemany("DELETE FROM frames WHERE number = ?", going)
 
 

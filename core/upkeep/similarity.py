@@ -14,7 +14,7 @@ from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
 
 Rows = NDArray[np.int64]
 
-BLOCK, TILE = 2048, 512
+BLOCK, TILE = 2048, 1024
 """So many descriptors of the shorter and of the longer traverse are in memory at a time."""
 
 NONE = -1

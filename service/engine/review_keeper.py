@@ -1,12 +1,19 @@
-"""Keeps frames for review beside the requests: a thread writes them, and drops those for which there is no time."""
+"""Keeps frames for review beside the requests: a thread writes them, and drops those for which there is no time.
+
+What people say of a frame is said one after the other.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from datetime import datetime
 from typing import Any
+from weakref import WeakValueDictionary
 
 from core.errors import PlacerecError
 from core.storage import Map
@@ -30,6 +37,14 @@ class ReviewKeeper:
         self._closed = False
         self._thread: threading.Thread | None = None
         self.dropped = 0
+        self._turns: WeakValueDictionary[tuple[str, datetime, int], asyncio.Lock] = WeakValueDictionary()
+
+    @asynccontextmanager
+    async def turn(self, map_: Map, number: int) -> AsyncIterator[None]:
+        """Hold the turn to say something of a kept frame of a map; call it on the event loop."""
+        key = (map_.record.id, map_.record.created_at, number)
+        async with self._turns.setdefault(key, asyncio.Lock()):
+            yield
 
     def offer(self, map_: Map, data: bytes, answer: Mapping[str, Any]) -> None:
         """Have a frame kept, if the map's setting still says so when its turn comes.

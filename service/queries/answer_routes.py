@@ -34,6 +34,9 @@ ANSWER_EXAMPLE: dict[str, Any] = {
     "threshold": 0.09,
     "reason": None,
     "matches": [{"place": "p7", "score": 0.41}, {"place": "p8", "score": 0.29}],
+    "camera": "front",
+    "session": None,
+    "frame": None,
     "operation": "query",
     "milliseconds": 21.3,
     "request_id": "565799d7ff8041ac7be3833c12160c09",
@@ -66,6 +69,9 @@ class RecentAnswerView(BaseModel):
     threshold: float
     reason: str | None
     matches: list[RecentMatch] = Field(description="The best five.")
+    camera: str | None = Field(description="The name of the camera that took the frame, if the request named it.")
+    session: str | None = Field(description="The session that the frame belongs to; null: none.")
+    frame: int | None = Field(description="The robot's number of the frame of the session.")
     operation: str | None = Field(description="The operation that asked, such as `query` or `send_frame`.")
     milliseconds: float | None = Field(description="From the arrival of the request; null for a part of a request.")
     request_id: str | None
@@ -80,6 +86,9 @@ class RecentAnswerView(BaseModel):
         return {
             **{name: getattr(answer, name) for name in _SAME},
             "matches": [RecentMatch(place=place, score=score) for place, score in answer.matches],
+            "camera": answer.frame.camera,
+            "session": answer.frame.session,
+            "frame": answer.frame.number,
             "operation": asker.operation,
             "milliseconds": answer.milliseconds.get("total"),
             "request_id": asker.request_id,
@@ -122,15 +131,26 @@ class PlaceMatchList(BaseModel):
 
 
 class LatestParameters(Parameters):
-    """How many answers."""
+    """How many answers, and whose."""
 
     limit: int = Field(default=100, ge=1, le=MOST_OF_MAP, description="Most answers, the latest ones.")
+    camera: str | None = Field(default=None, max_length=128, description="Only answers to frames of this camera.")
+    session: str | None = Field(default=None, max_length=128, description="Only answers to frames of this session.")
+
+    def wants(self, answer: RecentAnswer) -> bool:
+        """Whether an answer is to be listed."""
+        frame = answer.frame
+        return self.camera in (None, frame.camera) and self.session in (None, frame.session)
 
 
 class AnswerParameters(LatestParameters):
     """Which answers."""
 
     verdict: Verdict | None = Field(default=None, description="Only answers with this verdict.")
+
+    def wants(self, answer: RecentAnswer) -> bool:
+        """Whether an answer is to be listed."""
+        return self.verdict in (None, answer.verdict) and super().wants(answer)
 
 
 @router.get("/answers", responses=problem_documentation(errors.StorageFull))
@@ -148,7 +168,7 @@ def list_answers(
     """
     key = map_key(engine.atlas.get(map_id))
     kept = statistics.recent.of_map(key)
-    wanted = [one for one in kept if options.verdict in (None, one.verdict)][: options.limit]
+    wanted = [one for one in kept if options.wants(one)][: options.limit]
     return RecentAnswerList(
         items=[RecentAnswerView(**RecentAnswerView.fields_of(one, principal)) for one in wanted],
         kept=len(kept),
@@ -169,7 +189,8 @@ def list_place_matches(
     map_ = engine.atlas.get(map_id)
     map_.place(place_id)
     key = map_key(map_)
-    found = [(one, rank) for one in statistics.recent.of_map(key) if (rank := one.rank_of(place_id)) is not None]
+    kept = [one for one in statistics.recent.of_map(key) if options.wants(one)]
+    found = [(one, rank) for one in kept if (rank := one.rank_of(place_id)) is not None]
     count = statistics.of_place(key, place_id)
     return PlaceMatchList(
         items=[

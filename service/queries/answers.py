@@ -18,37 +18,44 @@ from service.engine.engine import Engine
 from service.engine.searches import Recognized
 from service.http.routing import FromState, rounded
 from service.places.schemas import PlaceView
+from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import EstimatedPose, Match, QueryAnswer, RivalGroup, ScoreParts, VerificationView
 from service.queries.statistics import QueryStatistics, map_key
 
 StatisticsDep = Annotated[QueryStatistics, Depends(FromState("statistics"))]
 
 
-def counted_answer(engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized) -> QueryAnswer:
+def counted_answer(
+    engine: Engine, statistics: QueryStatistics, map_: Map, recognized: Recognized, frame: AskedFrame
+) -> QueryAnswer:
     """The JSON answer to a frame; it is counted in the service's metrics and in the statistics of the map."""
     if recognized.answer is None:
         answer = blank_answer(map_, recognized.encoded)
     else:
         answer = answer_of(map_, recognized.encoded, recognized.answer)
-    count_answer(engine, statistics, map_, answer)
+    count_answer(engine, statistics, map_, answer, frame)
     return answer
 
 
-def count_answer(engine: Engine, statistics: QueryStatistics, map_: Map, answer: QueryAnswer) -> None:
+def count_answer(
+    engine: Engine, statistics: QueryStatistics, map_: Map, answer: QueryAnswer, frame: AskedFrame
+) -> None:
     """Count an answer in the service's metrics and in the statistics of its map."""
     engine.metrics.observe_answer(map_.record.id, answer.verdict, answer.score)
     if "search" in answer.milliseconds:
         engine.metrics.searches.observe(answer.milliseconds["search"] / 1e3)
-    count_for_map(engine, statistics, map_.record.id, answer)
+    count_for_map(engine, statistics, map_.record.id, answer, frame)
 
 
-def count_for_map(engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer) -> None:
+def count_for_map(
+    engine: Engine, statistics: QueryStatistics, map_id: str, answer: QueryAnswer, frame: AskedFrame
+) -> None:
     """Count an answer in the statistics of its map, and keep it for a while, if the map still exists."""
     with suppress(PlacerecError):  # the map was deleted in the meantime
         key = map_key(engine.atlas.find(map_id))
         best = answer.matches[0].place.id if answer.matches else None
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
-        statistics.recent.add(key, answer)
+        statistics.recent.add(key, answer, frame)
 
 
 def answer_of(map_: Map, encoded: Encoded, found: Answer) -> QueryAnswer:

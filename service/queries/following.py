@@ -8,6 +8,7 @@ from core.storage import Map
 from service.access.audit import ASKER
 from service.engine.engine import Engine
 from service.events.schemas import QueryEvent
+from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import QueryAnswer
 
 REVIEWED = {
@@ -25,11 +26,10 @@ def follow_answer(
     map_: Map,
     answer: QueryAnswer,
     frame: bytes,
-    camera: str | None = None,
-    session: str | None = None,
-    number: int | None = None,
+    asked: AskedFrame,
     file: str | None = None,
     milliseconds: Mapping[str, float] | None = None,
+    review: bool = True,
 ) -> None:
     """Tell the listeners of a map, if it has any, how a frame was answered, and keep the frame if the map says so.
 
@@ -37,13 +37,13 @@ def follow_answer(
 
     Args:
         frame: the bytes of the frame's file; listeners see a picture of it only if the map keeps pictures.
-        camera: the name of the camera that took the frame; None: not known.
-        session, number: the session that the frame belongs to, and the robot's number of it.
+        asked: whose frame it is.
         file: the name of the file part that the frame was.
         milliseconds: of the whole request, where the answer does not say it.
+        review: whether the map may keep the frame.
     """
     record = map_.record
-    is_kept = record.review is not None and answer.verdict in record.review.verdicts
+    is_kept = review and record.review is not None and answer.verdict in record.review.verdicts
     if not is_kept and not engine.events.heard(record.id):
         return
     explanation = answer.explanation
@@ -59,9 +59,9 @@ def follow_answer(
         decision=answer.decision,
         threshold=answer.threshold,
         reason=answer.reason,
-        camera=camera,
-        session=session,
-        frame=number,
+        camera=asked.camera,
+        session=asked.session,
+        frame=asked.number,
         file=file,
         milliseconds={**answer.milliseconds, **(milliseconds or {})},
         revision=answer.revision,

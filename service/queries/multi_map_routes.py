@@ -36,6 +36,7 @@ from service.queries.answers import StatisticsDep, answer_of, blank_answer, coun
 from service.queries.following import follow_answer
 from service.queries.multi_map import MapReport, RigFrame, judge_together, locate_in_maps, match_log_odds
 from service.queries.parameters import MultiMapParameters
+from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import FrameReport, MapAnswer, MapMatch, QueryAnswer, SeveralAnswer
 from service.queries.statistics import QueryStatistics
 from service.worker_threads import in_thread
@@ -81,13 +82,16 @@ async def query_maps(
     together = judge_together(reports)
     recognized = together.best if together.verdict == "recognized" else None
     answers = [_map_answer(request, engine, report) for report in reports]
+    asked = AskedFrame(frames[0].camera)
     for report in reports:
         # Of several maps only the one that recognized the place counts: the frame says nothing about the others.
         if report is recognized or len(reports) == 1:
-            _count_for_health(engine, statistics, report)
+            _count_for_health(engine, statistics, report, asked)
     total = rounded({"total": milliseconds_since(started(request))})
     for report in reports:
-        _tell(engine, report, frames, total)
+        # A frame whose place is recognized is in no doubt for the maps that do not know the place.
+        in_doubt_here = together.verdict != "recognized" or report is recognized
+        _tell(engine, report, frames[0].data, asked, total, in_doubt_here)
     matches = _matches(reports, options.k)
     place = pose = None
     if recognized is not None and recognized.answer is not None:
@@ -191,10 +195,10 @@ def _map_answer(request: Request, engine: Engine, report: MapReport) -> MapAnswe
     )
 
 
-def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport) -> None:
+def _count_for_health(engine: Engine, statistics: QueryStatistics, report: MapReport, asked: AskedFrame) -> None:
     """Count an answer in the statistics of its map."""
     if (found := _whole_answer(report)) is not None:
-        count_for_map(engine, statistics, report.map_id, found[1])
+        count_for_map(engine, statistics, report.map_id, found[1], asked)
 
 
 def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
@@ -207,12 +211,14 @@ def _whole_answer(report: MapReport) -> tuple[Map, QueryAnswer] | None:
     return report.map_, answer_of(report.map_, seen, report.answer)
 
 
-def _tell(engine: Engine, report: MapReport, frames: Sequence[RigFrame], milliseconds: dict[str, float]) -> None:
+def _tell(
+    engine: Engine, report: MapReport, frame: bytes, asked: AskedFrame, milliseconds: dict[str, float], review: bool
+) -> None:
     """Tell the listeners of a map how it answered, and keep the frame for review; of a rig it is the first frame."""
-    keeps = report.map_ is not None and report.map_.record.review is not None
+    keeps = review and report.map_ is not None and report.map_.record.review is not None
     if (keeps or engine.events.heard(report.map_id)) and (found := _whole_answer(report)) is not None:
         map_, answer = found
-        follow_answer(engine, map_, answer, frames[0].data, frames[0].camera, milliseconds=milliseconds)
+        follow_answer(engine, map_, answer, frame, asked, milliseconds=milliseconds, review=review)
 
 
 def _matches(reports: Sequence[MapReport], k: int) -> list[MapMatch]:

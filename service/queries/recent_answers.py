@@ -25,15 +25,29 @@ MapKey = tuple[str, str]
 """The id of a map and the time of its creation: a new map of the same id has answers of its own."""
 
 
+class AskedFrame(NamedTuple):
+    """Whose a frame is that was asked; None where that is not known.
+
+    camera: the name of the camera that took it.
+    session, number: the session that it belongs to, and the robot's number of it.
+    """
+
+    camera: str | None = None
+    session: str | None = None
+    number: int | None = None
+
+
 class RecentAnswer(NamedTuple):
     """What is kept of an answer: no frame and no metadata, whose size nobody bounds.
 
+    frame: whose frame it was.
     matches: ids and scores of the best matches, best first.
     milliseconds: of the answer; its request adds the total when it is done.
     asker: who asked, with which request.
     """
 
     at: datetime
+    frame: AskedFrame
     verdict: Verdict
     probability: float | None
     place: str | None
@@ -48,10 +62,11 @@ class RecentAnswer(NamedTuple):
     asker: Asker
 
     @classmethod
-    def of(cls, answer: QueryAnswer) -> RecentAnswer:
+    def of(cls, answer: QueryAnswer, frame: AskedFrame) -> RecentAnswer:
         """What is kept of an answer that is being given now."""
         return cls(
             datetime.now(UTC),
+            frame,
             answer.verdict,
             answer.probability,
             None if answer.place is None else answer.place.id,
@@ -79,9 +94,9 @@ class RecentAnswers:
         self._count = 0
         self._lock = threading.Lock()
 
-    def add(self, key: MapKey, answer: QueryAnswer) -> None:
+    def add(self, key: MapKey, answer: QueryAnswer, frame: AskedFrame) -> None:
         """Keep an answer of a map."""
-        made = RecentAnswer.of(answer)
+        made = RecentAnswer.of(answer, frame)
         with self._lock:
             of_map = self._kept.get(key)
             if of_map is None:

@@ -38,6 +38,7 @@ from service.queries.explanations import explain_match, scaled_for_drawing
 from service.queries.following import follow_answer
 from service.queries.parameters import QueryParameters
 from service.queries.pictures import ExplanationPictures
+from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import BatchAnswer, BatchAnswers, QueryAnswer
 from service.queries.statistics import map_key
 from service.worker_threads import in_thread
@@ -80,13 +81,14 @@ async def query(
     recognized = await engine.recognize(
         map_, data, deadline, options.k, options.selection(), mask, options.verify, options.camera
     )
-    answer = counted_answer(engine, statistics, map_, recognized)
+    asked = AskedFrame(options.camera)
+    answer = counted_answer(engine, statistics, map_, recognized, asked)
     if options.explain and recognized.answer is not None and recognized.answer.matches:
         encoded = await in_thread(scaled_for_drawing, recognized.encoded)
         answer.explanation = await explain_match(engine, pictures, map_, encoded, recognized.answer, deadline)
     answer.milliseconds |= rounded({"total": milliseconds_since(started(request))})
     request.state.noted = {"map": map_id, "verdict": answer.verdict}
-    follow_answer(engine, map_, answer, data, options.camera)
+    follow_answer(engine, map_, answer, data, asked)
     return answer
 
 
@@ -138,9 +140,10 @@ async def query_batch(
     recognized = await engine.searches.recognize(
         map_, list(encoded.values()), options.k, selection, options.verify, options.camera
     )
+    asked = AskedFrame(options.camera)
     for index, one in zip(encoded, recognized, strict=True):
-        answer = items[index].answer = counted_answer(engine, statistics, map_, one)
-        follow_answer(engine, map_, answer, files[index].data, options.camera, file=files[index].name)
+        answer = items[index].answer = counted_answer(engine, statistics, map_, one, asked)
+        follow_answer(engine, map_, answer, files[index].data, asked, file=files[index].name)
     request.state.noted = {"map": map_id, "frames": len(files)}
     total = rounded({"total": milliseconds_since(started(request))})
     return BatchAnswers(items=items, encoder=map_.record.encoder, milliseconds=total)

@@ -120,21 +120,30 @@ async def label_frame(
     """Say what a kept frame shows: a place of the map, a new place as which it is enrolled, or no place of the map.
 
     Or throw it away. A label that is given again replaces the one before; what was enrolled stays. Labels serve to
-    calibrate the map, with the method `labels`.
+    calibrate the map, with the method `labels`. What is said of one frame at the same time is done one after the other.
     """
     map_ = await engine.map(map_id)
+    async with engine.review_keeper.turn(map_, number):
+        return await _label(engine, map_, number, order, deadline)
+
+
+async def _label(engine: Engine, map_: Map, number: int, order: LabelOrder, deadline: RequestDeadline) -> Labelled:
     if order.discard:
         await in_thread(map_.review.discard, number)
         return Labelled(id=number, discarded=True, frame=None, enrolled=None)
-    enrolled: PlaceView | None = None
+    if order.new is not None:
+        with map_.review.held(number):
+            enrolled = await _enrol(engine, map_, number, order.new, deadline)
+            return await _store(map_, number, {"new": order.new.id}, enrolled)
     label: dict[str, Any] = {"stranger": True}
     if order.place is not None:
         check_place_id(order.place)
         await in_thread(map_.place, order.place)
         label = {"place": order.place}
-    elif order.new is not None:
-        enrolled = await _enrol(engine, map_, number, order.new, deadline)
-        label = {"new": order.new.id}
+    return await _store(map_, number, label)
+
+
+async def _store(map_: Map, number: int, label: dict[str, Any], enrolled: PlaceView | None = None) -> Labelled:
     asker = ASKER.get()
     said = {"label": label, "at": datetime.now(UTC).isoformat(), "by": asker.principal if asker.key else None}
     frame = await in_thread(map_.review.label, number, said)

@@ -18,6 +18,7 @@ from service.http.routing import rounded
 from service.places.schemas import PlaceView
 from service.queries.answers import counted_answer
 from service.queries.following import follow_answer
+from service.queries.recent_answers import AskedFrame
 from service.queries.schemas import QueryAnswer
 from service.queries.statistics import QueryStatistics
 from service.sessions.schemas import (
@@ -73,7 +74,8 @@ async def process_frame(
         recognized = await engine.recognize(
             map_, data, deadline, options.k, session.selection, mask, verify, session.options.camera
         )
-        single = counted_answer(engine, statistics, map_, recognized)
+        asked = AskedFrame(session.options.camera, session.id, options.frame)
+        single = counted_answer(engine, statistics, map_, recognized, asked)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
             answer = await in_thread(
@@ -83,7 +85,7 @@ async def process_frame(
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise
     total = {"total": answer.milliseconds["total"]}
-    follow_answer(engine, map_, single, data, session.options.camera, session.id, options.frame, milliseconds=total)
+    follow_answer(engine, map_, single, data, asked, milliseconds=total)
     tell_belief(engine, map_, session, answer)
     return answer
 

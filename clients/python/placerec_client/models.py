@@ -1110,6 +1110,9 @@ class PlaceMatchView(Model):
     threshold: float
     reason: str | None = None
     matches: list[RecentMatch]
+    camera: str | None = None
+    session: str | None = None
+    frame: int | None = None
     operation: str | None = None
     milliseconds: float | None = None
     request_id: str | None = None
@@ -1188,6 +1191,9 @@ class RecentAnswerView(Model):
     threshold: float
     reason: str | None = None
     matches: list[RecentMatch]
+    camera: str | None = None
+    session: str | None = None
+    frame: int | None = None
     operation: str | None = None
     milliseconds: float | None = None
     request_id: str | None = None

@@ -542,6 +542,12 @@ class ListAnswers(TypedDict, total=False):
     limit: int
     """Most answers, the latest ones."""
 
+    camera: str | None
+    """Only answers to frames of this camera."""
+
+    session: str | None
+    """Only answers to frames of this session."""
+
     verdict: Literal["recognized", "ambiguous", "unknown"] | None
     """Only answers with this verdict."""
 
@@ -551,6 +557,12 @@ class ListPlaceMatches(TypedDict, total=False):
 
     limit: int
     """Most answers, the latest ones."""
+
+    camera: str | None
+    """Only answers to frames of this camera."""
+
+    session: str | None
+    """Only answers to frames of this session."""
 
 
 class Encode(TypedDict, total=False):

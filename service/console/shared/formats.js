@@ -1,10 +1,9 @@
 // How numbers, sizes and times are written; the same everywhere.
 
-const plain = new Intl.NumberFormat("en", { maximumFractionDigits: 0 });
 const NOTHING = "–";
 
 export function integer(value) {
-  return value === null || value === undefined ? NOTHING : plain.format(value).replaceAll(",", "\u202f");
+  return value === null || value === undefined ? NOTHING : String(Math.round(value)).replace(/\B(?=(\d{3})+$)/g, "\u202f");
 }
 
 export function decimal(value, digits = 3) {

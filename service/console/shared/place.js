@@ -99,10 +99,22 @@ function Row({ map, items, present }) {
 }
 
 function Lately({ map, id }) {
-  const matches = useResource((signal) => get(mapPath(map, "places", id, "matches"), { limit: 50 }, { signal }), [map, id], { every: 20_000 });
+  const cameras = useResource((signal) => get(mapPath(map, "cameras"), {}, { signal }), [map]);
+  const [camera, setCamera] = useState("");
+  const matches = useResource((signal) => get(mapPath(map, "places", id, "matches"), { limit: 50, camera }, { signal }), [map, id, camera], { every: 20_000 });
   return html`
     <section class="panel">
-      <h2>What matched it lately</h2>
+      <div class="spread">
+        <h2>What matched it lately</h2>
+        ${cameras.data?.items.length > 0 && html`
+          <${Field} label="Camera" inline>
+            <select value=${camera} onChange=${(event) => setCamera(event.target.value)}>
+              <option value="">all</option>
+              ${cameras.data.items.map(({ name }) => html`<option value=${name}>${name}</option>`)}
+            </select>
+          <//>
+        `}
+      </div>
       <${Shown} resource=${matches}>
         ${({ items, best, recognized, last_at: last }) => html`
           <p class="faint">
@@ -121,7 +133,7 @@ function Answers({ items }) {
   return html`
     <div class="table" tabindex="0" role="region" aria-label="Answers">
       <table>
-        <thead><tr><th>When</th><th>Verdict</th><th class="number">Probability</th><th class="number">Rank</th><th class="number">Score</th><th>Camera</th><th>Asked by</th><th class="number">Took</th></tr></thead>
+        <thead><tr><th>When</th><th>Verdict</th><th class="number">Probability</th><th class="number">Rank</th><th class="number">Score</th><th>Camera</th><th>Session</th><th>Asked by</th><th class="number">Took</th></tr></thead>
         <tbody>
           ${items.map((one) => html`
             <tr>
@@ -131,6 +143,7 @@ function Answers({ items }) {
               <td class="number">${one.rank}</td>
               <td class="number">${decimal(one.score)}</td>
               <td>${one.camera || "–"}</td>
+              <td class="nowrap">${one.session ? html`<span title=${one.session}>${one.session.slice(0, 8)}${one.frame !== null && html` <span class="faint">frame ${integer(one.frame)}</span>`}</span>` : "–"}</td>
               <td>${one.principal || "–"}</td>
               <td class="number">${milliseconds(one.milliseconds)}</td>
             </tr>

@@ -102,7 +102,8 @@ function gapsOf({ traverses, px, py }) {
     const lengths = new Float64Array(places.length - 1);
     for (let one = 0; one < lengths.length; one += 1) {
       const [from, to] = [places[one], places[one + 1]];
-      lengths[one] = Math.hypot(px[to] - px[from], py[to] - py[from]);
+      const [dx, dy] = [px[to] - px[from], py[to] - py[from]];
+      lengths[one] = Math.sqrt(dx * dx + dy * dy);
     }
     const known = lengths.filter((length) => !Number.isNaN(length)).sort();
     const median = known[Math.floor(known.length / 2)];
@@ -134,7 +135,8 @@ export function nearestTo(plan, id, most) {
   if (number === undefined || Number.isNaN(plan.px[number])) return [];
   const found = [];
   for (let one = 0; one < plan.count; one += 1) {
-    const distance = Math.hypot(plan.px[one] - plan.px[number], plan.py[one] - plan.py[number]);
+    const [dx, dy] = [plan.px[one] - plan.px[number], plan.py[one] - plan.py[number]];
+    const distance = Math.sqrt(dx * dx + dy * dy);
     if (one === number || Number.isNaN(distance)) continue;
     if (found.length === most && distance >= found.at(-1).distance) continue;
     found.push({ id: plan.ids[one], distance });

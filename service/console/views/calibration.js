@@ -153,7 +153,7 @@ const ROWS = [
 function Effect({ now, then }) {
   return html`
     <table aria-label="What would change">
-      <thead><tr><th>On the measured frames</th><th class="number">Now</th><th class="number">Then</th><th class="number">Change</th></tr></thead>
+      <thead><tr><th class="wrapped">On the measured frames</th><th class="number">Now</th><th class="number">Then</th><th class="number">Change</th></tr></thead>
       <tbody>
         ${ROWS.map(([name, value, written]) => {
           const [before, after] = [value(now), value(then)];

@@ -152,7 +152,7 @@ function ScaleBar({ scale, strips }) {
   const wanted = 120 / scale;
   const power = 10 ** Math.floor(Math.log10(wanted));
   const length = [5, 2, 1].map((one) => one * power).find((one) => one <= wanted);
-  const text = strips ? `${integer(Math.max(1, length))} frames` : metres(length).replace(/\.0+ /, " ");
+  const text = strips ? counted(Math.max(1, length), "frame") : metres(length).replace(/\.0+ /, " ");
   return html`<span><span>${text}</span><div class="scale-bar" style=${{ width: `${length * scale}px` }}></div></span>`;
 }
 

@@ -18,13 +18,14 @@ export default function Service() {
 
 function State({ data }) {
   const { queue, storage, requests, jobs, sessions, maps, memory, disk, checks } = data;
+  const notReady = requests.operations.find((one) => one.path === "/readyz")?.errors ?? 0; // an answer, not a failure
   const bad = Object.entries(checks).filter(([, told]) => told !== "ok");
   return html`
     ${bad.map(([name, told]) => html`<p class="notice"><strong>${name}</strong>: ${told}</p>`)}
     <dl class="figures panel">
       <${Figure} name="requests, 5 min" value=${integer(requests.count)} />
       <${Figure} name="under way" value=${integer(requests.under_way)} />
-      <${Figure} name="failed (5xx)" value=${integer(requests.errors)} />
+      <${Figure} name="failed (5xx)" value=${integer(requests.errors - notReady)} />
       <${Figure} name="jobs running" value=${integer(jobs.running)} />
       <${Figure} name="jobs waiting" value=${integer(jobs.queued)} />
       <${Figure} name="up" value=${duration(data.uptime_seconds)} />
@@ -81,7 +82,7 @@ function Latencies({ operations }) {
             <tr>
               <td class="long small">${one.method} <code>${one.path}</code></td>
               <td class="number">${integer(one.count)}</td>
-              <td class="number">${one.errors ? html`<span class="pill bad">${integer(one.errors)}</span>` : "0"}</td>
+              <td class="number">${one.errors ? html`<span class=${one.path === "/readyz" ? "" : "pill bad"}>${integer(one.errors)}</span>` : "0"}</td>
               <td class="number">${milliseconds(one.p50)}</td><td class="number">${milliseconds(one.p90)}</td><td class="number">${milliseconds(one.p99)}</td><td class="number">${milliseconds(one.max)}</td>
             </tr>
           `)}

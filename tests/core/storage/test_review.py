@@ -92,6 +92,18 @@ def test_lower_limits_give_back_the_room(tmp_path: Path) -> None:
     assert (tmp_path / FILE).stat().st_size < 500_000
 
 
+def test_a_frame_that_is_held_is_not_dropped_for_newer_ones(tmp_path: Path) -> None:
+    review = frames_at(tmp_path)
+    setting = ReviewSetting(most_frames=2, most_bytes=1 << 20)
+    for number in range(4):
+        with review.held(1):
+            review.keep(bytes([number]), ANSWER, setting)
+    assert [one.number for one in review.page(None, 10)] == [4, 1]
+    review.keep(b"next", ANSWER, setting)
+    assert [one.number for one in review.page(None, 10)] == [5, 4]
+    review.close()
+
+
 def edit(path: Path, statement: str, *values: object) -> None:
     connection = sqlite3.connect(path)
     with connection:

@@ -17,6 +17,14 @@ from tests.service.server import Server
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
+OUT_OF_PANEL = """[...document.querySelectorAll("main .panel")].flatMap((panel) => {
+  const { right } = panel.getBoundingClientRect();
+  return [...panel.querySelectorAll("*")]
+    .filter((one) => one.getBoundingClientRect().right > right && !one.closest(".table, pre"))
+    .map((one) => `${one.tagName}.${one.className} ${one.textContent.slice(0, 40)}`);
+})"""
+"""What a panel does not hold: parts that are wider than it, and not scrolled."""
+
 SIZES = {"phone": (390, 844), "laptop": (1280, 800), "wall": (3840, 2160)}
 
 

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
 from service.access.keys import KeyStore
 from tests.service.console.conftest import Operator, Visit
@@ -202,8 +203,8 @@ def test_the_state_of_the_service_is_shown(admin: Operator, visit: Visit) -> Non
     page.get_by_text("data dir").wait_for()
     other = visit("query").go("service")
     other.get_by_text("Encoder's queue").wait_for()
-    assert other.get_by_text("Memory of the process").count() == 0
-    assert other.get_by_role("button", name="Settings").count() == 0
+    expect(other.get_by_text("Memory of the process")).to_have_count(0)
+    expect(other.get_by_role("button", name="Settings")).to_have_count(0)
 
 
 def test_no_key_and_no_secret_is_in_the_logs(

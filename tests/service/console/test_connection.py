@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from playwright.sync_api import expect
 
 from service.access.keys import KeyStore
 from tests.service.console.conftest import Visit, given_key
@@ -35,7 +36,7 @@ def test_the_console_stays_within_the_rate(visit: Visit, slow: tuple[Server, str
     page = operator.go("maps/lab/places")
     pictures = page.locator(".thumbs img")
     pictures.nth(14).wait_for(timeout=19_000)
-    assert page.locator(".trouble").count() == 0
+    expect(page.locator(".trouble")).to_have_count(0)
 
 
 def test_a_lost_connection_is_said_and_mended_without_reloading(visit: Visit, slow: tuple[Server, str]) -> None:

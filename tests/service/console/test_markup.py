@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.service.console.conftest import Operator
 from tests.service.console.world import LAB, frame
@@ -18,7 +20,7 @@ MARKUP = "<img src=x onerror=\"window.pwned=1\"><b id='pwned'>&amp;</b>"
 def check_plain(operator: Operator, text: str = MARKUP) -> None:
     """The text stands in the page as it is, and made no element."""
     operator.page.get_by_text(text, exact=False).first.wait_for(state="attached")
-    assert operator.page.locator("#pwned").count() == 0
+    expect(operator.page.locator("#pwned")).to_have_count(0)
     assert operator.page.evaluate("window.pwned") is None
 
 
@@ -46,14 +48,15 @@ def test_descriptions(admin: Operator, hostile: str) -> None:
     page = admin.go("maps")
     check_plain(admin)
     page.get_by_role("button", name=f"Edit {hostile}").click()
-    assert page.get_by_role("dialog").get_by_label("Description").input_value() == MARKUP
+    expect(page.get_by_role("dialog").get_by_label("Description")).to_have_value(MARKUP)
 
 
 def test_names_and_values_of_metadata(admin: Operator, hostile: str) -> None:
     page = admin.go(f"maps/{hostile}/places/p0")
     check_plain(admin)
     page.get_by_role("button", name="Edit").click()
-    assert MARKUP.replace('"', '\\"') in page.get_by_role("dialog").get_by_label("Metadata").input_value()
+    written = re.compile(re.escape(MARKUP.replace('"', '\\"')))
+    expect(page.get_by_role("dialog").get_by_label("Metadata")).to_have_value(written)
 
 
 @pytest.mark.parametrize("view", ["plan", "places", "traverses", "try", "calibration", "health"])
@@ -61,7 +64,8 @@ def test_names_of_traverses(admin: Operator, hostile: str, view: str) -> None:
     admin.go(f"maps/{hostile}/{view}")
     if view in ("plan", "places", "traverses"):
         check_plain(admin, MARKUP.replace("/", "|"))
-    assert admin.page.locator("#pwned").count() == 0 and admin.page.evaluate("window.pwned") is None
+    expect(admin.page.locator("#pwned")).to_have_count(0)
+    assert admin.page.evaluate("window.pwned") is None
 
 
 def test_names_of_files(admin: Operator, tmp_path: Path) -> None:
@@ -73,7 +77,7 @@ def test_names_of_files(admin: Operator, tmp_path: Path) -> None:
     page.get_by_role("region", name="Frames", exact=True).locator(".verdict").first.wait_for()
     check_plain(admin, name)
     page.get_by_role("button", name=name).click()
-    assert "<b id=" in page.get_by_label("The same request", exact=True).inner_text()
+    expect(page.get_by_label("The same request", exact=True)).to_contain_text("<b id=")
 
 
 def test_texts_of_problems_and_of_addresses(admin: Operator) -> None:
@@ -84,7 +88,7 @@ def test_texts_of_problems_and_of_addresses(admin: Operator) -> None:
     check_plain(admin, "<b id='pwned'>x")
     page.goto(f"{admin.root}/console#/%3Cb%20id='pwned'%3E")
     page.get_by_text("There is no such view").wait_for()
-    assert page.locator("#pwned").count() == 0
+    expect(page.locator("#pwned")).to_have_count(0)
 
 
 def test_reasons_that_the_service_gives(admin: Operator, keyed: Server) -> None:
@@ -99,7 +103,7 @@ def test_reasons_that_the_service_gives(admin: Operator, keyed: Server) -> None:
     admin.page.route("**/v1/jobs*", lambda route: route.fulfill(status=418, json=problem))
     admin.page.goto(f"{admin.root}/console#/jobs")
     check_plain(admin)
-    assert admin.page.get_by_role("alert").inner_text().count(MARKUP) >= 4
+    expect(admin.page.get_by_role("alert")).to_contain_text(re.compile("(.*" + re.escape(MARKUP) + "){4}", re.DOTALL))
 
 
 def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
@@ -116,3 +120,29 @@ def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
     check_plain(admin)
     admin.go("audit")
     check_plain(admin)
+
+
+def test_names_that_kept_frames_and_recent_answers_may_bring(admin: Operator, keyed: Server) -> None:
+    answer = {"verdict": "unknown", "reason": MARKUP, "probability": 0.1, "score": 0.1, "decision": 0.1}
+    answer |= {"threshold": 0.2, "best": MARKUP, "matches": [{"place": MARKUP, "score": 0.1}], "revision": 1}
+    answer |= dict.fromkeys(("camera", "session", "file", "operation", "request_id", "key"), MARKUP)
+    kept = {"id": 1, "at": "2026-11-20T10:00:00Z", "sha256": "0", "bytes": 1, "answer": answer}
+    kept |= {"label": {"place": MARKUP, "new": None, "stranger": False}, "labelled_at": None, "labelled_by": MARKUP}
+    page = admin.page
+    page.route(
+        "**/review?*", lambda route: route.fulfill(json={"items": [kept], "next_cursor": None, "frames": 1, "bytes": 1})
+    )
+    found = {"at": "2026-11-20T10:00:00Z", "rank": 1, "frame": 7, "milliseconds": 1, "principal": MARKUP, **answer}
+    told = {"items": [found], "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
+    page.route("**/matches?*", lambda route: route.fulfill(json=told))
+    cameras = {"items": [{"name": MARKUP, "mask": None}], "next_cursor": None}
+    page.route("**/cameras", lambda route: route.fulfill(json=cameras))
+    admin.foresee("404", "422")  # there are no such pictures
+    admin.go(f"maps/{LAB}/review")
+    check_plain(admin)
+    for text in ("Camera", "Session", "Reason", "By"):
+        expect(page.get_by_role("region", name="Frame to be labelled")).to_contain_text(text + MARKUP)
+    admin.go(f"maps/{LAB}/places/monday-03")
+    row = page.get_by_role("region", name="Answers").get_by_role("row").nth(1)
+    expect(row).to_contain_text(MARKUP)
+    check_plain(admin, MARKUP[:8])

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.service.console import world
 from tests.service.console.conftest import Operator, Visit
@@ -57,7 +58,7 @@ def test_frames_are_labelled_in_every_way(visit: Visit, keyed: Server, doubtful:
     operator = visit("enrol")
     page = operator.go(f"maps/{doubtful}/review")
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
-    assert queue.count() == 3
+    expect(queue).to_have_count(3)
     panel = page.get_by_role("region", name="Frame to be labelled")
     assert (
         panel.get_by_role("img", name="The frame").evaluate("one => one.decode().then(() => one.naturalWidth)") == 320
@@ -98,10 +99,10 @@ def test_a_frame_that_is_thrown_away_can_be_taken_back_for_a_while(
     queue = page.get_by_role("list", name="Frames").get_by_role("listitem")
     page.get_by_role("button", name="Throw away").click()
     page.get_by_text("The frame is thrown away.").wait_for()
-    assert queue.count() == 2
+    expect(queue).to_have_count(2)
     page.get_by_role("button", name="Undo").click()
     page.get_by_text("The frame is thrown away.").wait_for(state="detached")
-    assert queue.count() == 3
+    expect(queue).to_have_count(3)
     page.get_by_role("button", name="Throw away").click()
     page.get_by_role("link", name="Places").click()  # whoever goes on means it
     page.get_by_role("heading", name="Places").wait_for()
@@ -129,8 +130,7 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     keyed.client.patch("/v1/maps/day", json={"review": KEPT})
     asked = [encoded(seen_again(scene(number), seed=200 + number)) for number in range(world.PLACES)]
     asked += [world.foreign_frame(3000 + number) for number in range(world.PLACES)]
-    for data in asked:
-        keyed.query("day", data)
+    stated = [keyed.query("day", data)["probability"] for data in asked]
     wait_for_kept(keyed, "day", len(asked))
 
     # Each frame is labelled: by its best match where that is right, as a stranger otherwise.
@@ -158,6 +158,17 @@ def test_an_operators_day(admin: Operator, keyed: Server, tmp_path: Path) -> Non
     before.wait_for(state="detached")
     page.get_by_role("img", name=re.compile("Reliability diagram")).wait_for()
     assert keyed.client.get("/v1/maps/day").json()["calibration"]["source"] == "labels"
+
+    # The frame that was least certain is now as probable as the labels say.
+    doubted = min(range(len(asked)), key=lambda number: abs(stated[number] - 0.5))
+    (tmp_path / "frame.jpg").write_bytes(asked[doubted])
+    page = admin.go("maps/day/try")
+    page.get_by_label("Pictures").set_input_files(tmp_path / "frame.jpg")
+    answer = page.get_by_role("region", name="Answer")
+    answer.locator(".verdict").first.wait_for()
+    now = keyed.query("day", asked[doubted])["probability"]
+    assert f"{now:.1%}" != f"{stated[doubted]:.1%}"
+    expect(answer).to_contain_text(f"{100 * now:.1f}\u00a0%")
 
     # It is pruned, and saved.
     page = admin.go("maps/day/health")

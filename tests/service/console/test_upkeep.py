@@ -8,14 +8,14 @@ from collections.abc import Iterator
 import pytest
 
 from tests.service.console import world
-from tests.service.console.conftest import Operator, Visit
+from tests.service.console.conftest import OUT_OF_PANEL, Operator, Visit
 from tests.service.server import Server
 
 
 @pytest.fixture(scope="module")
 def yard(keyed: Server) -> Iterator[str]:
     """Another map of the drawn world, which these tests calibrate and align."""
-    world.fill(keyed, "yard")
+    world.copy(keyed, "yard")
     yield "yard"
     keyed.client.delete("/v1/maps/yard")
 
@@ -51,6 +51,9 @@ def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(
     assert keyed.client.post(f"/v1/maps/{yard}/calibrate", json=order).status_code == 200
     before = keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]
     page = admin.go(f"maps/{yard}/calibration")
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.get_by_role("table", name="What would change").wait_for()
+    assert page.evaluate(OUT_OF_PANEL) == []
     slider = page.get_by_role("slider", name=re.compile("Threshold"))
     slider.focus()
     page.keyboard.press("End")
@@ -125,7 +128,7 @@ def test_a_traverse_is_deleted_by_its_name(admin: Operator, keyed: Server) -> No
 
 
 def test_health_is_examined_and_a_map_pruned(admin: Operator, keyed: Server) -> None:
-    world.fill(keyed, "pruned")
+    world.copy(keyed, "pruned")
     page = admin.go("maps/pruned/health")
     page.get_by_text("The map has not been queried yet.").wait_for()
     prune = page.get_by_role("region", name="Prune")

@@ -7,11 +7,12 @@ import time
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Route, expect
+from playwright.sync_api import Page, Route, expect
 
-from tests.service.console.conftest import Operator, Theme, Visit
+from tests.service.console.conftest import OUT_OF_PANEL, SIZES, Operator, Visit
 from tests.service.console.world import LAB
 from tests.service.server import Server
+from tests.service.wire import eventually
 
 OF_MAP = {
     "plan": (LAB, "query"),
@@ -42,36 +43,52 @@ def open_to(role: str, needed: str) -> bool:
     return LEVELS.index(role) >= LEVELS.index(needed)
 
 
-@pytest.mark.parametrize("role", LEVELS)
+@pytest.mark.parametrize("role", LEVELS[:2])
 def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) -> None:
     operator = visit(role)
+    changes = "Create|Delete|Edit|Forget|Import|Export|Calibrate|Apply"
+    refused = (
+        f"^({changes}|Align|What would alignment)" if role == "query" else "^(Create|Import|Export$|Calibrate|Apply)"
+    )
     for view, (title, needed) in VIEWS.items():
         page = operator.go(view)
-        heading = page.get_by_role("heading", level=1)
-        assert heading.inner_text() == (title if open_to(role, needed) else "Not for this key"), view
-    links = page.get_by_role("navigation", name="Views").get_by_role("link").all_inner_texts()
-    assert ("Keys" in links) == (role == "admin") and ("Health" in links) == (role != "query")
-    assert page.locator(".identity").inner_text().startswith(f"{role}-key")
-
-
-def test_a_query_key_is_offered_nothing_that_it_may_not_do(visit: Visit) -> None:
-    operator = visit("query")
-    for view in VIEWS:
-        page = operator.go(view)
+        expect(page.get_by_role("heading", level=1)).to_have_text(
+            title if open_to(role, needed) else "Not for this key"
+        )
         names = page.locator("main").get_by_role("button").all_inner_texts()
-        refused = r"^(Create|Delete|Edit|Forget|Import|Export|Calibrate|Apply|Align|What would alignment)"
         assert [name for name in names if re.match(refused, name)] == [], view
-        assert page.locator("main .danger").count() == 0, view
+        if role == "query":
+            expect(page.locator("main .danger")).to_have_count(0)
+    links = page.get_by_role("navigation", name="Views").get_by_role("link").all_inner_texts()
+    assert "Keys" not in links and ("Health" in links) == (role == "enrol")
+    expect(page.locator(".identity")).to_contain_text(re.compile(f"^{role}-key"))
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("group", ["map", "service"])
-def test_axe_finds_nothing_serious(visit: Visit, theme: Theme, group: str) -> None:
-    operator = visit("admin", theme=theme)
-    for view in VIEWS:
-        if view.startswith(f"maps/{LAB}/") == (group == "map"):
-            operator.go(view)
-            check_with_axe(operator, view)
+def test_an_admin_sees_every_view_in_light_and_dark_on_any_screen(visit: Visit, group: str) -> None:
+    operator = visit("admin")
+    for view, (title, _) in VIEWS.items():
+        if view.startswith(f"maps/{LAB}/") != (group == "map"):
+            continue
+        page = operator.go(view)
+        expect(page.get_by_role("heading", level=1)).to_have_text(title)
+        check_with_axe(operator, view)
+        page.emulate_media(color_scheme="dark")
+        check_with_axe(operator, f"{view}, dark")
+        page.emulate_media(color_scheme="light")
+        for size, (width, height) in SIZES.items():
+            page.set_viewport_size({"width": width, "height": height})
+            check_width(page, f"{view}, {size}")
+        page.set_viewport_size({"width": SIZES["laptop"][0], "height": SIZES["laptop"][1]})
+    expect(page.get_by_role("navigation", name="Views").get_by_role("link", name="Keys")).to_have_count(1)
+    expect(page.locator(".identity")).to_contain_text(re.compile("^admin-key"))
+
+
+def check_width(page: Page, where: str) -> None:
+    """Fail if the page, or a part of a panel, does not become as narrow as it has to."""
+    fits = "document.documentElement.scrollWidth <= innerWidth"
+    done = eventually(lambda: page.evaluate(fits) and page.evaluate(OUT_OF_PANEL) == [], seconds=10)
+    assert done, (where, page.evaluate(TOO_WIDE), page.evaluate(OUT_OF_PANEL))
 
 
 def check_with_axe(operator: Operator, where: str) -> None:
@@ -85,13 +102,16 @@ def check_with_axe(operator: Operator, where: str) -> None:
     assert serious == [], where
 
 
-@pytest.mark.parametrize("size", ["phone", "laptop", "wall"])
-def test_no_view_is_wider_than_the_screen(visit: Visit, size: str) -> None:
+@pytest.mark.parametrize("size", ["phone", "wall"])
+def test_a_view_that_begins_on_this_screen_is_not_wider(visit: Visit, size: str) -> None:
     operator = visit("admin", size=size)
-    for view in VIEWS:
+    for view in (
+        f"maps/{LAB}/plan",
+        f"maps/{LAB}/traverses",
+        f"maps/{LAB}/calibration",
+    ):  # these draw as wide as they are
         page = operator.go(view)
-        wide, screen = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-        assert wide <= screen, (view, page.evaluate(TOO_WIDE))
+        check_width(page, view)
 
 
 def test_on_a_phone_the_views_are_behind_a_button(visit: Visit) -> None:
@@ -114,9 +134,9 @@ def test_light_and_dark_follow_the_system_until_one_is_chosen(visit: Visit) -> N
     assert dark != light
     page.reload()
     operator.settle()
-    assert page.evaluate(ground) == light
+    assert eventually(lambda: page.evaluate(ground) == light)
     page.get_by_text("auto", exact=True).click()
-    assert page.evaluate(ground) == dark
+    assert eventually(lambda: page.evaluate(ground) == dark)
 
 
 def late(route: Route) -> None:
@@ -127,7 +147,7 @@ def late(route: Route) -> None:
 def test_everything_is_reached_by_keyboard(admin: Operator) -> None:
     page = admin.go("maps")
     page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.textContent") == "Skip to the content"
+    expect(page.get_by_role("link", name="Skip to the content")).to_be_focused()
     button = page.get_by_role("button", name=f"Edit {LAB}")
     button.focus()
     page.route(f"**/v1/maps/{LAB}", late)  # one dialog follows another
@@ -151,8 +171,8 @@ def test_a_service_without_keys_needs_none(visit: Visit, server: Server, travers
 
 def test_a_view_that_is_not_there_says_so(admin: Operator) -> None:
     page = admin.go("nowhere")
-    assert page.get_by_role("heading", level=1).inner_text() == "There is no such view"
+    expect(page.get_by_role("heading", level=1)).to_have_text("There is no such view")
     admin.foresee("404")
     page.goto(f"{admin.root}/console#/maps/gone/plan")
     page.get_by_role("alert").get_by_text("There is no map 'gone'.").wait_for()
-    assert re.search(r"Request [0-9a-f]{32}", page.get_by_role("alert").inner_text())
+    expect(page.get_by_role("alert")).to_contain_text(re.compile(r"Request [0-9a-f]{32}"))

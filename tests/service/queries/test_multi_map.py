@@ -11,6 +11,7 @@ import pytest
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again, stranger
 from tests.service.server import Server, assert_item_problem, assert_problem, text, typed
+from tests.service.wire import eventually
 
 HALL, YARD = range(8), range(20, 28)
 
@@ -45,6 +46,27 @@ def ask(server: Server, data: bytes, **parameters: object) -> dict[str, Any]:
     assert response.status_code == 200, response.text
     answer: dict[str, Any] = response.json()
     return answer
+
+
+def reviewed(server: Server, map_id: str, frames: int) -> list[str]:
+    """The verdicts of a map's kept frames, as soon as there are so many."""
+    assert eventually(lambda: server.client.get(f"/v1/maps/{map_id}/review").json()["frames"] >= frames)
+    return [one["answer"]["verdict"] for one in server.client.get(f"/v1/maps/{map_id}/review").json()["items"]]
+
+
+def test_a_frame_that_one_map_recognizes_is_kept_for_review_by_no_other(fleet: Server) -> None:
+    every = {"review": {"verdicts": ["recognized", "ambiguous", "unknown"]}}
+    for name in ("hall", "yard"):
+        assert fleet.client.patch(f"/v1/maps/{name}", json=every).is_success
+    try:
+        known, foreign = again(3), encoded(stranger(900))
+        assert ask(fleet, known, maps="hall,yard")["map"] == "hall"
+        assert ask(fleet, foreign, maps="hall,yard")["verdict"] == "unknown"
+        assert reviewed(fleet, "hall", 2) == ["unknown", "recognized"]
+        assert reviewed(fleet, "yard", 1) == ["unknown"], "the frame of the hall is in no doubt"
+    finally:
+        for name in ("hall", "yard"):
+            fleet.client.patch(f"/v1/maps/{name}", json={"review": None})
 
 
 def ask_rig(server: Server, frames: dict[str, bytes], **fields: object) -> dict[str, Any]:

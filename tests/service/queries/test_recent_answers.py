@@ -9,7 +9,7 @@ import pytest
 
 from service.access.keys import KeyStore
 from service.queries import recent_answers
-from service.queries.recent_answers import MapKey, RecentAnswers
+from service.queries.recent_answers import AskedFrame, MapKey, RecentAnswers
 from service.queries.schemas import QueryAnswer
 from tests.service.scenes import blank, encoded, jpeg, stranger
 from tests.service.server import Server, assert_problem
@@ -54,6 +54,35 @@ def test_the_latest_answers_and_the_mix_of_the_day(server: Server, map_id: str) 
     wanted = [item for item in found["items"] if "p1" in [match["place"] for match in item["matches"]]]
     assert [{name: value for name, value in item.items() if name != "rank"} for item in lately["items"]] == wanted
     assert lately["items"][-1]["rank"] == 1 and lately["best"] >= 2 and lately["recognized"] >= 1 and lately["last_at"]
+
+
+def test_an_answer_knows_camera_and_session(server: Server, map_id: str) -> None:
+    for number in range(3):
+        server.enrol(map_id, f"p{number}", jpeg(number), x=3 * number, y=0, heading=90)
+    maps = f"/v1/maps/{map_id}"
+    for name in ("front", "left"):
+        mask = {"mask": {"polygons": [[[0, 0.9], [1, 0.9], [1, 1], [0, 1]]]}}
+        assert server.client.put(f"{maps}/cameras/{name}", json=mask).is_success
+    session = server.client.post(f"{maps}/sessions", json={"camera": "left"}).json()["id"]
+    picture = {"Content-Type": "image/jpeg"}
+    form = {"a": ("a", jpeg(0), "image/jpeg")}
+    for path, parameters in ((f"{maps}/query", {"camera": "front"}), (f"{maps}/query", {})):
+        assert server.client.post(path, params=parameters, content=jpeg(1), headers=picture).is_success
+    frames = f"{maps}/sessions/{session}/frames"
+    assert server.client.post(frames, params={"frame": "7"}, content=jpeg(1), headers=picture).is_success
+    assert server.client.post(f"{maps}/query:batch", params={"camera": "left"}, files=form).is_success
+    both = {"maps": map_id, "camera": "front"}
+    assert server.client.post("/v1/query", params=both, content=jpeg(1), headers=picture).is_success
+
+    def listed(path: str = "answers", **parameters: str) -> list[tuple[str | None, str | None, int | None]]:
+        items = server.client.get(f"{maps}/{path}", params=parameters).json()["items"]
+        return [(one["camera"], one["session"], one["frame"]) for one in items]
+
+    one, of_session, other = ("front", None, None), ("left", session, 7), ("left", None, None)
+    assert listed() == [one, other, of_session, (None, None, None), one]
+    assert listed(camera="left") == [other, of_session] and listed(session=session) == [of_session]
+    assert listed("places/p1/matches", camera="front") == [one, one]
+    assert listed("places/p1/matches", session=session) == [of_session]
 
 
 def test_what_does_not_fit_is_refused(server: Server, map_id: str) -> None:
@@ -116,12 +145,12 @@ def test_the_answers_of_all_maps_together_are_bounded(monkeypatch: pytest.Monkey
     maps: list[MapKey] = [(f"map-{number}", "then") for number in range(4)]
     for one in (maps[0], maps[1], maps[0]):
         for _ in range(20):
-            kept.add(one, ANSWER)
+            kept.add(one, ANSWER, AskedFrame())
     assert [len(kept.of_map(one)) for one in maps] == [10, 10, 0, 0]
     for _ in range(6):
-        kept.add(maps[2], ANSWER)
+        kept.add(maps[2], ANSWER, AskedFrame())
     assert [len(kept.of_map(one)) for one in maps] == [10, 0, 6, 0], "those of the map asked least recently went"
     for _ in range(100):
-        kept.add(maps[3], ANSWER)
+        kept.add(maps[3], ANSWER, AskedFrame())
     assert [len(kept.of_map(one)) for one in maps] == [0, 0, 6, 10]
     assert kept._count == sum(len(kept.of_map(one)) for one in maps)

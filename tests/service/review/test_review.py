@@ -6,6 +6,7 @@ import hashlib
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +156,32 @@ def test_frames_are_labelled_enrolled_and_thrown_away(reviewed: Server, lab: str
     assert len(kept(reviewed, lab, 3, labelled="true")) == 3
     label(reviewed, lab, ids[0], stranger=True)
     assert reviewed.client.get(f"/v1/maps/{lab}/review/labels").json()["items"][0]["place"] is None
+
+
+def test_a_frame_is_not_thrown_away_while_it_is_enrolled(reviewed: Server, lab: str) -> None:
+    for number in range(6):
+        reviewed.query(lab, encoded(stranger(300 + number)))
+    ids = sorted(one["id"] for one in kept(reviewed, lab, 6))
+
+    def say(order: tuple[int, dict[str, Any]]) -> int:
+        return reviewed.client.post(f"/v1/maps/{lab}/review/{order[0]}", json=order[1]).status_code
+
+    orders = [(one, said) for one in ids for said in ({"new": {"id": f"f{one}"}}, {"discard": True})]
+    with ThreadPoolExecutor(len(orders)) as threads:
+        told = list(threads.map(say, orders))
+    there = reviewed.places(lab)
+    for one, enrolled, discarded in zip(ids, told[::2], told[1::2], strict=True):
+        assert discarded == 200 and enrolled in (200, 404)
+        assert (f"f{one}" in there) == (enrolled == 200), "a frame that was gone is not enrolled"
+    assert kept(reviewed, lab, 0) == []
+
+
+def test_an_edit_that_is_stored_is_no_error_although_frames_stay(reviewed: Server) -> None:
+    reviewed.create_map("unreadable")
+    (reviewed.data_dir / "maps" / "unreadable" / "review.sqlite").mkdir()  # no file can be opened there
+    edited = reviewed.client.patch("/v1/maps/unreadable", json={"review": {"most_frames": 1}})
+    assert edited.status_code == 200 and edited.json()["review"]["most_frames"] == 1, edited.text
+    assert "kept frames beyond the new limits stay" in reviewed.log_file.read_text()
 
 
 def test_bad_labels_are_refused_and_change_nothing(reviewed: Server, lab: str) -> None:
