@@ -15,9 +15,8 @@ from typing import Any, Protocol, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from core.frames.intrinsics import Intrinsics
-from core.frames.masks import Mask
 from core.geometry.keypoints import Keypoints
+from core.maps.cameras import KnownCameras
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import Change, Enrolment, MapRecord, MapSettings, Outline, SameFrame
 from core.maps.selection import Selection
@@ -114,20 +113,6 @@ class Snapshot(Protocol):
         """The places of some rows, bool [rows], as a scope without a prior; only living rows count."""
 
 
-class Cameras(Protocol):
-    """The cameras of a map."""
-
-    def mask(self, name: str | None) -> Mask | None:
-        """What to ignore in a frame of a camera; None without a name.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """
-
-    def intrinsics(self, name: str | None) -> Intrinsics | None:
-        """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name."""
-
-
 class Outlines(Protocol):
     """Lists all places of a map in brief."""
 
@@ -147,7 +132,7 @@ class Map(Protocol):
         """The map's record as of its last edit."""
 
     @property
-    def cameras(self) -> Cameras:
+    def cameras(self) -> KnownCameras:
         """The cameras of the map."""
 
     @property

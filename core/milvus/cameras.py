@@ -12,12 +12,12 @@ from psycopg import Connection
 from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.storage.cameras import MOST_CAMERAS, CameraRecord
+from core.maps.cameras import MOST_CAMERAS, CameraRecord, KnownCameras
 
 Access = Callable[[], AbstractContextManager[Connection[Any]]]
 
 
-class MilvusCameras:
+class MilvusCameras(KnownCameras):
     """All cameras of one map.  Any thread may use it.
 
     Args:
@@ -34,34 +34,12 @@ class MilvusCameras:
             found = connection.execute("SELECT record FROM cameras WHERE map = %s ORDER BY name", (self._map,))
             return [CameraRecord.model_validate_json(text) for (text,) in found]
 
-    def _find(self, name: str) -> CameraRecord | None:
+    def known(self, name: str) -> CameraRecord | None:
+        """One camera; None if the map has none of this name."""
         with self._reading() as connection:
             query = "SELECT record FROM cameras WHERE map = %s AND name = %s"
             found = connection.execute(query, (self._map, name)).fetchone()
         return None if found is None else CameraRecord.model_validate_json(found[0])
-
-    def find(self, name: str) -> CameraRecord:
-        """One camera.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """
-        if (found := self._find(name)) is None:
-            raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
-        return found
-
-    def mask(self, name: str | None) -> Mask | None:
-        """What to ignore in a frame of a camera; None without a name.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """
-        return None if name is None else self.find(name).mask
-
-    def intrinsics(self, name: str | None) -> Intrinsics | None:
-        """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name."""
-        found = None if name is None else self._find(name)
-        return None if found is None else found.intrinsics
 
     def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
         """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.

@@ -9,37 +9,22 @@ from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel
 
 from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.places import Camera, Timestamp
+from core.maps.cameras import MOST_CAMERAS, CameraRecord, KnownCameras
 from core.storage.database import row_checksums
 from core.storage.database.ledger import moment_text
 from core.storage.writing import Write
-
-MOST_CAMERAS = 256
-"""Cameras of one map."""
-
-
-class CameraRecord(BaseModel):
-    """One camera."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: Camera
-    mask: Mask | None = Field(description="What to ignore in its frames; null: nothing.")
-    intrinsics: Intrinsics | None = Field(default=None, description="Of its upright frames; null: not known.")
-    updated_at: Timestamp
-
 
 Connected = TypeVar("Connected")
 Access = Callable[[], AbstractContextManager[Connected]]
 
 
-class Cameras:
+class Cameras(KnownCameras):
     """All cameras of one map, which are few and needed by every frame, so they stay in memory.  Any thread may use it.
 
     Every method may raise what ``reading`` and ``writing`` raise.
@@ -59,32 +44,9 @@ class Cameras:
         """All cameras by name."""
         return sorted(self._records().values(), key=lambda camera: camera.name)
 
-    def find(self, name: str) -> CameraRecord:
-        """One camera.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """
-        found = self._records().get(name)
-        if found is None:
-            raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
-        return found
-
-    def mask(self, name: str | None) -> Mask | None:
-        """What to ignore in a frame of a camera; None without a name.
-
-        Raises:
-            UnknownCamera: the map has none of this name.
-        """
-        return None if name is None else self.find(name).mask
-
-    def intrinsics(self, name: str | None) -> Intrinsics | None:
-        """The intrinsics of a camera; None if they are not known, if the map has no such camera, or without a name.
-
-        A place may name a camera that was forgotten since.
-        """
-        found = None if name is None else self._records().get(name)
-        return None if found is None else found.intrinsics
+    def known(self, name: str) -> CameraRecord | None:
+        """One camera; None if the map has none of this name."""
+        return self._records().get(name)
 
     def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
         """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.

@@ -18,12 +18,12 @@ from core.disk.files import Damage, sync_file, sync_folder
 from core.disk.sqlite_file import transaction
 from core.errors import InvalidArchive, InvalidField, InvalidImage, InvalidKeypoints
 from core.geometry.keypoints import MOST, keypoints_of, record_bytes
+from core.maps.cameras import MOST_CAMERAS
 from core.maps.records import MapRecord
 from core.places import NO_SEQUENCE
 from core.storage.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
 from core.storage.archives.manifest import Manifest, Part
 from core.storage.archives.reading import Archive, PartReader
-from core.storage.cameras import MOST_CAMERAS
 from core.storage.database import keypoints, ledger, row_checksums
 from core.storage.database.connections import FILE, connect
 from core.storage.database.ledger import moment_text, segment_entries
