@@ -30,13 +30,15 @@ def free_port() -> int:
 
 
 class Server:
-    """``placerec serve`` in a process of its own, forked off one that has imported everything unless it is wrapped.
+    """``placerec serve`` in a process of its own.
 
     Args:
         folder: for its data and its log.
         settings: names without the prefix, such as ``{"queue_length": 1}``.
         wrapper: words before the command, such as those of strace.
         key: that the client sends.
+        forked: start it off a process that has imported everything; not if it has a wrapper, or has to be where this
+            process is, as in a network of its own.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class Server:
         settings: Mapping[str, object] | None = None,
         wrapper: Sequence[str] = (),
         key: str | None = None,
+        forked: bool = True,
     ) -> None:
         self.folder, self.port, self.key = folder, free_port(), key
         self.data_dir, self.log_file = folder / "data", folder / "log.jsonl"
@@ -53,7 +56,7 @@ class Server:
         own = {"host": "127.0.0.1", "port": self.port, "data_dir": self.data_dir, **(settings or {})}
         environment |= {f"PLACEREC_{name.upper()}": str(value) for name, value in own.items()}
         self.process: ForkedServer | subprocess.Popen[bytes]
-        if wrapper:
+        if wrapper or not forked:
             command = [*wrapper, sys.executable, "-m", "service.commands", "serve"]
             with self.log_file.open("ab") as log:
                 self.process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=log, stderr=log)

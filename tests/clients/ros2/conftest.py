@@ -33,7 +33,7 @@ def site(network: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Si
     folder = tmp_path_factory.mktemp("site")
     store = KeyStore(folder / "service" / "data")
     keys = {role: store.create(role, role)[1] for role in ("query", "enrol", "admin")}
-    server = Server(folder / "service", key=keys["admin"])
+    server = Server(folder / "service", key=keys["admin"], forked=False)
     frames = walk()
     made = Site(folder, server, keys, frames, walked_again(frames))
     for number, data in enumerate(made.again):

@@ -47,7 +47,7 @@ class Drive:
 def drive(folder: Path, minutes: float, rate: float) -> Drive:
     """Drive in the present network."""
     frames = walk()
-    site = Site(folder, Server(folder / "service"), {}, frames, walked_again(frames))
+    site = Site(folder, Server(folder / "service", forked=False), {}, frames, walked_again(frames))
     for number, data in enumerate(site.again):
         (folder / f"again-{number:02d}.jpg").write_bytes(data)
     site.start_peers()

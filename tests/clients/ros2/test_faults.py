@@ -51,7 +51,7 @@ def test_a_service_that_was_killed_is_found_again(driving: Robot, monkeypatch: p
     robot.peer.take("pose")
     robot.says("cannot be reached")
     assert robot.peer.take("pose") == [], "no old pose is repeated"
-    site.server = Server(site.folder / "service", key=site.keys["admin"]).wait()
+    site.server = Server(site.folder / "service", key=site.keys["admin"], forked=False).wait()
     until_answered(robot, 3)
     robot.says("The verdict is")
     robot.answers_settled()
