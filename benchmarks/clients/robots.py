@@ -11,13 +11,13 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import resource
 import sys
 import time
 from pathlib import Path
 from typing import Any, Literal
 
 from placerec_client import AsyncClient
+from service.commands.load import processor_seconds
 
 Verify = Literal["auto", "always", "never"]
 
@@ -36,7 +36,7 @@ async def drive(url: str, map_id: str, frames: list[bytes], robots: int, seconds
 
     async with AsyncClient(url) as client:
         await client.maps[map_id].query(frames[0], verify=verify)  # the model is built by the first answer
-        before, began = _processor_seconds(), time.perf_counter()
+        before, began = processor_seconds(), time.perf_counter()
         until = began + seconds
         await asyncio.gather(*(robot(7 * number) for number in range(robots)))
         spent = time.perf_counter() - began
@@ -44,13 +44,8 @@ async def drive(url: str, map_id: str, frames: list[bytes], robots: int, seconds
         "robots": robots,
         "seconds": spent,
         "milliseconds": [round(1e3 * one, 3) for one in times],
-        "processor_seconds": _processor_seconds() - before,
+        "processor_seconds": processor_seconds() - before,
     }
-
-
-def _processor_seconds() -> float:
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    return usage.ru_utime + usage.ru_stime
 
 
 def main() -> None:

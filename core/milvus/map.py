@@ -32,9 +32,8 @@ from core.milvus.ledger import Frame, MapState, PlaceEntry
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.tokens import tokens_of
 from core.places import Place, PlaceFields
-from core.storage.database.conditions import text_of
 from core.storage.database.ledger import metadata_text, picture_of, same_fields
-from core.storage.pagination import Listing, decode_number, encode_cursor
+from core.storage.pagination import decode_number, listing_of_places, one_more, page_of
 from core.storage.writing import check_enrolment
 
 log = logging.getLogger(__name__)
@@ -133,15 +132,13 @@ class MilvusMap:
         Raises:
             InvalidCursor.
         """
-        if limit < 1:
-            raise ValueError("a page has at least one entry")
-        listing: Listing = ["places", self.record.id, wanted.sequence]
-        listing += [] if (others := text_of(wanted)) is None else [others]
+        most = one_more(limit)
+        listing = listing_of_places(self.record.id, wanted)
         after = decode_number(listing, cursor)
         with self._reading() as connection:
-            found = ledger.entries_after(connection, self._number, after, limit + 1, wanted)
-        more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None
-        return [entry.place for entry in found[:limit]], more
+            found = ledger.entries_after(connection, self._number, after, most, wanted)
+        page, more = page_of(listing, found, limit, lambda entry: entry.number)
+        return [entry.place for entry in page], more
 
     def outline(self) -> list[Outline]:
         """All places in brief, in the order of their enrolment."""

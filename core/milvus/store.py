@@ -13,7 +13,7 @@ from core.milvus.collection import Collection, Connection
 from core.milvus.database import Database
 from core.milvus.map import MilvusMap
 from core.places import check_map_id
-from core.storage.pagination import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, one_more, page_of
 
 log = logging.getLogger(__name__)
 
@@ -105,15 +105,13 @@ class MilvusStore:
         Raises:
             InvalidCursor.
         """
-        if limit < 1:
-            raise ValueError("a page has at least one entry")
+        wanted = one_more(limit)
         listing: Listing = ["maps"]
         after = decode_name(listing, cursor)
         self._expect_open()
         with self._database.reading() as connection:
-            found = ledger.records_after(connection, after, limit + 1)
-        more = encode_cursor(listing, found[limit - 1].id) if len(found) > limit else None
-        return found[:limit], more
+            found = ledger.records_after(connection, after, wanted)
+        return page_of(listing, found, limit, lambda record: record.id)
 
     def delete(self, map_id: str) -> None:
         """Delete a map; the deletion is durable when this returns.

@@ -28,7 +28,7 @@ from core.storage.files.row_formats import HALF
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
-from core.storage.pagination import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, one_more, page_of
 from core.storage.verification import Progress, inspect_folder, no_progress
 
 log = logging.getLogger(__name__)
@@ -327,14 +327,13 @@ class Atlas:
         Raises:
             InvalidCursor.
         """
-        if limit < 1:
-            raise ValueError("a page has at least one entry")
+        wanted = one_more(limit)
         listing: Listing = ["maps"]
         after = decode_name(listing, cursor)
         maps = {map_id: found for map_id, found in self._maps.copy().items() if found.damage is None}
-        page = sorted(map_id for map_id in maps if map_id > after)
-        more = encode_cursor(listing, page[limit - 1]) if len(page) > limit else None
-        return [maps[map_id].record for map_id in page[:limit]], more
+        following = sorted(map_id for map_id in maps if map_id > after)[:wanted]
+        page, more = page_of(listing, following, limit, str)
+        return [maps[map_id].record for map_id in page], more
 
     def quarantined(self) -> dict[str, str]:
         """Why maps are out of service, by id."""

@@ -10,6 +10,8 @@ import base64
 import binascii
 import json
 import sqlite3
+from collections.abc import Callable
+from typing import TypeVar
 
 from core.errors import InvalidCursor
 from core.maps.place_filter import PlaceFilter
@@ -17,6 +19,8 @@ from core.maps.records import SequenceSummary
 from core.places import Place
 from core.storage.database import ledger
 from core.storage.database.conditions import text_of
+
+Entry = TypeVar("Entry")
 
 Listing = list[str | None]
 """Names a listing, such as ``["places", "lab", "monday"]``; a cursor of another listing is refused."""
@@ -63,6 +67,20 @@ def decode_name(listing: Listing, cursor: str | None) -> str:
     return after
 
 
+def page_of(
+    listing: Listing, found: list[Entry], limit: int, key: Callable[[Entry], str | int]
+) -> tuple[list[Entry], str | None]:
+    """The first ``limit`` of the entries found and, if there are more, the cursor of the next page."""
+    more = encode_cursor(listing, key(found[limit - 1])) if len(found) > limit else None
+    return found[:limit], more
+
+
+def listing_of_places(map_id: str, wanted: PlaceFilter) -> Listing:
+    """Names the places of a map that fulfil some conditions."""
+    others = text_of(wanted)
+    return ["places", map_id, wanted.sequence] + ([] if others is None else [others])
+
+
 def page_of_places(
     connection: sqlite3.Connection, map_id: str, cursor: str | None, limit: int, wanted: PlaceFilter
 ) -> tuple[list[Place], str | None]:
@@ -71,12 +89,11 @@ def page_of_places(
     Raises:
         InvalidCursor.
     """
-    listing: Listing = ["places", map_id, wanted.sequence]
-    listing += [] if (others := text_of(wanted)) is None else [others]
+    listing = listing_of_places(map_id, wanted)
     after = decode_number(listing, cursor)
-    found = ledger.places_after(connection, after, _one_more(limit), wanted)
-    more = encode_cursor(listing, found[limit - 1].number) if len(found) > limit else None
-    return [stored.place for stored in found[:limit]], more
+    found = ledger.places_after(connection, after, one_more(limit), wanted)
+    page, more = page_of(listing, found, limit, lambda stored: stored.number)
+    return [stored.place for stored in page], more
 
 
 def page_of_sequences(
@@ -89,12 +106,11 @@ def page_of_sequences(
     """
     listing: Listing = ["sequences", map_id]
     after = decode_name(listing, cursor)
-    found = ledger.sequences_after(connection, after, _one_more(limit))
-    more = encode_cursor(listing, found[limit - 1].name) if len(found) > limit else None
-    return found[:limit], more
+    found = ledger.sequences_after(connection, after, one_more(limit))
+    return page_of(listing, found, limit, lambda sequence: sequence.name)
 
 
-def _one_more(limit: int) -> int:
+def one_more(limit: int) -> int:
     """An entry more than the page has tells whether there is a next page."""
     if limit < 1:
         raise ValueError("a page has at least one entry")

@@ -102,7 +102,7 @@ async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: 
     requests = [request(parts.netloc, parts.path.rstrip("/") + path, data, key) for data in frames]
     times: list[float] = []
     statuses: Counter[int] = Counter()
-    before = _processor_seconds()
+    before = processor_seconds()
     began = time.perf_counter()
     until = began + seconds
     drives = [robot(host, port, requests, 7 * number, until, times, statuses) for number in range(robots)]
@@ -113,11 +113,12 @@ async def drive(url: str, path: str, frames: list[bytes], robots: int, seconds: 
         "seconds": spent,
         "statuses": {str(status): count for status, count in statuses.items()},
         "milliseconds": [round(1e3 * one, 3) for one in times],
-        "processor_seconds": _processor_seconds() - before,
+        "processor_seconds": processor_seconds() - before,
     }
 
 
-def _processor_seconds() -> float:
+def processor_seconds() -> float:
+    """What this process has cost so far."""
     usage = resource.getrusage(resource.RUSAGE_SELF)
     return usage.ru_utime + usage.ru_stime
 
