@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.pagination import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, page_of
 from service.access.gate import Gate
 from service.access.keys import Key, KeyStore
 from service.access.roles import ANONYMOUS
@@ -79,8 +79,8 @@ def list_keys(page: Page, store: StoreDep, principal: PrincipalDep) -> KeyPage:
     """List every key that was ever created, the oldest first, without their secrets."""
     after = decode_name(LISTING, page.cursor)
     found = [key for key in store.all() if _position(key) > after]
-    more = encode_cursor(LISTING, _position(found[page.limit - 1])) if len(found) > page.limit else None
-    return KeyPage(items=[KeyView.of(key, principal.key_id) for key in found[: page.limit]], next_cursor=more)
+    shown, more = page_of(LISTING, found, page.limit, _position)
+    return KeyPage(items=[KeyView.of(key, principal.key_id) for key in shown], next_cursor=more)
 
 
 def _position(key: Key) -> str:

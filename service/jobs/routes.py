@@ -13,7 +13,7 @@ from pydantic import Field
 from starlette.responses import JSONResponse, Response, StreamingResponse
 
 from core import errors
-from core.storage.pagination import Listing, decode_number, encode_cursor
+from core.storage.pagination import Listing, decode_number, page_of
 from service.access.roles import OPERATIONS, UNLISTED, Principal, covers
 from service.errors.faults import Fault, JobEnded, RoleTooLow, TooManyWatchers, UnknownJob
 from service.errors.problems import problem_documentation
@@ -85,8 +85,7 @@ async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) 
         and page.state in (None, job.state)
         and principal.may_use(*job.used_maps())
     ]
-    shown = found[: page.limit]
-    more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
+    shown, more = page_of(listing, found, page.limit, lambda job: job.number)
     return JobPage(items=[JobView.of(job) for job in shown], next_cursor=more)
 
 

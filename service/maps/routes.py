@@ -13,7 +13,7 @@ from core import errors
 from core.judgement.verdict import Calibration
 from core.places import check_map_id
 from core.storage import Map, MapRecord, MapSettings, ReviewSetting, VerifyReport
-from core.storage.pagination import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, page_of
 from service.engine.engine import Engine
 from service.errors.faults import BodyTooLarge, JobQueueFull, MalformedBody, TooManyMaps, UnsupportedMediaType
 from service.errors.problems import problem_documentation
@@ -147,8 +147,7 @@ def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters
     for map_id in sorted(map_ids):
         with suppress(errors.UnknownMap, errors.MapQuarantined):
             found += [engine.atlas.find(map_id).record] if map_id > decode_name(listing, page.cursor) else []
-    more = encode_cursor(listing, found[page.limit - 1].id) if len(found) > page.limit else None
-    return found[: page.limit], more
+    return page_of(listing, found, page.limit, lambda record: record.id)
 
 
 @router.get("/{map}", responses=problem_documentation(errors.UnknownMap))

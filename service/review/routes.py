@@ -13,7 +13,7 @@ from core import errors
 from core.frames.containers import read_header
 from core.places import check_place_id
 from core.storage import Map
-from core.storage.pagination import Listing, decode_number, encode_cursor
+from core.storage.pagination import Listing, decode_number, page_of
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -54,8 +54,7 @@ def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], e
     listing: Listing = ["review-of", map_id, str(page.labelled)]
     before = decode_number(listing, page.cursor)
     found = review.page(None if before < 0 else before, page.limit + 1, page.labelled)
-    shown = found[: page.limit]
-    more = encode_cursor(listing, shown[-1].number) if len(found) > page.limit else None
+    shown, more = page_of(listing, found, page.limit, lambda one: one.number)
     count, size = review.size()
     return ReviewPage(items=[ReviewFrameView.of(one) for one in shown], next_cursor=more, frames=count, bytes=size)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 
 from core import errors
-from core.storage.pagination import Listing, decode_name, encode_cursor
+from core.storage.pagination import Listing, decode_name, page_of
 from service.errors.faults import (
     EncoderNotInstalled,
     FrameOutOfOrder,
@@ -80,8 +80,7 @@ async def list_sessions(map_id: MapId, page: Page, engine: EngineDep, sessions: 
     listing: Listing = ["sessions-of", map_id]
     after = decode_name(listing, page.cursor)
     found = [session for session in await in_thread(sessions.of_map, map_) if session.id > after]
-    shown = found[: page.limit]
-    more = encode_cursor(listing, shown[-1].id) if len(found) > len(shown) else None
+    shown, more = page_of(listing, found, page.limit, lambda session: session.id)
     counts = await in_thread(lambda: [sessions.frames_of(session) for session in shown])
     items = [session_view(session, count) for session, count in zip(shown, counts, strict=True)]
     return SessionPage(items=items, next_cursor=more)
