@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from core.method.catalogue import DEFAULT_ENCODER
+from core.method import DEFAULT_ENCODER
 
 PREFIX = "PLACEREC_"
 MIB = 1024 * 1024
