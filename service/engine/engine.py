@@ -21,7 +21,7 @@ from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.verification import Verify
 from core.storage import Atlas, Map, MapRecord
-from service.engine.encoder_threads import AfterEncoding, Encoded
+from service.engine.encoders import AfterEncoding, Encoded
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Recognized, Searches, search_ahead

@@ -23,7 +23,7 @@ from core.recognition.recognition import Answer, locate
 from core.recognition.verification import Verifier, Verify
 from core.storage import Map
 from core.threads import cores
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 
 MOST_TOGETHER = 8
 """The most queries of one search: more than four save no further time, and the queries that arrive next would wait."""

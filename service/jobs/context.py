@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 from core.errors import UnknownMap
 from core.frames.masks import Mask
 from core.storage import Atlas, Map
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import ClientGone

@@ -13,7 +13,7 @@ from core.judgement.position import PoseEstimate
 from core.recognition.recognition import Answer
 from core.recognition.stages import Candidates, calibration_of
 from core.storage import Map
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.searches import Recognized
 from service.http.routing import FromState, rounded

@@ -14,7 +14,7 @@ from core.places import Place, check_place_id
 from core.recognition.recognition import Answer, locate
 from core.recognition.verification import Verifier, Verify
 from core.storage import Map
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.errors.faults import (
     EncoderNotInstalled,

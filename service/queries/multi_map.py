@@ -17,7 +17,7 @@ from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.verification import Verifier, Verify
 from core.storage import Map
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import EncoderNotInstalled

@@ -17,7 +17,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage import Map
 from service.engine import searches
-from service.engine.encoder_threads import AfterEncoding, Encoded, EncoderThreads, QueuedFrame
+from service.engine.encoder_threads import EncoderThreads
+from service.engine.encoders import AfterEncoding, Encoded, QueuedFrame
 from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes
