@@ -7,6 +7,7 @@ import time
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from functools import partial
+from typing import TYPE_CHECKING
 
 from anyio import CapacityLimiter, to_thread
 from starlette.datastructures import State
@@ -31,6 +32,10 @@ from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.upkeep.similarity import Matrices
 from service.worker_threads import in_thread
 
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+    from service.shared.state import SharedState
+
 DISK_CHECK_SECONDS = 1.0
 """The disk is checked at most this often; a readiness probe that comes sooner gets the last result."""
 
@@ -42,9 +47,12 @@ class Runtime:
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
+
+    Args:
+        database: what services share; None: this one keeps its state in its data directory.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+    def __init__(self, settings: Settings, metrics: Metrics, database: SharedDatabase | None = None) -> None:
         self.settings = settings
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
@@ -59,7 +67,11 @@ class Runtime:
                 self.engine.events,
             )
             opened.callback(self.jobs.close, 0.0)
-            self.sessions = Sessions(settings, self.engine.events)
+            self.shared = None if database is None else _shared_state(settings, database)
+            if self.shared is None:
+                self.sessions = Sessions(settings, self.engine.events)
+            else:
+                self.sessions = self.shared.sessions(self.engine.events)
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.batch_order, self.plans = BatchOrder(), Plans()
@@ -99,6 +111,7 @@ class Runtime:
         state.health_examinations = self.health_examinations
         state.similarity_matrices = self.similarity_matrices
         state.exports, state.imports = self.exports, self.imports
+        state.audit_trail = None if self.shared is None else self.shared.audit
 
     def start(self) -> None:
         """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""
@@ -110,6 +123,8 @@ class Runtime:
         self.exports.clean()
         self.imports.clean()
         self.jobs.start()
+        if self.shared is not None:
+            self.shared.start()
 
     def _remove_leftovers(self) -> None:
         """Remove the forms and unlisted maps that belong to no unfinished job."""
@@ -129,6 +144,8 @@ class Runtime:
         await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
         await to_thread.run_sync(self.statistics.close)
         await to_thread.run_sync(self.sessions.close)
+        if self.shared is not None:
+            await to_thread.run_sync(self.shared.close)
         await to_thread.run_sync(self.engine.close)
 
     async def check_readiness(self) -> dict[str, str]:
@@ -142,6 +159,8 @@ class Runtime:
             self._disk_checked = now
             self._disk_state = await in_thread(self._check_disk)
         checks = {"encoder": self.engine.encoder_state, "maps": "ok", "disk": self._disk_state}
+        if self.shared is not None:
+            checks["replica"] = self.shared.replica.state
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
@@ -155,3 +174,9 @@ class Runtime:
         except PlacerecError as error:
             return str(error)
         return "ok"
+
+
+def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
+    from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
+
+    return SharedState(settings, database)
