@@ -58,16 +58,9 @@ class Runtime:
         with ExitStack() as opened:
             self.engine = Engine(settings, metrics)
             opened.callback(self.engine.close)
-            self.jobs = Jobs(
-                settings.data_dir,
-                settings.job_workers,
-                settings.job_queue,
-                settings.job_history,
-                settings.job_watchers,
-                self.engine.events,
-            )
-            opened.callback(self.jobs.close, 0.0)
             self.shared = None if database is None else _shared_state(settings, database)
+            self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
+            opened.callback(self.jobs.close, 0.0)
             if self.shared is None:
                 self.sessions = Sessions(settings, self.engine.events)
             else:
@@ -122,9 +115,9 @@ class Runtime:
         self.statistics.start()
         self.exports.clean()
         self.imports.clean()
-        self.jobs.start()
         if self.shared is not None:
             self.shared.start()
+        self.jobs.start()
 
     def _remove_leftovers(self) -> None:
         """Remove the forms and unlisted maps that belong to no unfinished job."""
@@ -176,7 +169,19 @@ class Runtime:
         return "ok"
 
 
+def _jobs(settings: Settings, engine: Engine) -> Jobs:
+    """The jobs of a data directory."""
+    return Jobs(
+        settings.data_dir,
+        settings.job_workers,
+        settings.job_queue,
+        settings.job_history,
+        settings.job_watchers,
+        engine.events,
+    )
+
+
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database)
+    return SharedState(settings, database, shared_maps=False)

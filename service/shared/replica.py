@@ -19,16 +19,12 @@ FILE = "replica"
 BEAT_SECONDS = 2.0
 """How often a service says that it is there."""
 
-GONE_SECONDS = 10.0
-"""A service that has not said so for so long counts as gone, by the database's clock; others take over its jobs."""
-
 LOSING_SECONDS = 7.0
-"""A service that could not say so for so long stops its jobs, by its own clock: before others take them over."""
+"""A service that could not say so for so long stops its jobs, by its own clock: before it counts as gone by the
+database's, and others take them over (``service.living`` in tables.sql)."""
 
-LIVING = "SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '10 seconds'"
+LIVING = "SELECT id FROM service.living"
 """The ids of the services that are there."""
-
-FORGOTTEN = "DELETE FROM service.replicas WHERE seen < clock_timestamp() - interval '30 days'"
 
 CHANNEL = "placerec"
 RECONNECT_SECONDS = 1.0

@@ -9,6 +9,10 @@ CREATE TABLE IF NOT EXISTS service.replicas (
     seen timestamptz NOT NULL DEFAULT clock_timestamp()
 );
 
+-- A service that has not said that it is there for ten seconds counts as gone.
+CREATE OR REPLACE VIEW service.living AS
+    SELECT id FROM service.replicas WHERE seen > clock_timestamp() - interval '10 seconds';
+
 CREATE TABLE IF NOT EXISTS service.sessions (
     id text COLLATE "C" PRIMARY KEY,
     map text COLLATE "C" NOT NULL,
@@ -58,3 +62,33 @@ CREATE TABLE IF NOT EXISTS service.audit (
     replica text COLLATE "C" NOT NULL,
     line text NOT NULL
 );
+
+CREATE TABLE IF NOT EXISTS service.jobs (
+    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    id text COLLATE "C" NOT NULL UNIQUE,
+    kind text NOT NULL,
+    map text COLLATE "C",
+    state text NOT NULL,
+    arguments text NOT NULL,
+    resumable boolean NOT NULL,
+    cancelling boolean NOT NULL,
+    attempt integer NOT NULL,
+    change bigint NOT NULL,
+    done bigint NOT NULL,
+    total bigint,
+    message text NOT NULL,
+    notes text NOT NULL,
+    result text,
+    problem text,
+    created_at timestamptz NOT NULL DEFAULT clock_timestamp(),
+    started_at timestamptz,
+    ended_at timestamptz,
+    maps text NOT NULL,
+    asker text NOT NULL,
+    home text COLLATE "C",                  -- the only service that can do it; NULL: any
+    owner text COLLATE "C",                 -- the service that does it
+    behind bigint,                          -- it gave way to the jobs up to this number; NULL: never
+    yielded bigint NOT NULL DEFAULT 0       -- orders those that gave way to the same ones; 0: never
+);
+CREATE INDEX IF NOT EXISTS open_jobs ON service.jobs (map, number) WHERE state IN ('queued', 'running');
+CREATE SEQUENCE IF NOT EXISTS service.yields;
