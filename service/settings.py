@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, SecretStr, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from core.method import DEFAULT_ENCODER
@@ -54,6 +54,11 @@ class Settings(BaseSettings):
     )
     data_dir: Path = Field(
         default=Path("data"), description="Directory of the maps; only one process at a time can use it."
+    )
+    postgres: SecretStr | None = Field(
+        default=None,
+        description="Address of the PostgreSQL in which services share their state (sessions, keys, jobs, rates, "
+        "statistics, events), such as postgresql://placerec:password@db/placerec; default: in the data directory.",
     )
     models_dir: Path | None = Field(
         default=None,

@@ -54,7 +54,7 @@ class RuntimeCollector(Collector):
         yield _gauge("placerec_stopping", "1 if the service is about to stop, else 0.", int(runtime.stopping))
 
     def _jobs(self) -> Metric:
-        counts = Counter(job.state for job in self._runtime.jobs.all())
+        counts = self._runtime.jobs.counts()
         gauge = GaugeMetricFamily(
             "placerec_jobs", "Jobs, by state, including ended ones that are still listed.", labels=["state"]
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -179,7 +178,7 @@ async def read_service(
     checks, ready = await _checks(runtime)
     settings, engine = runtime.settings, runtime.engine
     limiter = to_thread.current_default_thread_limiter()
-    states = Counter(job.state for job in runtime.jobs.all())
+    states = runtime.jobs.counts()
     records = await in_thread(engine.all_records)
     manages = principal.role == "admin" and principal.maps is None
     return ServiceState(
