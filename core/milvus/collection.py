@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isnan
 
+import grpc
 import numpy as np
 from numpy.typing import NDArray
 from pymilvus import Collection as Connected
@@ -22,6 +23,7 @@ from pymilvus.exceptions import MilvusException
 
 from core.errors import StorageFailure
 from core.milvus.expressions import NO_HEADING
+from core.milvus.indexes import indexing_for, search_settings
 from core.places import Whereabouts
 
 logging.getLogger("pymilvus").setLevel(logging.CRITICAL)  # what it refuses is raised; it would log it as well
@@ -65,7 +67,7 @@ def milvus_errors(action: str) -> Iterator[None]:
     """Turn what Milvus refuses into a StorageFailure."""
     try:
         yield
-    except MilvusException as error:
+    except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through
         raise StorageFailure(f"Milvus refuses to {action}: {str(error)[:300]}") from error
 
 
@@ -101,18 +103,25 @@ class Collection:
     """
 
     def __init__(self, connection: Connection, encoder: str, dimension: int) -> None:
-        name, schema = collection_name(encoder, dimension), _schema(encoder, dimension)
+        name = collection_name(encoder, dimension)
         with milvus_errors("make a collection"):
-            found = None
+            chosen = indexing_for(utility.get_server_version(using=connection.name, timeout=_PATIENCE_SECONDS))
+            schema = _schema(encoder, dimension, chosen.half)
             if utility.has_collection(name, using=connection.name, timeout=_PATIENCE_SECONDS):
-                found = Connected(name, using=connection.name).schema.description
-            if found not in (None, schema.description):
-                raise StorageFailure(f"Milvus's collection {name} is of another version: {found[:200]!r}.")
-            self._collection = Connected(
-                name, schema, connection.name, num_partitions=PARTITIONS, shards_num=1, consistency_level="Bounded"
-            )
+                self._collection = Connected(name, using=connection.name)
+                found = self._collection.schema.description
+                if found != schema.description:
+                    raise StorageFailure(f"Milvus's collection {name} is of another version: {found[:200]!r}.")
+            else:
+                self._collection = Connected(
+                    name, schema, connection.name, num_partitions=PARTITIONS, shards_num=1, consistency_level="Bounded"
+                )
             if not self._collection.has_index():
-                self._collection.create_index("descriptor", {"index_type": "FLAT", "metric_type": "IP", "params": {}})
+                self._collection.create_index("descriptor", dict(chosen.index))
+            # A collection stays as it was made when its server becomes a newer one.
+            types = {field.name: field.dtype for field in self._collection.schema.fields}
+            self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
+            self.index_type = str(self._collection.index().params["index_type"])
             self._collection.load()
 
     def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
@@ -124,7 +133,7 @@ class Collection:
         seen_from = 0
         with milvus_errors("store descriptors"):
             for start in range(0, len(entities), _AT_ONCE):
-                some = [_record(map_number, one) for one in entities[start : start + _AT_ONCE]]
+                some = [self._record(map_number, one) for one in entities[start : start + _AT_ONCE]]
                 seen_from = int(self._collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
         return seen_from
 
@@ -143,9 +152,10 @@ class Collection:
             limit: how many at most; at most ``MOST_FOUND``.
             seen_from: a timestamp of Milvus; what was inserted until then is searched.
         """
+        queries, settings = list(descriptors.astype(self._value, copy=False)), search_settings(self.index_type, limit)
         with milvus_errors("search"):
             found = self._collection.search(
-                list(descriptors), "descriptor", {"metric_type": "IP"}, limit, expression, timeout=_PATIENCE_SECONDS,
+                queries, "descriptor", settings, limit, expression, timeout=_PATIENCE_SECONDS,
                 consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
             )  # fmt: skip
         return [
@@ -156,8 +166,26 @@ class Collection:
             for hits in found
         ]
 
+    def _record(self, map_number: int, entity: Entity) -> dict[str, object]:
+        where = entity.where
+        heading = float(where.heading[0])
+        return {
+            "key": entity.key,
+            "map": map_number,
+            "row": entity.row,
+            "kind": int(where.kind[0]),
+            **dict(zip("xyz", where.position[0].tolist(), strict=True)),
+            "heading": NO_HEADING if isnan(heading) else heading,
+            "timestamp": int(where.timestamp[0]),
+            "sequence": int(where.sequence[0]),
+            "ordinal": int(where.ordinal[0]),
+            "camera": entity.camera or "",
+            "metadata": {"tokens": list(entity.tokens)},
+            "descriptor": entity.descriptor.astype(self._value, copy=False),
+        }
 
-def _schema(encoder: str, dimension: int) -> CollectionSchema:
+
+def _schema(encoder: str, dimension: int, half: bool) -> CollectionSchema:
     return CollectionSchema(
         [
             FieldSchema("key", DataType.INT64, is_primary=True),
@@ -171,26 +199,7 @@ def _schema(encoder: str, dimension: int) -> CollectionSchema:
             FieldSchema("ordinal", DataType.INT64),
             FieldSchema("camera", DataType.VARCHAR, max_length=64),
             FieldSchema("metadata", DataType.JSON),
-            FieldSchema("descriptor", DataType.FLOAT_VECTOR, dim=dimension),
+            FieldSchema("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension),
         ],
         description=f"placerec collection 1 of {encoder}",
     )
-
-
-def _record(map_number: int, entity: Entity) -> dict[str, object]:
-    where = entity.where
-    heading = float(where.heading[0])
-    return {
-        "key": entity.key,
-        "map": map_number,
-        "row": entity.row,
-        "kind": int(where.kind[0]),
-        **dict(zip("xyz", where.position[0].tolist(), strict=True)),
-        "heading": NO_HEADING if isnan(heading) else heading,
-        "timestamp": int(where.timestamp[0]),
-        "sequence": int(where.sequence[0]),
-        "ordinal": int(where.ordinal[0]),
-        "camera": entity.camera or "",
-        "metadata": {"tokens": list(entity.tokens)},
-        "descriptor": entity.descriptor,
-    }
