@@ -50,7 +50,7 @@ def score_pairs(snapshot: Snapshot, encoder: Encoder, queries: Rows, references:
     with ThreadPoolExecutor(threads, "scores", compute_alone) as helpers:
         for start in range(0, len(few), BLOCK):
             rows = few[start : start + BLOCK]
-            some = np.empty((len(rows), snapshot.dimension), np.float32)
+            some = np.empty((len(rows), encoder.dimension), np.float32)
 
             def read(part: slice, rows: Rows = rows, some: NDArray[np.float32] = some) -> None:
                 some[part] = snapshot.descriptors_at(rows[part])
