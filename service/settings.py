@@ -58,7 +58,29 @@ class Settings(BaseSettings):
     postgres: SecretStr | None = Field(
         default=None,
         description="Address of the PostgreSQL in which services share their state (sessions, keys, jobs, rates, "
-        "statistics, events), such as postgresql://placerec:password@db/placerec; default: in the data directory.",
+        "statistics, events) and, with the store milvus, their maps, such as "
+        "postgresql://placerec:password@db/placerec; default: in the data directory.",
+    )
+    store: Literal["embedded", "milvus"] = Field(
+        default="embedded",
+        description="Where the maps are: in the data directory (embedded), or in a PostgreSQL and a Milvus (milvus), "
+        "which several services may use.",
+    )
+    milvus: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^\s/@]+/?$",
+        description="Address of Milvus, such as http://milvus:19530; https for TLS.",
+    )
+    milvus_token: SecretStr = Field(
+        default=SecretStr(""), description="Token of Milvus, such as user:password; none by default."
+    )
+    milvus_certificate: Path | None = Field(
+        default=None,
+        description="File with the certificate of the authority that Milvus's certificate is checked by; by default "
+        "those of the system.",
+    )
+    milvus_database: str = Field(
+        default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
     )
     models_dir: Path | None = Field(
         default=None,
@@ -250,6 +272,14 @@ class Settings(BaseSettings):
             raise ValueError(f"{PREFIX}MAX_BATCH_BYTES is less than {PREFIX}MAX_IMAGE_BYTES")
         if self.max_upload_memory < self.max_batch_bytes:
             raise ValueError(f"{PREFIX}MAX_UPLOAD_MEMORY is less than {PREFIX}MAX_BATCH_BYTES")
+        return self
+
+    @model_validator(mode="after")
+    def _store_has_addresses(self) -> Settings:
+        if self.store == "milvus":
+            for name in ("milvus", "postgres"):
+                if getattr(self, name) is None:
+                    raise ValueError(f"{PREFIX}STORE is milvus, which needs {PREFIX}{name.upper()}")
         return self
 
     @property
