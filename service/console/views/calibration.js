@@ -24,11 +24,10 @@ export default function Calibration({ map }) {
   };
   return html`
     <${Head} title="Calibration" note=${`When an answer of ${map} is believed.`}>
-      ${may("admin") && own && html`<button type="button" class="danger" onClick=${giveUp}>Back to the encoder's</button>`}
       ${may("admin") && html`<button type="button" class="primary" onClick=${calibrate}>Calibrate</button>`}
     <//>
     ${job && html`<section class="panel"><${JobProgress} key=${job.id} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Dry run" : "Calibration"} /></section>`}
-    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} />`}<//>
+    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} giveUp=${giveUp} />`}<//>
     ${dialog}
   `;
 }
@@ -50,7 +49,7 @@ function GiveUp({ map, tag, changed, close }) {
   `;
 }
 
-function State({ map, data, tag, changed }) {
+function State({ map, data, tag, changed, giveUp }) {
   const { calibration, measured } = data;
   return html`
     <div class="columns">
@@ -63,6 +62,7 @@ function State({ map, data, tag, changed }) {
           calibration.frames && ["Frames it rests on", integer(calibration.frames)],
           ["Probabilities", calibration.curve ? "by its curve" : "none: it has no curve"],
         ]} />
+        ${may("admin") && !ofEncoder(calibration) && html`<div class="row"><button type="button" class="danger" onClick=${giveUp}>Back to the encoder's</button></div>`}
       </section>
       ${measured && html`<${Measured} measured=${measured} />`}
     </div>
