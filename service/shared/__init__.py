@@ -9,13 +9,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from core.errors import MissingExtra
+from service.access.gate import Rates
 from service.access.keys import KeyRecords, KeyStore
 from service.settings import Settings
 
 if TYPE_CHECKING:
     from service.shared.database import SharedDatabase
 
-__all__ = ["keys_of", "open_database"]
+__all__ = ["keys_of", "open_database", "rates_of"]
 
 
 def open_database(settings: Settings) -> SharedDatabase | None:
@@ -46,3 +47,12 @@ def keys_of(settings: Settings, database: SharedDatabase | None) -> KeyRecords:
     from service.shared.keys import SharedKeys  # with it comes what speaks to PostgreSQL
 
     return SharedKeys(database)
+
+
+def rates_of(settings: Settings, database: SharedDatabase | None) -> Rates:
+    """The limits of all services together, or of this one; a context in which they hold."""
+    if database is None:
+        return Rates(settings.rate_per_key, settings.rate_burst)
+    from service.shared.rates import SharedRates  # with it comes what speaks to PostgreSQL
+
+    return SharedRates(database, settings.rate_per_key, settings.rate_burst)

@@ -92,3 +92,9 @@ CREATE TABLE IF NOT EXISTS service.jobs (
 );
 CREATE INDEX IF NOT EXISTS open_jobs ON service.jobs (map, number) WHERE state IN ('queued', 'running');
 CREATE SEQUENCE IF NOT EXISTS service.yields;
+
+-- When the bucket of a caller will be full again.  A crash of PostgreSQL fills all of them.
+CREATE UNLOGGED TABLE IF NOT EXISTS service.rates (
+    name text COLLATE "C" PRIMARY KEY,
+    full_at timestamptz NOT NULL
+);
