@@ -33,7 +33,9 @@ def answers(map_: Map) -> list[list[tuple[str, float]]]:
     found = []
     for rows, products in map_.scope().search(asked):
         places = map_.places_at(rows.tolist())
-        found.append([(place.id, round(float(score), 4)) for place, score in zip(places, products, strict=True) if place])
+        found.append(
+            [(place.id, round(float(score), 4)) for place, score in zip(places, products, strict=True) if place]
+        )
     return found
 
 

@@ -39,9 +39,7 @@ def keys_in_milvus(store: MilvusStore, lab: MilvusMap) -> set[int]:
     return set(lab.collection.keys_between(max(0, last - 1000), last + 1))
 
 
-def test_what_a_dead_write_left_is_deleted(
-    store: MilvusStore, lab: MilvusMap, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_dead_write_left_is_deleted(store: MilvusStore, lab: MilvusMap, monkeypatch: pytest.MonkeyPatch) -> None:
     lab.enrol([frame("a")])
     store.sweep()
     before = keys_in_milvus(store, lab)
