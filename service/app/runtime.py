@@ -56,9 +56,9 @@ class Runtime:
         self.settings = settings
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
-            self.engine = Engine(settings, metrics)
-            opened.callback(self.engine.close)
             self.shared = None if database is None else _shared_state(settings, database)
+            self.engine = Engine(settings, metrics, None if self.shared is None else self.shared.events)
+            opened.callback(self.engine.close)
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
             if self.shared is None:
@@ -68,7 +68,8 @@ class Runtime:
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.batch_order, self.plans = BatchOrder(), Plans()
-        self.statistics = QueryStatistics.of_engine(self.engine)
+        statistics = QueryStatistics.of_engine if self.shared is None else self.shared.statistics
+        self.statistics = statistics(self.engine)
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
         self.health_examinations = CapacityLimiter(1)  # each is a long search

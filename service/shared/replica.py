@@ -42,10 +42,10 @@ class Replica:
 
     Args:
         database: what the services share; it is closed by its owner.
-        directory: the data directory, which this process holds.
+        directory: the data directory.
 
     Raises:
-        StorageFull, StorageFailure: PostgreSQL cannot be reached, or refuses; or the directory cannot be written to.
+        StorageFull, StorageFailure: the directory cannot be written to.
     """
 
     def __init__(self, database: SharedDatabase, directory: Path) -> None:
@@ -58,12 +58,6 @@ class Replica:
         self._heard: dict[str, Heard] = {}
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
-        self.database.execute(
-            "enter itself",
-            "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
-            " SET process = excluded.process, seen = clock_timestamp()",
-            (self.id, self.process),
-        )
 
     def every(self, task: Callable[[], None]) -> None:
         """Do something at every beat, in a thread; call it before :meth:`start`."""
@@ -74,7 +68,18 @@ class Replica:
         self._heard[topic] = heard
 
     def start(self) -> None:
-        """Begin to beat and to listen."""
+        """Enter, and begin to beat and to listen; the process must hold its data directory.
+
+        Raises:
+            StorageFull, StorageFailure: PostgreSQL cannot be reached, or refuses.
+        """
+        self.database.execute(
+            "enter itself",
+            "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
+            " SET process = excluded.process, seen = clock_timestamp()",
+            (self.id, self.process),
+        )
+        self._beaten = time.monotonic()
         for name, work in (("replica-beat", self._beat_on), ("replica-listen", self._listen_on)):
             thread = threading.Thread(target=work, name=name, daemon=True)
             thread.start()
