@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from functools import partial
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING
 from anyio import CapacityLimiter, to_thread
 from starlette.datastructures import State
 
+from core.disk.files import check_writable
 from core.errors import PlacerecError
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
@@ -76,7 +78,7 @@ class Runtime:
         self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
-        self._disk_state, self._disk_checked = "ok", 0.0
+        self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -125,7 +127,7 @@ class Runtime:
         unended = [job.arguments for job in self.jobs.all() if not job.ended]
         unfinished = {arguments.get("to") for arguments in unended}
         self.staging.clean({arguments["form"] for arguments in unended if "form" in arguments})
-        for map_id in self.engine.atlas.unlisted():
+        for map_id in self.engine.atlas.abandoned():
             if map_id not in unfinished:
                 with suppress(PlacerecError):  # the next start tries again
                     self.engine.atlas.abandon(map_id)
@@ -151,8 +153,8 @@ class Runtime:
         now = time.monotonic()
         if now - self._disk_checked > DISK_CHECK_SECONDS:
             self._disk_checked = now
-            self._disk_state = await in_thread(self._check_disk)
-        checks = {"encoder": self.engine.encoder_state, "maps": "ok", "disk": self._disk_state}
+            self._maps_state, self._disk_state = await in_thread(self._check_store)
+        checks = {"encoder": self.engine.encoder_state, "maps": self._maps_state, "disk": self._disk_state}
         if self.shared is not None:
             checks["replica"] = self.shared.replica.state
         if self.stopping:
@@ -162,12 +164,19 @@ class Runtime:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks
 
-    def _check_disk(self) -> str:
-        try:
-            self.engine.atlas.check_writable()
-        except PlacerecError as error:
-            return str(error)
-        return "ok"
+    def _check_store(self) -> tuple[str, str]:
+        """The states of the servers that have the maps, if there are such, and of the disk."""
+        if self.settings.store == "embedded":
+            return "ok", _outcome(self.engine.atlas.check_writable)
+        return _outcome(self.engine.atlas.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
+
+
+def _outcome(check: Callable[[], None]) -> str:
+    try:
+        check()
+    except PlacerecError as error:
+        return str(error)
+    return "ok"
 
 
 def _jobs(settings: Settings, engine: Engine) -> Jobs:
@@ -185,4 +194,4 @@ def _jobs(settings: Settings, engine: Engine) -> Jobs:
 def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
     from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
 
-    return SharedState(settings, database, shared_maps=False)
+    return SharedState(settings, database, shared_maps=settings.store != "embedded")

@@ -9,8 +9,8 @@ from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
 from core.frames.masks import Mask
-from core.storage import Atlas, Map
-from service.engine.encoder_threads import Encoded
+from core.maps import Map, Store
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import ClientGone
@@ -66,7 +66,7 @@ class JobContext:
         self.notes = job.notes
         self.maps = job.maps
 
-    def map(self, atlas: Atlas, map_id: str | None = None) -> Map:
+    def map(self, atlas: Store, map_id: str | None = None) -> Map:
         """One of the job's maps: the one with id ``map_id``, or by default the map that the job works on.
 
         Raises:

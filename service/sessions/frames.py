@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
+from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
-from core.storage import Map
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest

@@ -21,9 +21,9 @@ from pydantic import ValidationError
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
 from core.disk.files import disk_errors
 from core.errors import UnknownSequence
+from core.maps import Map, Snapshot
 from core.maps.selection import Conditions, Selection
 from core.recognition.stages import neighborhood_of
-from core.storage import Map, Snapshot
 from service.access.audit import ASKER
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
@@ -211,7 +211,7 @@ class Sessions:
             StorageFull, StorageFailure: the session cannot be saved.
         """
         names = options.sequences or []
-        if absent := set(names) - set(map_.attributes.sequence_codes(names)):
+        if absent := map_.unknown_sequences(names):
             raise UnknownSequence(f"The map has no sequence {min(absent)!r}.")
         if (begun := self._begun_before(map_, options)) is not None:
             return begun
@@ -369,8 +369,7 @@ class Sessions:
                 return known.graph
             scope = map_.scope(selection)
             snapshot = scope.snapshot
-            living = snapshot.alive if scope.allowed is None else snapshot.alive & scope.allowed
-            graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
+            graph = place_graph(snapshot.whereabouts, scope.living_rows(), snapshot.rows, neighborhood)
             done = time.monotonic()
             self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)
             if len(self._graphs) > self._settings.max_sessions:  # some are of refused or ended sessions

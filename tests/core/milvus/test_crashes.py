@@ -100,7 +100,7 @@ def loaded(store: MilvusStore, seed: int, may: dict[str, set[str | None]]) -> It
 
 def check(lab: MilvusMap, may: dict[str, set[str | None]]) -> None:
     """Every place shows what it may show, is stored whole and is found."""
-    outline, snapshot = lab.outline(), lab.snapshot()
+    outline, snapshot = lab.transfer.outline(), lab.snapshot()
     found = {place.id: place for place in outline}
     assert len(snapshot) == len(found)
     for name, shows in may.items():
