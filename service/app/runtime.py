@@ -14,7 +14,7 @@ from anyio import CapacityLimiter, to_thread
 from starlette.datastructures import State
 
 from core.disk.files import check_writable
-from core.errors import PlacerecError
+from core.errors import PlacerecError, StoreUnavailable
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
@@ -114,10 +114,13 @@ class Runtime:
         for name in unknown_variables():
             log.warning("the environment sets %s, which is not a setting", name)
         self.engine.start()
-        self._remove_leftovers()
+        try:
+            self._remove_leftovers()
+            self.imports.clean()
+        except StoreUnavailable as error:
+            log.warning("what the last run has left stays until the next start: %s", error)
         self.statistics.start()
         self.exports.clean()
-        self.imports.clean()
         if self.shared is not None:
             self.shared.start()
         self.jobs.start()

@@ -48,16 +48,14 @@ class SharedEvents(Events):
         self._said: dict[str, bool] = {}  # the same of this service, as the others know it
         self._outbox: deque[tuple[str, str | None]] = deque(maxlen=MOST_WAITING)
         self._something, self._ending = threading.Event(), False
-        self._reached, self._read_lately = 0, deque[int](maxlen=4 * LOOK_BACK)
+        self._reached, self._read_lately = -1, deque[int](maxlen=4 * LOOK_BACK)
         self._teller = threading.Thread(target=self._tell_on, name="events", daemon=True)
         replica.hear(EVENT, self._fetch)
         replica.hear(LISTENING, self._look)
         replica.every(self._keep_up)
 
     def start(self) -> None:
-        """Begin to tell others; the replica must not have started yet."""
-        found = self._database.execute("read events", "SELECT coalesce(max(number), 0) FROM service.events")
-        self._reached = int(found[0][0])
+        """Begin to tell others."""
         self._teller.start()
 
     def close(self) -> None:
@@ -143,6 +141,10 @@ class SharedEvents(Events):
         self._elsewhere = dict(self._database.execute("see who listens", query, (self._replica.id,)))
 
     def _fetch(self, _said: str | None) -> None:
+        if self._reached < 0:  # whoever listens here does so from now on
+            found = self._database.execute("read events", "SELECT coalesce(max(number), 0) FROM service.events")
+            self._reached = int(found[0][0])
+            return
         maps = list(self._feeds)
         query = (
             "SELECT number, map, event FROM service.events WHERE number > %s AND replica <> %s AND map = ANY(%s)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import secrets
 import threading
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 import psycopg
 
 from core.disk.files import disk_errors, write_file
+from core.errors import StorageFailure
 from service.shared.database import SETTINGS, SharedDatabase
 
 FILE = "replica"
@@ -53,7 +55,7 @@ class Replica:
         self.id, self.process = _id_of(directory), secrets.token_hex(8)
         self.displaced = False
         """Whether another service runs under this id, because its data directory is a copy."""
-        self._beaten = time.monotonic()
+        self._entered, self._beaten = False, -math.inf
         self._tasks: list[Callable[[], None]] = []
         self._heard: dict[str, Heard] = {}
         self._stopping = threading.Event()
@@ -70,16 +72,12 @@ class Replica:
     def start(self) -> None:
         """Enter, and begin to beat and to listen; the process must hold its data directory.
 
-        Raises:
-            StorageFull, StorageFailure: PostgreSQL cannot be reached, or refuses.
+        If PostgreSQL cannot be reached, this service enters as soon as it can.
         """
-        self.database.execute(
-            "enter itself",
-            "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
-            " SET process = excluded.process, seen = clock_timestamp()",
-            (self.id, self.process),
-        )
-        self._beaten = time.monotonic()
+        try:
+            self.beat()
+        except StorageFailure as error:
+            log.error("the service does not take part yet: %s", error)
         for name, work in (("replica-beat", self._beat_on), ("replica-listen", self._listen_on)):
             thread = threading.Thread(target=work, name=name, daemon=True)
             thread.start()
@@ -133,6 +131,14 @@ class Replica:
             StorageFailure: PostgreSQL cannot be reached, or refuses.
         """
         began = time.monotonic()
+        if not self._entered:
+            enter = (
+                "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
+                " SET process = excluded.process, seen = clock_timestamp()"
+            )
+            self.database.execute("enter", enter, (self.id, self.process))
+            self._entered, self._beaten = True, began
+            return
         query = "UPDATE service.replicas SET seen = clock_timestamp() WHERE id = %s AND process = %s RETURNING id"
         if self.displaced:
             return
