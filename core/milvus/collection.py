@@ -8,11 +8,14 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import threading
 import uuid
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isnan
+from typing import Any
 
 import grpc
 import numpy as np
@@ -21,11 +24,13 @@ from pymilvus import Collection as Connected
 from pymilvus import CollectionSchema, DataType, FieldSchema, connections, utility
 from pymilvus.exceptions import MilvusException
 
-from core.errors import StorageFailure
+from core.errors import StoreOfAnotherVersion
 from core.milvus.expressions import NO_HEADING
-from core.milvus.indexes import indexing_for, search_settings
+from core.milvus.indexes import search_settings
+from core.milvus.outage import Outage, Unreachable
 from core.places import Whereabouts
 
+warnings.filterwarnings("ignore", message=".*ORM-style PyMilvus API")
 logging.getLogger("pymilvus").setLevel(logging.CRITICAL)  # what it refuses is raised; it would log it as well
 
 MOST_FOUND = 16_384
@@ -36,6 +41,7 @@ PARTITIONS = 64
 
 _AT_ONCE = 256  # entities of one insertion: 16 MB with the default encoder; Milvus takes 64
 _PATIENCE_SECONDS = 10.0
+_CONNECTING_SECONDS = 3.0
 # A Milvus that was gone is asked again within two seconds; by default gRPC would wait for up to two minutes.
 _AGAIN_SOON = {"grpc.initial_reconnect_backoff_ms": 200, "grpc.max_reconnect_backoff_ms": 2000}
 
@@ -64,65 +70,108 @@ def collection_name(encoder: str, dimension: int) -> str:
 
 @contextmanager
 def milvus_errors(action: str) -> Iterator[None]:
-    """Turn what Milvus refuses into a StorageFailure."""
+    """Turn what Milvus refuses into a StoreUnavailable."""
     try:
         yield
     except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through
-        raise StorageFailure(f"Milvus refuses to {action}: {str(error)[:300]}") from error
+        raise Unreachable("Milvus", f"cannot be reached, or refuses to {action}: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [""])[0][:300]
 
 
 class Connection:
-    """A connection to Milvus.  Any thread may use it.
-
-    Raises:
-        StorageFailure: Milvus cannot be reached, or refuses.
-    """
+    """A connection to Milvus, which is made when it is first used.  Any thread may use it."""
 
     def __init__(self, address: str, token: str, database: str, certificate: str | None) -> None:
-        self.name = f"placerec-{uuid.uuid4().hex}"
-        tls = {} if certificate is None else {"server_pem_path": certificate, "secure": True}
-        with milvus_errors("connect"):
-            connections.connect(
-                self.name, uri=address, token=token, db_name=database, timeout=_PATIENCE_SECONDS,
-                grpc_options=_AGAIN_SOON, **tls,
-            )  # fmt: skip
+        self._given: dict[str, Any] = {"uri": address, "token": token, "db_name": database}
+        if certificate is not None:
+            self._given |= {"server_pem_path": certificate, "secure": True}
+        self._name = f"placerec-{uuid.uuid4().hex}"
+        self._making = threading.Lock()
+        self._made = False
+        self._outage = Outage("Milvus")
+
+    @contextmanager
+    def using(self, action: str) -> Iterator[str]:
+        """The name of the connection, by which pymilvus knows it.
+
+        Raises:
+            StoreUnavailable: Milvus cannot be reached, or refuses.
+        """
+        with self._outage.noticed(), milvus_errors(action):
+            if not self._made:
+                self._connect()
+            yield self._name
+
+    def _connect(self) -> None:
+        with self._making:
+            if not self._made:
+                connections.connect(self._name, timeout=_CONNECTING_SECONDS, grpc_options=_AGAIN_SOON, **self._given)
+                self._made = True
+
+    def check(self) -> None:
+        """Ask Milvus for its version.
+
+        Raises:
+            StoreUnavailable: it does not answer, or refuses.
+        """
+        with self.using("answer") as name:
+            utility.get_server_version(using=name, timeout=_CONNECTING_SECONDS)
 
     def close(self) -> None:
         """Close it."""
-        connections.disconnect(self.name)
+        if self._made:
+            connections.disconnect(self._name)
 
 
 class Collection:
-    """The descriptors of one encoder.  Any thread may use it.
+    """The descriptors of one encoder; it is made when it is first used.  Any thread may use it.
+
+    Every method may raise StoreUnavailable (Milvus cannot be reached, or refuses) and StoreOfAnotherVersion (its
+    collection of this name was made otherwise).
 
     Args:
         encoder, dimension: its identity, and the values of a descriptor.
-
-    Raises:
-        StorageFailure: Milvus refuses, or its collection of this name was made otherwise.
     """
 
     def __init__(self, connection: Connection, encoder: str, dimension: int) -> None:
-        name = collection_name(encoder, dimension)
-        with milvus_errors("make a collection"):
-            chosen = indexing_for(utility.get_server_version(using=connection.name, timeout=_PATIENCE_SECONDS))
-            schema = _schema(encoder, dimension, chosen.half)
-            if utility.has_collection(name, using=connection.name, timeout=_PATIENCE_SECONDS):
-                self._collection = Connected(name, using=connection.name)
-                found = self._collection.schema.description
-                if found != schema.description:
-                    raise StorageFailure(f"Milvus's collection {name} is of another version: {found[:200]!r}.")
-            else:
-                self._collection = Connected(
-                    name, schema, connection.name, num_partitions=PARTITIONS, shards_num=1, consistency_level="Bounded"
+        self._connection = connection
+        self._encoder, self._dimension = encoder, dimension
+        self._name = collection_name(encoder, dimension)
+        self._value: type[np.float16 | np.float32] = np.float32
+        self.index_type = "FLAT"
+        """How Milvus searches it, as far as it was used."""
+        self._making = threading.Lock()
+        self._collection: Connected | None = None
+
+    @contextmanager
+    def _using(self, action: str) -> Iterator[Connected]:
+        with self._connection.using(action) as name:
+            if self._collection is None:
+                self._make(name)
+            yield self._collection
+
+    def _make(self, connection: str) -> None:
+        with self._making:
+            if self._collection is not None:
+                return
+            found = None
+            if utility.has_collection(self._name, using=connection, timeout=_PATIENCE_SECONDS):
+                found = Connected(self._name, using=connection).schema.description
+            if found not in (None, self._schema.description):
+                raise StoreOfAnotherVersion(
+                    f"Milvus's collection {self._name} was made by another version: {found[:200]!r}."
                 )
-            if not self._collection.has_index():
-                self._collection.create_index("descriptor", dict(chosen.index))
-            # A collection stays as it was made when its server becomes a newer one.
-            types = {field.name: field.dtype for field in self._collection.schema.fields}
-            self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
-            self.index_type = str(self._collection.index().params["index_type"])
-            self._collection.load()
+            made = Connected(
+                self._name, self._schema, connection, num_partitions=PARTITIONS, shards_num=1,
+                consistency_level="Bounded",
+            )  # fmt: skip
+            if not made.has_index():
+                made.create_index("descriptor", {"index_type": "FLAT", "metric_type": "IP", "params": {}})
+            made.load()
+            self._collection = made
 
     def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
         """Insert entities of a map; they are durable when this returns.
@@ -131,16 +180,44 @@ class Collection:
             From which timestamp on a search sees them.
         """
         seen_from = 0
-        with milvus_errors("store descriptors"):
+        with self._using("store descriptors") as collection:
             for start in range(0, len(entities), _AT_ONCE):
                 some = [self._record(map_number, one) for one in entities[start : start + _AT_ONCE]]
-                seen_from = int(self._collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
+                seen_from = int(collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
         return seen_from
+
+    def check(self) -> None:
+        """Raise unless the collection can be searched."""
+        with self._using("answer") as collection:
+            collection.query("key == 0", ["key"], timeout=_CONNECTING_SECONDS, consistency_level="Eventually")
 
     def delete(self, keys: Sequence[int]) -> None:
         """Delete entities."""
-        with milvus_errors("delete descriptors"):
-            self._collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
+        with self._using("delete descriptors") as collection:
+            collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
+
+    def keys_between(self, first: int, end: int) -> list[int]:
+        """The keys of all entities from ``first`` on and below ``end``; at most ``MOST_FOUND`` apart."""
+        with self._using("list descriptors") as collection:
+            found = collection.query(
+                f"key >= {first} and key < {end}", ["key"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
+            )
+        return [int(one["key"]) for one in found]
+
+    def descriptors_of(self, keys: Sequence[int], seen_from: int) -> dict[int, NDArray[np.float32]]:
+        """The descriptors of entities by key, float32 [D]; keys that Milvus does not have are left out."""
+        with self._using("read descriptors") as collection:
+            found = collection.query(
+                f"key in {list(keys)}", ["key", "descriptor"], timeout=_PATIENCE_SECONDS,
+                consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
+            )  # fmt: skip
+        return {int(one["key"]): self._vector(one["descriptor"]) for one in found}
+
+    def _vector(self, value: Any) -> NDArray[np.float32]:
+        """A descriptor as Milvus returns it: a list, or the bytes of halves."""
+        halves = value[0] if isinstance(value, list) and value and isinstance(value[0], bytes) else value
+        kept = np.frombuffer(halves, np.float16) if isinstance(halves, bytes) else np.asarray(halves)
+        return kept.astype(np.float32)
 
     def search(
         self, descriptors: NDArray[np.float32], expression: str, limit: int, seen_from: int
@@ -152,10 +229,10 @@ class Collection:
             limit: how many at most; at most ``MOST_FOUND``.
             seen_from: a timestamp of Milvus; what was inserted until then is searched.
         """
-        queries, settings = list(descriptors.astype(self._value, copy=False)), search_settings(self.index_type, limit)
-        with milvus_errors("search"):
-            found = self._collection.search(
-                queries, "descriptor", settings, limit, expression, timeout=_PATIENCE_SECONDS,
+        with self._using("search") as collection:
+            queries = list(descriptors.astype(self._value, copy=False))
+            found = collection.search(
+                queries, "descriptor", search_settings(self.index_type, limit), limit, expression, timeout=_PATIENCE_SECONDS,
                 consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
             )  # fmt: skip
         return [

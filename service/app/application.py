@@ -16,9 +16,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from service.access.audit import audit_file
-from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
+from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
-from service.access.keys import KeyStore
 from service.administration import audit_routes, key_routes
 from service.app import routes as root
 from service.app import service_state
@@ -43,6 +42,7 @@ from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
 from service.settings import Settings, read_settings
+from service.shared import keys_of, open_database, rates_of
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
 from service.upkeep import routes as upkeep
@@ -190,21 +190,24 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     Raises:
         SettingsError: a setting is wrong, or would expose the service without keys.
         KeysUnreadable: the file of keys cannot be read.
+        MissingExtra, StorageFailure: the state is in PostgreSQL, which cannot be reached.
     """
     chosen = settings if settings is not None else read_settings()
-    store = KeyStore(chosen.data_dir)
+    database = open_database(chosen)
+    store = keys_of(chosen, database)
     chosen.check_exposure(has_keys=not as_owner and store.exists())
     keyring = None if as_owner else Keyring(store)
     metrics = Metrics()
-    gate = Gate(keyring, Rates(chosen.rate_per_key, chosen.rate_burst), chosen.is_loopback())
+    rates = rates_of(chosen, database)
+    gate = Gate(keyring, rates, chosen.is_loopback())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with audit_file(chosen.audit_file) as latest_lines, keyring or nullcontext():
+        with audit_file(chosen.audit_file) as latest_lines, keyring or nullcontext(), rates:
             app.state.audit_lines = latest_lines
             warn_if_exposed(gate, chosen)
-            runtime = await to_thread.run_sync(Runtime, chosen, metrics)
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics, database)
             runtime.publish(app.state)
             runtime.start()
             try:
@@ -212,6 +215,8 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
                     yield
             finally:
                 await runtime.close()
+                if database is not None:
+                    await to_thread.run_sync(database.close)
 
     app = Application(
         title="placerec",

@@ -16,8 +16,9 @@ from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
-from core.threads import cores, share_cores
-from service.engine.encoder_threads import AfterEncoding, Encoded, EncoderThreads, QueuedFrame, deadline_exceeded
+from core.threads import share_cores
+from service.engine.encoder_threads import EncoderThreads
+from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders, QueuedFrame, deadline_exceeded
 from service.errors.faults import ClientGone, DeadlineExceeded, QueueFull
 from service.telemetry.metrics import Metrics
 
@@ -25,9 +26,6 @@ __all__ = ["AfterEncoding", "Encoded", "EncoderQueue", "Outcomes", "RequestDeadl
 
 Outcomes = list[tuple[int, Encoded | Exception]]
 """Some frames of a request, each with its index: encoded, or the error that kept it from being encoded."""
-
-AHEAD = 8 * max(2, cores())
-"""Frames of one bulk request that wait at a time: enough that the encoder never runs out of them."""
 
 UNWATCHED = 0.25
 """Seconds after which a connection is watched for a client that hangs up; most frames are encoded by then."""
@@ -46,7 +44,7 @@ class RequestDeadline:
 
 
 class EncoderQueue:
-    """Loads encoders and encodes frames.  It is used from the event loop.
+    """Loads encoders and lets them encode frames.  It is used from the event loop.
 
     Args:
         catalogue: the installed encoders.
@@ -54,22 +52,29 @@ class EncoderQueue:
         queue_length: the most requests that may have a place at one time.
         threads: how many threads encode, each a frame of its own; a frame that is alone has all of them.  0 leaves the
             number to torch.
+        make_encoders: makes what encodes the frames; None: such threads.
     """
 
     def __init__(
-        self, catalogue: EncoderCatalogue, limits: Limits, queue_length: int, threads: int, metrics: Metrics
+        self,
+        catalogue: EncoderCatalogue,
+        limits: Limits,
+        queue_length: int,
+        threads: int,
+        metrics: Metrics,
+        make_encoders: MakeEncoders | None = None,
     ) -> None:
         self._catalogue, self._metrics = catalogue, metrics
         self._queue_length, self._waiting, self._bulk = queue_length, 0, 0
         self._loaded: dict[str, Encoder] = {}
         share_cores(threads or torch.get_num_threads())
-        self._threads = EncoderThreads(limits)
+        self.encoders = EncoderThreads(limits) if make_encoders is None else make_encoders(limits, metrics)
         self._loader = ThreadPoolExecutor(1, "encoder-loader")
 
     def close(self) -> None:
-        """Cancel the waiting frames and end the encoder's threads; blocks."""
+        """Cancel the waiting frames and end what encodes them; blocks."""
         self._loader.shutdown(cancel_futures=True)
-        self._threads.close()
+        self.encoders.close()
 
     def check_room(self) -> None:
         """Raise QueueFull if there is no free place; a route calls it before it reads a body."""
@@ -161,7 +166,7 @@ class EncoderQueue:
         """
         encoder = await self._load_in_time(identity, deadline)
         frame = QueuedFrame(encoder, data, mask, deadline.at, keypoints=keypoints, after_encoding=after_encoding)
-        self._threads.put([frame])
+        self.encoders.put([frame])
         result = asyncio.wrap_future(frame.result)
         try:
             ended = await _ended(result, deadline)
@@ -184,8 +189,8 @@ class EncoderQueue:
     ) -> AsyncGenerator[Outcomes]:
         """Encode the frames of a bulk request; call it within ``place``.
 
-        At most ``AHEAD`` of them wait at a time, and robots' frames go first.  When the generator is closed, waiting
-        frames leave the queue.
+        At most ``encoders.ahead`` of them wait at a time, and robots' frames go first.  When the generator is closed,
+        waiting frames leave the queue.
 
         Args:
             frames: the bytes of the files.
@@ -203,13 +208,13 @@ class EncoderQueue:
         encoder = await self._load_in_time(identity, deadline)
         hidden = [None] * len(frames) if masks is None else masks
         open_: dict[asyncio.Future[Encoded], tuple[int, QueuedFrame]] = {}
-        begun, bulk = 0, len(frames) > 1
+        begun, bulk, ahead = 0, len(frames) > 1, self.encoders.ahead
         gone = asyncio.ensure_future(deadline.hung_up())
         try:
             while begun < len(frames) or open_:
-                following = range(begun, min(len(frames), begun + AHEAD - len(open_)))
+                following = range(begun, min(len(frames), begun + ahead - len(open_)))
                 queued = [QueuedFrame(encoder, frames[i], hidden[i], deadline.at, bulk, keypoints) for i in following]
-                self._threads.put(queued)
+                self.encoders.put(queued)
                 open_ |= {
                     asyncio.wrap_future(frame.result): (i, frame) for i, frame in zip(following, queued, strict=True)
                 }

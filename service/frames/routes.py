@@ -11,7 +11,7 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.method.region_drawing import boxes, draw, layer_grids, strongest
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.errors.faults import (
     QueueFull,
     UnsupportedMediaType,

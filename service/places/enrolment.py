@@ -9,12 +9,12 @@ from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
 
 from core.frames.masks import Mask
+from core.maps import Change, Enrolment, Map, SameFrame
 from core.places import Place, PlaceFields
 from core.recognition.recognition import describe, frame_digest
-from core.storage import Change, Enrolment, Map, SameFrame
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine
-from service.engine.queue import AHEAD, RequestDeadline
+from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameNeeded, TooManyPlaces
 from service.places.batch_order import BatchTurn, Stage
 from service.places.place_events import tell_enrolment
@@ -135,7 +135,7 @@ async def enrol(
                                 reject(i, made)
                             else:
                                 enrolments[i], times[i] = made
-                        if batch_turn is not None and len(sent) - len(enrolments) <= AHEAD:
+                        if batch_turn is not None and len(sent) - len(enrolments) <= engine.queue.encoders.ahead:
                             batch_turn.report(Stage.ENCODED)
         if batch_turn is not None:
             batch_turn.report(Stage.ENCODED)

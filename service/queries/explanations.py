@@ -11,6 +11,7 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.geometry.verification import LEAST_MATCHES
+from core.maps import Map
 from core.method.encoder import Encoder
 from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
@@ -18,8 +19,7 @@ from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
 from core.places import Place
 from core.recognition.recognition import Answer
-from core.storage import Map
-from service.engine.encoder_threads import Encoded
+from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.queries.pictures import ExplanationPictures, Line, Outline, scaled, side_by_side
@@ -44,7 +44,7 @@ DRAWN = 60
 
 def scaled_for_drawing(encoded: Encoded) -> Encoded:
     """A copy whose pixels are scaled to the size of the drawing: a frame of 40 megapixels would fill the memory."""
-    return replace(encoded, pixels=scaled(encoded.pixels))
+    return replace(encoded, source=scaled(encoded.pixels))
 
 
 async def explain_match(

@@ -23,8 +23,8 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import PlacerecError, UnknownMap
 from core.judgement.verdict import Verdict
+from core.maps import Map
 from core.places import Timestamp
-from core.storage import Map
 from core.upkeep.drift import SCORE_BINS, Week
 from service.engine.engine import Engine
 from service.queries.recent_answers import MapKey, RecentAnswers
@@ -198,7 +198,11 @@ class QueryStatistics:
             if engine.atlas.quarantined():
                 return None  # a map that is quarantined may come back
             found = {}
-            for record in engine.all_records():
+            try:
+                records = engine.all_records()
+            except PlacerecError:
+                return None
+            for record in records:
                 try:
                     map_ = engine.atlas.find(record.id)
                 except UnknownMap:

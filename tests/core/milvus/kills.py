@@ -124,7 +124,7 @@ def running(loads: Sequence[Load]) -> Iterator[None]:
 
 def check(lab: MilvusMap, may: May) -> None:
     """Every place shows what it may show, is stored whole and is found."""
-    outline, snapshot = lab.outline(), lab.snapshot()
+    outline, snapshot = lab.transfer.outline(), lab.snapshot()
     found = {place.id: place for place in outline}
     assert len(snapshot) == len(found)
     for name, shows in may.items():

@@ -28,7 +28,7 @@ from core.milvus.collection import Connection
 
 ROOT = Path(__file__).parents[3]
 MILVUS_PYTHON = ROOT / ".venv-cluster/bin/python"
-START_SECONDS = 120.0
+START_SECONDS = 300.0
 NICENESS = 10
 
 MILVUS_SETTINGS = {"common.session.ttl": "10"}
@@ -77,6 +77,7 @@ def free_port() -> int:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return int(listener.getsockname()[1])
+
 
 _ETCD = """
 listen-client-urls: http://127.0.0.1:{client}
@@ -188,7 +189,11 @@ class Servers:
         psycopg.connect(self.postgres_address, connect_timeout=5).close()
 
     def _ask_milvus(self) -> None:
-        Connection(self.milvus_address, "", "", None).close()
+        connection = Connection(self.milvus_address, "", "", None)
+        try:
+            connection.check()
+        finally:
+            connection.close()
 
 
 def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:

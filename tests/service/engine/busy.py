@@ -8,11 +8,11 @@ import time
 import torch
 
 from core.method.encoder import Encoder
-from service.engine.encoder_threads import Encoded, EncoderThreads, QueuedFrame
+from service.engine.encoders import Encoded, Encoders, QueuedFrame
 from tests.service.scenes import jpeg
 
 
-def keep_busy(encoder_threads: EncoderThreads, encoder: Encoder) -> tuple[list[QueuedFrame], threading.Event]:
+def keep_busy(encoders: Encoders, encoder: Encoder) -> tuple[list[QueuedFrame], threading.Event]:
     """Give every thread a frame that it does not finish until the event is set; those frames, and the event."""
     done, begun = threading.Event(), threading.Semaphore(0)
 
@@ -24,7 +24,7 @@ def keep_busy(encoder_threads: EncoderThreads, encoder: Encoder) -> tuple[list[Q
         QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=wait)
         for _ in range(torch.get_num_threads())
     ]
-    encoder_threads.put(frames)
+    encoders.put(frames)
     for _ in frames:
         assert begun.acquire(timeout=30)
     return frames, done

@@ -24,8 +24,9 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.threads import cores
 from service.engine import encoder_threads
-from service.engine.encoder_threads import BULK_SHARE, MOST_PIXELS, Encoded, EncoderThreads, QueuedFrame
-from service.engine.queue import AHEAD, EncoderQueue, Outcomes, RequestDeadline
+from service.engine.encoder_threads import MOST_PIXELS, EncoderThreads
+from service.engine.encoders import BULK_SHARE, Encoded, QueuedFrame, WaitingFrames
+from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.errors.faults import ClientGone, DeadlineExceeded
 from service.telemetry.metrics import Metrics
 from tests.service.encoders import COARSE, install_coarse_encoder
@@ -275,6 +276,11 @@ def queue(catalogue: EncoderCatalogue) -> Iterator[EncoderQueue]:
     made.close()
 
 
+def waiting(queue: EncoderQueue) -> WaitingFrames:
+    assert isinstance(queue.encoders, EncoderThreads)
+    return queue.encoders._waiting
+
+
 async def collected(queue: EncoderQueue, frames: Sequence[bytes], deadline: RequestDeadline) -> Outcomes:
     identity = EncoderCatalogue().resolve(DEFAULT_ENCODER)
     return [one async for some in queue.encode_many(identity, frames, deadline) for one in some]
@@ -282,7 +288,7 @@ async def collected(queue: EncoderQueue, frames: Sequence[bytes], deadline: Requ
 
 @pytest.mark.anyio
 async def test_many_frames_of_one_request(queue: EncoderQueue, default: Encoder) -> None:
-    frames = [jpeg(index % 6) for index in range(AHEAD + 10)]
+    frames = [jpeg(index % 6) for index in range(queue.encoders.ahead + 10)]
     frames[4] = b"poison"
     found = await collected(queue, frames, RequestDeadline(time.monotonic() + 60, stays))
     assert sorted(index for index, _ in found) == list(range(len(frames)))
@@ -302,14 +308,14 @@ async def test_waiting_frames_of_an_aborted_request_are_cancelled(queue: Encoder
         await asyncio.sleep(0.2)
 
     encoder = await queue.load(EncoderCatalogue().resolve(DEFAULT_ENCODER))
-    _, free = keep_busy(queue._threads, encoder)
+    _, free = keep_busy(queue.encoders, encoder)
     deadline = RequestDeadline(time.monotonic() + (0.2 if fault is DeadlineExceeded else 60), leaves)
     if fault is DeadlineExceeded:
         deadline = RequestDeadline(deadline.at, stays)
     with pytest.raises(fault):
-        await collected(queue, [jpeg(0)] * (AHEAD + 5), deadline)
-    assert not queue._threads._robots and queue._threads._bulk
-    assert all(frame.result.cancelled() for frame in queue._threads._bulk)
+        await collected(queue, [jpeg(0)] * (queue.encoders.ahead + 5), deadline)
+    left = waiting(queue)
+    assert not left._robots and left._bulk and all(frame.result.cancelled() for frame in left._bulk)
     free.set()
     await queue.encode(encoder.identity, jpeg(1), RequestDeadline(time.monotonic() + 60, stays))
 
@@ -320,9 +326,9 @@ async def test_a_frame_that_is_too_late_ends_its_request(queue: EncoderQueue) ->
     await queue.load(identity := EncoderCatalogue().resolve(DEFAULT_ENCODER))
     at = time.monotonic() + 1
     with pytest.raises(DeadlineExceeded):
-        async for _ in queue.encode_many(identity, [jpeg(0)] * (AHEAD + 2), RequestDeadline(at, stays)):
+        async for _ in queue.encode_many(identity, [jpeg(0)] * (queue.encoders.ahead + 2), RequestDeadline(at, stays)):
             await asyncio.sleep(max(0.0, at - time.monotonic()))
-            while queue._threads._bulk:
+            while len(waiting(queue)):
                 await asyncio.sleep(0.01)
 
 

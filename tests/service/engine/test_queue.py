@@ -48,7 +48,7 @@ async def queue() -> AsyncIterator[EncoderQueue]:
 @pytest.fixture
 def busy(queue: EncoderQueue) -> Iterator[threading.Event]:
     """The encoder's threads are at work until the event is set."""
-    _, done = keep_busy(queue._threads, queue._loaded[IDENTITY])
+    _, done = keep_busy(queue.encoders, queue._loaded[IDENTITY])
     yield done
     done.set()
 

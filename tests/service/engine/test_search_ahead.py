@@ -17,7 +17,8 @@ from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.storage import Map
 from service.engine import searches
-from service.engine.encoder_threads import AfterEncoding, Encoded, EncoderThreads, QueuedFrame
+from service.engine.encoder_threads import EncoderThreads
+from service.engine.encoders import AfterEncoding, Encoded, QueuedFrame
 from service.engine.searches import Searches, search_ahead
 from service.queries.parameters import QueryParameters
 from tests.service.engine.test_searches import map_of_scenes
@@ -63,7 +64,7 @@ def test_searches_that_may_take_long_are_not_done_ahead(
     search, now = search_ahead(map_, 3, None), map_.snapshot()
     assert search is not None
     with monkeypatch.context() as patched:
-        patched.setattr(map_, "snapshot", lambda: replace(now, holds=False))
+        patched.setattr(map_, "_snapshot", replace(now, holds=False))
         assert search(encoded(encoder, scene(0))) is None, "what is on the disk may take long"
     monkeypatch.setattr(searches, "MOST_AHEAD", 3)
     assert search_ahead(map_, 3, None) is None

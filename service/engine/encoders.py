@@ -1,0 +1,186 @@
+"""What the queue asks of the encoders, wherever they run: threads of this process, or processes of a cluster.
+
+A frame waits in :class:`WaitingFrames` and becomes an :class:`Encoded`; :class:`Encoders` are what encodes it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from core.frames.containers import read_header
+from core.frames.images import Limits
+from core.frames.masks import Mask
+from core.frames.preprocessing import Pixels
+from core.geometry.detection import ScaledFrame, keypoints_in
+from core.geometry.keypoints import Keypoints
+from core.method.encoder import Encoder, Encoding
+from core.networks.xfeat import packaged_xfeat
+from service.errors.faults import DeadlineExceeded
+from service.telemetry.metrics import Metrics
+
+BULK_SHARE = 4
+"""One frame in so many is a bulk frame while robots' frames wait, or bulk would wait as long as robots send."""
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A frame, decoded and encoded.
+
+    source: its pixels, or what decodes them when they are first asked for, where another process has encoded it.
+    encoder: the encoder that has encoded it.
+    milliseconds: spent in ``wait`` (in the queue), ``decode``, ``forward``, ``regions``, ``vlad`` and ``keypoints``.
+    mask: the part of the frame that was ignored.
+    keypoints: its keypoints, if they were asked for.
+    search_result: what the frame's ``after_encoding`` returned for it; None if it had none, or that failed.
+    """
+
+    source: Pixels | Callable[[], Pixels]
+    encoding: Encoding
+    encoder: Encoder
+    milliseconds: dict[str, float]
+    mask: Mask | None = None
+    keypoints: Keypoints | None = None
+    search_result: Any = None
+    _scaled: ScaledFrame | None = None
+
+    @cached_property
+    def pixels(self) -> Pixels:
+        """Uint8 [H, W, 3], BGR."""
+        return self.source() if callable(self.source) else self.source
+
+    @property
+    def scaled(self) -> ScaledFrame:
+        """The frame as keypoints are found in it."""
+        return self._scaled or ScaledFrame.of(self.pixels, self.mask)
+
+    def find_keypoints(self) -> Keypoints:
+        """The frame's keypoints; unless they were asked for, this takes about 20 ms."""
+        return keypoints_in(packaged_xfeat(), self.scaled) if self.keypoints is None else self.keypoints
+
+    def without_pixels(self, keep_scaled: bool = False) -> Encoded:
+        """A copy with 0 x 0 pixels, for frames that stay in memory for a while.
+
+        Args:
+            keep_scaled: keep what keypoints are found in, at most 0.7 MB.
+        """
+        return replace(self, source=np.zeros((0, 0, 3), np.uint8), _scaled=self.scaled if keep_scaled else None)
+
+
+AfterEncoding = Callable[[Encoded], object]
+"""A function that is called with a frame once it is encoded."""
+
+
+@dataclass(eq=False)
+class QueuedFrame:
+    """One frame that waits to be encoded; cancel ``result`` to withdraw it.
+
+    data: the bytes of the frame's file.
+    mask: the part of the frame that is ignored.
+    deadline: the ``time.monotonic`` after which its encoding is not begun any more.
+    bulk: whether its request has many frames; such a frame may wait longer than the single frame of a robot.
+    keypoints: whether the frame's keypoints are wanted, too.
+    after_encoding: is called in the encoder's thread: a search done there needs no change of threads.  It must take
+        only milliseconds.
+    result: the encoded frame, or the error that kept it from being encoded.
+    attempts: how often its encoding was begun and lost, because the process that had it ended.
+    queued: the ``time.perf_counter`` at which the frame began to wait.
+    pixels: the number of pixels by the header of the file, or 0 if that cannot be read.
+    """
+
+    encoder: Encoder
+    data: bytes
+    mask: Mask | None
+    deadline: float
+    bulk: bool = False
+    keypoints: bool = False
+    after_encoding: AfterEncoding | None = None
+    attempts: int = 0
+    result: Future[Encoded] = field(default_factory=Future)
+    queued: float = field(default_factory=time.perf_counter)
+    pixels: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        with suppress(Exception):  # decoding will report it
+            header = read_header(self.data)
+            self.pixels = header.width * header.height
+
+
+class WaitingFrames:
+    """Frames in the order of their turns: robots' first, but a share is reserved for bulk frames.  Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._robots: deque[QueuedFrame] = deque()
+        self._bulk: deque[QueuedFrame] = deque()
+        self._passed_over = 0  # robots' frames that were taken while bulk frames waited
+
+    def __len__(self) -> int:
+        return len(self._robots) + len(self._bulk)
+
+    def add(self, frame: QueuedFrame) -> None:
+        """Add a frame; bulk frames keep their order, and so do the others."""
+        (self._bulk if frame.bulk else self._robots).append(frame)
+
+    def first(self) -> QueuedFrame | None:
+        """The frame whose turn it is; None if none waits."""
+        queue = self._queue()
+        return queue[0] if queue else None
+
+    def remove_first(self) -> None:
+        """Remove the frame whose turn it is."""
+        self._queue().popleft()
+
+    def count_turn(self, frame: QueuedFrame) -> None:
+        """Note that a frame, which was removed, is being encoded."""
+        self._passed_over = 0 if frame.bulk else self._passed_over + bool(self._bulk)
+
+    def clear(self) -> list[QueuedFrame]:
+        """Remove all frames, and return them."""
+        frames = [*self._robots, *self._bulk]
+        self._robots.clear()
+        self._bulk.clear()
+        return frames
+
+    def _queue(self) -> deque[QueuedFrame]:
+        """The queue whose turn it is."""
+        bulk_next = not self._robots or (self._bulk and self._passed_over >= BULK_SHARE - 1)
+        return self._bulk if bulk_next else self._robots
+
+
+class Encoders(Protocol):
+    """What encodes the frames that a queue has let in.  Thread-safe.
+
+    A frame that cannot be encoded fails alone, by the error of its ``result``.  One whose ``result`` is cancelled
+    before its encoding has begun is not encoded, nor is one whose deadline has passed.
+    """
+
+    @property
+    def ahead(self) -> int:
+        """Frames of one bulk request that wait at a time: enough that the encoders never run out of them."""
+
+    @property
+    def state(self) -> str:
+        """ "ok", or a sentence that says why no frame is encoded now."""
+
+    def put(self, frames: Iterable[QueuedFrame]) -> None:
+        """Add frames; returns at once."""
+
+    def close(self) -> None:
+        """Cancel all waiting frames and end; blocks."""
+
+
+MakeEncoders = Callable[[Limits, Metrics], Encoders]
+"""Makes what encodes frames, given the largest frame that is decoded and where to count."""
+
+
+def deadline_exceeded() -> DeadlineExceeded:
+    """The error of a frame whose deadline passed before its encoding began."""
+    return DeadlineExceeded("The deadline of the request passed before its frame was encoded.")
