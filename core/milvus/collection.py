@@ -26,7 +26,7 @@ from pymilvus.exceptions import MilvusException
 
 from core.errors import StoreOfAnotherVersion
 from core.milvus.expressions import NO_HEADING
-from core.milvus.indexes import search_settings
+from core.milvus.indexes import indexing_for, search_settings
 from core.milvus.outage import Outage, Unreachable
 from core.places import Whereabouts
 
@@ -157,19 +157,25 @@ class Collection:
         with self._making:
             if self._collection is not None:
                 return
-            found = None
+            chosen = indexing_for(utility.get_server_version(using=connection, timeout=_PATIENCE_SECONDS))
+            schema = _schema(self._encoder, self._dimension, chosen.half)
             if utility.has_collection(self._name, using=connection, timeout=_PATIENCE_SECONDS):
-                found = Connected(self._name, using=connection).schema.description
-            if found not in (None, self._schema.description):
-                raise StoreOfAnotherVersion(
-                    f"Milvus's collection {self._name} was made by another version: {found[:200]!r}."
-                )
-            made = Connected(
-                self._name, self._schema, connection, num_partitions=PARTITIONS, shards_num=1,
-                consistency_level="Bounded",
-            )  # fmt: skip
+                made = Connected(self._name, using=connection)
+                if (found := made.schema.description) != schema.description:
+                    raise StoreOfAnotherVersion(
+                        f"Milvus's collection {self._name} was made by another version: {found[:200]!r}."
+                    )
+            else:
+                made = Connected(
+                    self._name, schema, connection, num_partitions=PARTITIONS, shards_num=1,
+                    consistency_level="Bounded",
+                )  # fmt: skip
             if not made.has_index():
-                made.create_index("descriptor", {"index_type": "FLAT", "metric_type": "IP", "params": {}})
+                made.create_index("descriptor", dict(chosen.index))
+            # A collection stays as it was made when its server becomes a newer one.
+            types = {field.name: field.dtype for field in made.schema.fields}
+            self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
+            self.index_type = str(made.index().params["index_type"])
             made.load()
             self._collection = made
 
@@ -204,13 +210,12 @@ class Collection:
             )
         return [int(one["key"]) for one in found]
 
-    def descriptors_of(self, keys: Sequence[int], seen_from: int) -> dict[int, NDArray[np.float32]]:
-        """The descriptors of entities by key, float32 [D]; keys that Milvus does not have are left out."""
+    def descriptors_of(self, keys: Sequence[int]) -> dict[int, NDArray[np.float32]]:
+        """The descriptors of entities by key, float32 [D]; keys that Milvus does not have now are left out."""
         with self._using("read descriptors") as collection:
             found = collection.query(
-                f"key in {list(keys)}", ["key", "descriptor"], timeout=_PATIENCE_SECONDS,
-                consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
-            )  # fmt: skip
+                f"key in {list(keys)}", ["key", "descriptor"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
+            )
         return {int(one["key"]): self._vector(one["descriptor"]) for one in found}
 
     def _vector(self, value: Any) -> NDArray[np.float32]:
@@ -230,9 +235,12 @@ class Collection:
             seen_from: a timestamp of Milvus; what was inserted until then is searched.
         """
         with self._using("search") as collection:
-            queries = list(descriptors.astype(self._value, copy=False))
+            queries, settings = (
+                list(descriptors.astype(self._value, copy=False)),
+                search_settings(self.index_type, limit),
+            )
             found = collection.search(
-                queries, "descriptor", search_settings(self.index_type, limit), limit, expression, timeout=_PATIENCE_SECONDS,
+                queries, "descriptor", settings, limit, expression, timeout=_PATIENCE_SECONDS,
                 consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
             )  # fmt: skip
         return [

@@ -38,7 +38,7 @@ from core.maps.records import (
     patched_record,
 )
 from core.maps.selection import Selection
-from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
+from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, Tier, no_progress
 from core.milvus import ledger
 from core.milvus.cameras import MilvusCameras
 from core.milvus.collection import Collection, Entity
@@ -266,11 +266,12 @@ class MilvusMap:
     # How it is kept
 
     def index_status(self) -> IndexStatus:
-        """How the map is searched: Milvus compares every place."""
+        """How the map is searched: by Milvus, which compares every place if its collection has no other index."""
+        tier: Tier = "exact" if self.collection.index_type == "FLAT" else "compact"
         return IndexStatus(
             setting=self.record.index,
-            tier="exact",
-            wanted="exact",
+            tier=tier,
+            wanted=tier,
             state="ready",
             progress=1,
             rows_indexed=0,

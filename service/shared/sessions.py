@@ -16,7 +16,7 @@ from typing import Any
 
 from core.belief import DamagedRecord, Run, from_bytes
 from core.errors import StorageFailure, StorageFull
-from core.storage import Map
+from core.maps import Map
 from service.errors.faults import SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.sessions.schemas import NewSession
