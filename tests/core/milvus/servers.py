@@ -79,6 +79,16 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
+_ETCD = """
+listen-client-urls: http://127.0.0.1:{client}
+advertise-client-urls: http://127.0.0.1:{client}
+listen-peer-urls: http://127.0.0.1:{peer}
+initial-advertise-peer-urls: http://127.0.0.1:{peer}
+initial-cluster: default=http://127.0.0.1:{peer}
+"""
+"""Without it, two Milvus on one machine would want the same port."""
+
+
 def fixed_ports(count: int) -> list[int]:
     """Ports that nobody listens at, and of which the system makes no use."""
     found: list[int] = []
@@ -189,10 +199,12 @@ class Servers:
 def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:
     """A Milvus that keeps its data and its ports when it is started again."""
     others = fixed_ports(20)
-    ports = ",".join(str(other) for other in (*others[1:], port))
+    ports = ",".join(str(other) for other in (*others[3:], port))
     named = [f"{name}={value}" for name, value in settings.items()]
     subprocess.run([MILVUS_PYTHON, "-c", _CONFIGURE, folder, ports, *named], check=True)
+    (folder / "etcd.yaml").write_text(_ETCD.format(client=others[1], peer=others[2]))
     variables = {
+        "ETCD_CONFIG_PATH": str(folder / "etcd.yaml"),
         "DEPLOY_MODE": "STANDALONE",
         "METRICS_PORT": str(others[0]),
         "MILVUS_RUN_DIR": str(folder / "run"),
