@@ -35,16 +35,16 @@ from core.maps.records import (
 from core.maps.selection import Selection
 from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, Tier, no_progress
 from core.milvus import ledger
-from core.milvus.cameras import MilvusCameras
 from core.milvus.collection import Collection
-from core.milvus.counterparts import MilvusCounterparts
 from core.milvus.database import Database
-from core.milvus.exporter import MilvusExporter
 from core.milvus.ledger import MapState, PlaceEntry
-from core.milvus.plan import MilvusPlan
-from core.milvus.review import MilvusReview
+from core.milvus.parts.cameras import MilvusCameras
+from core.milvus.parts.counterparts import MilvusCounterparts
+from core.milvus.parts.exporter import MilvusExporter
+from core.milvus.parts.plan import MilvusPlan
+from core.milvus.parts.review import MilvusReview
+from core.milvus.parts.transfer import MilvusTransfer
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
-from core.milvus.transfer import MilvusTransfer
 from core.milvus.writing import Write, expect_place
 from core.places import Place, PlaceFields
 from core.storage.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of

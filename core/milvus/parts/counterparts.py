@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager
 
 from core.maps.counterparts import Correspondence, brought_over
 from core.milvus import ledger
-from core.milvus.cameras import Access
+from core.milvus.parts.cameras import Access
 from core.milvus.writing import Write
 
 

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import Enrolment, History, Outline
 from core.milvus import ledger
-from core.milvus.cameras import Access
+from core.milvus.parts.cameras import Access
 from core.milvus.writing import Write
 from core.places import Place
 
