@@ -78,6 +78,8 @@ class Keyring:
     Args:
         store: what keeps the keys.
         wall, monotonic: the clocks, in seconds.
+        may_open: whether everybody may be let in while there are no keys; else nobody is, if that is learnt only after
+            the start.
     """
 
     def __init__(
@@ -85,9 +87,11 @@ class Keyring:
         store: KeyRecords,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = time.monotonic,
+        may_open: bool = True,
     ) -> None:
         self.store, self._wall, self._monotonic = store, wall, monotonic
         self._known = _Known()
+        self._may_open, self._seen_keys = may_open, False
         self._source = store.watch()
         self._read_at = self._looked_at = monotonic()
         self._used: dict[str, float] = {}
@@ -102,12 +106,20 @@ class Keyring:
         return self._known.demanded
 
     def start(self) -> None:
-        """Read the file, and start the thread that watches it.
+        """Read the keys, and start the thread that watches them.
+
+        Nobody is let in until they can be read, if they are on a server that cannot be reached.
 
         Raises:
-            KeysUnreadable: the file exists but cannot be read.
+            KeysUnreadable: their file exists but cannot be read.
         """
-        self._read()
+        try:
+            self._read()
+        except KeysUnreadable as error:
+            if not self.store.remote:
+                raise
+            log.error("nobody is let in: %s", error)
+            self._known = _Known(demanded=True, broken=str(error))
         self._thread = threading.Thread(target=self._watch, name="keys", daemon=True)
         self._thread.start()
 
@@ -197,7 +209,10 @@ class Keyring:
     def _read(self) -> None:
         keys = self._source.read()
         if keys is None:
+            if self._known.broken is not None and not self._seen_keys:
+                self._known = _Known(demanded=not self._may_open)
             return
+        self._seen_keys = True
         before = self._known.held
         held = {key.id.encode(): self._hold(key, before.get(key.id.encode())) for key in keys}
         if not self._known.demanded:

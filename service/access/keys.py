@@ -22,7 +22,7 @@ from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
@@ -148,7 +148,11 @@ class KeyRecords(ABC):
 
     All methods may raise KeysUnreadable: the keys are damaged, of a later version or writable by others, or the disk or
     server failed.
+
+    remote: whether they are on a server, which may be away for a while.
     """
+
+    remote: ClassVar[bool] = False
 
     @abstractmethod
     def exists(self) -> bool:

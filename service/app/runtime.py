@@ -14,7 +14,7 @@ from anyio import CapacityLimiter, to_thread
 from starlette.datastructures import State
 
 from core.disk.files import check_writable
-from core.errors import PlacerecError
+from core.errors import PlacerecError, StoreUnavailable
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
@@ -58,9 +58,9 @@ class Runtime:
         self.settings = settings
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
-            self.engine = Engine(settings, metrics)
-            opened.callback(self.engine.close)
             self.shared = None if database is None else _shared_state(settings, database)
+            self.engine = Engine(settings, metrics, None if self.shared is None else self.shared.events)
+            opened.callback(self.engine.close)
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
             if self.shared is None:
@@ -70,7 +70,8 @@ class Runtime:
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.batch_order, self.plans = BatchOrder(), Plans()
-        self.statistics = QueryStatistics.of_engine(self.engine)
+        statistics = QueryStatistics.of_engine if self.shared is None else self.shared.statistics
+        self.statistics = statistics(self.engine)
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
         self.health_examinations = CapacityLimiter(1)  # each is a long search
@@ -113,10 +114,13 @@ class Runtime:
         for name in unknown_variables():
             log.warning("the environment sets %s, which is not a setting", name)
         self.engine.start()
-        self._remove_leftovers()
+        try:
+            self._remove_leftovers()
+            self.imports.clean()
+        except StoreUnavailable as error:
+            log.warning("what the last run has left stays until the next start: %s", error)
         self.statistics.start()
         self.exports.clean()
-        self.imports.clean()
         if self.shared is not None:
             self.shared.start()
         self.jobs.start()

@@ -87,7 +87,7 @@ class Engine:
         MissingExtra: the store of the settings needs a package that is not installed.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+    def __init__(self, settings: Settings, metrics: Metrics, events: Events | None = None) -> None:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.atlas: Store = self._store.maps
@@ -95,7 +95,7 @@ class Engine:
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
         self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
         self.searches = Searches()
-        self.events = Events(settings.event_listeners)
+        self.events = Events(settings.event_listeners) if events is None else events
         self.review_keeper = ReviewKeeper()
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""

@@ -24,7 +24,6 @@ def open_database(settings: Settings) -> SharedDatabase | None:
 
     Raises:
         MissingExtra: what speaks to PostgreSQL is not installed.
-        StorageFull, StorageFailure: PostgreSQL cannot be reached, or refuses.
     """
     if settings.postgres is None:
         return None

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import psycopg
 from psycopg import Connection
 from psycopg_pool import ConnectionPool, PoolTimeout
 
-from core.errors import StorageFailure
+from core.errors import StoreUnavailable
 from core.milvus.ledger import postgres_errors
+from core.milvus.outage import Outage
 
 TABLES = (Path(__file__).parent / "tables.sql").read_text()
 
@@ -29,7 +32,7 @@ MAKING_TABLES = 7_061_636_573
 SETTINGS: dict[str, Any] = {
     "application_name": "placerec",
     "autocommit": True,
-    "connect_timeout": 5,
+    "connect_timeout": 3,
     # A machine that is gone is noticed within some ten seconds.
     "keepalives_idle": 5,
     "keepalives_interval": 2,
@@ -45,9 +48,10 @@ def configure(connection: Connection[Any]) -> None:
 
 
 class SharedDatabase:
-    """The PostgreSQL that has what services share; its tables are made if they are missing.  Any thread may use it.
+    """The PostgreSQL that has what services share.  Any thread may use it.
 
-    Every method may raise StorageFull or StorageFailure: PostgreSQL cannot be reached, or refuses.
+    It is connected to when it is first used; its tables are made then, if they are missing.  Every method may raise
+    StoreUnavailable (it cannot be reached), StorageFull or StorageFailure (it refuses).
 
     Args:
         address: as libpq takes it, such as ``postgresql://placerec@db/placerec``.
@@ -55,16 +59,30 @@ class SharedDatabase:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        self._pool = ConnectionPool(
-            address, min_size=1, max_size=MOST_CONNECTIONS, timeout=PATIENCE_SECONDS, kwargs=SETTINGS,
-            configure=configure, check=ConnectionPool.check_connection, open=True,
-        )  # fmt: skip
-        try:
-            with self.transaction("make its tables", MAKING_TABLES) as connection:
-                connection.execute(TABLES)
-        except BaseException:
-            self.close()
-            raise
+        self._outage = Outage("PostgreSQL")
+        self._opening = threading.Lock()
+        self._pool: ConnectionPool[Connection[Any]] | None = None
+
+    def _opened(self) -> ConnectionPool[Connection[Any]]:
+        """The pool of connections to a database whose tables are there."""
+        if (pool := self._pool) is not None:
+            return pool
+        with self._opening:
+            if self._pool is None:
+                with self._alone() as connection, connection.transaction():
+                    connection.execute("SELECT pg_advisory_xact_lock(%s)", (MAKING_TABLES,))
+                    connection.execute(TABLES)
+                self._pool = ConnectionPool(
+                    self.address, min_size=1, max_size=MOST_CONNECTIONS, timeout=PATIENCE_SECONDS, kwargs=SETTINGS,
+                    configure=configure, check=ConnectionPool.check_connection, open=True,
+                )  # fmt: skip
+            return self._pool
+
+    @contextmanager
+    def _alone(self) -> Iterator[Connection[Any]]:
+        """A connection of its own, which says why there is none."""
+        with postgres_errors("make its tables"), psycopg.connect(self.address, **SETTINGS) as connection:
+            yield connection
 
     def execute(self, action: str, query: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Execute one statement, which is durable when this returns; the rows that it gives.
@@ -90,12 +108,25 @@ class SharedDatabase:
 
     @contextmanager
     def _connected(self, action: str) -> Iterator[Connection[Any]]:
-        try:
-            with postgres_errors(action), self._pool.connection() as connection:
-                yield connection
-        except PoolTimeout as error:
-            raise StorageFailure("PostgreSQL cannot be reached.") from error
+        with self._outage.noticed():
+            pool = self._opened()
+            try:
+                with postgres_errors(action), pool.connection() as connection:
+                    yield connection
+            except PoolTimeout as error:
+                with self._alone():  # raises if it cannot be reached
+                    pass
+                raise StoreUnavailable("All connections to PostgreSQL are in use.") from error
+
+    def __enter__(self) -> SharedDatabase:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Close all connections."""
-        self._pool.close()
+        with self._opening:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.close()

@@ -291,7 +291,8 @@ class SharedJobs(Jobs):
         """Do nothing: the connections are not of the jobs."""
 
     def _resume(self) -> None:
-        self.keep_up()
+        with suppress(StorageFailure):  # it is done as soon as PostgreSQL can be reached
+            self.keep_up()
 
     # Keeping up with the others
 

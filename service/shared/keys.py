@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, ClassVar
 
 from psycopg import Connection
 
@@ -25,6 +25,8 @@ class SharedKeys(KeyRecords):
 
     A change locks the version of the keys, so that one comes after the other.
     """
+
+    remote: ClassVar[bool] = True
 
     def __init__(self, database: SharedDatabase) -> None:
         self.database = database

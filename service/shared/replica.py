@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import secrets
 import threading
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 import psycopg
 
 from core.disk.files import disk_errors, write_file
+from core.errors import StorageFailure
 from service.shared.database import SETTINGS, SharedDatabase
 
 FILE = "replica"
@@ -42,10 +44,10 @@ class Replica:
 
     Args:
         database: what the services share; it is closed by its owner.
-        directory: the data directory, which this process holds.
+        directory: the data directory.
 
     Raises:
-        StorageFull, StorageFailure: PostgreSQL cannot be reached, or refuses; or the directory cannot be written to.
+        StorageFull, StorageFailure: the directory cannot be written to.
     """
 
     def __init__(self, database: SharedDatabase, directory: Path) -> None:
@@ -53,17 +55,11 @@ class Replica:
         self.id, self.process = _id_of(directory), secrets.token_hex(8)
         self.displaced = False
         """Whether another service runs under this id, because its data directory is a copy."""
-        self._beaten = time.monotonic()
+        self._entered, self._beaten = False, -math.inf
         self._tasks: list[Callable[[], None]] = []
         self._heard: dict[str, Heard] = {}
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
-        self.database.execute(
-            "enter itself",
-            "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
-            " SET process = excluded.process, seen = clock_timestamp()",
-            (self.id, self.process),
-        )
 
     def every(self, task: Callable[[], None]) -> None:
         """Do something at every beat, in a thread; call it before :meth:`start`."""
@@ -74,7 +70,14 @@ class Replica:
         self._heard[topic] = heard
 
     def start(self) -> None:
-        """Begin to beat and to listen."""
+        """Enter, and begin to beat and to listen; the process must hold its data directory.
+
+        If PostgreSQL cannot be reached, this service enters as soon as it can.
+        """
+        try:
+            self.beat()
+        except StorageFailure as error:
+            log.error("the service does not take part yet: %s", error)
         for name, work in (("replica-beat", self._beat_on), ("replica-listen", self._listen_on)):
             thread = threading.Thread(target=work, name=name, daemon=True)
             thread.start()
@@ -128,6 +131,14 @@ class Replica:
             StorageFailure: PostgreSQL cannot be reached, or refuses.
         """
         began = time.monotonic()
+        if not self._entered:
+            enter = (
+                "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
+                " SET process = excluded.process, seen = clock_timestamp()"
+            )
+            self.database.execute("enter", enter, (self.id, self.process))
+            self._entered, self._beaten = True, began
+            return
         query = "UPDATE service.replicas SET seen = clock_timestamp() WHERE id = %s AND process = %s RETURNING id"
         if self.displaced:
             return

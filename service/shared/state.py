@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from service.engine.engine import Engine
 from service.events.events import Events
 from service.jobs.jobs import Jobs
+from service.queries.statistics import QueryStatistics
 from service.sessions.sessions import Sessions
 from service.settings import Settings
 from service.shared.audit import AuditTable
 from service.shared.database import SharedDatabase
+from service.shared.events import SharedEvents
 from service.shared.jobs import SharedJobs
 from service.shared.replica import Replica
 from service.shared.sessions import SharedSessions
+from service.shared.statistics import SharedStatistics
 
 
 class SharedState:
@@ -25,6 +29,11 @@ class SharedState:
         self._settings, self._shared_maps = settings, shared_maps
         self.replica = Replica(database, settings.data_dir)
         self.audit = AuditTable(database, self.replica.id)
+        self.events = SharedEvents(self.replica, settings.event_listeners)
+
+    def statistics(self, engine: Engine) -> QueryStatistics:
+        """The statistics of all services."""
+        return SharedStatistics.of_services(engine, self.replica.database)
 
     def jobs(self, events: Events) -> Jobs:
         """All jobs of all services."""
@@ -40,10 +49,12 @@ class SharedState:
 
     def start(self) -> None:
         """Begin to take part; all parts must be made before."""
+        self.events.start()
         self.replica.start()
         self.audit.start()
 
     def close(self) -> None:
         """Leave the others; blocks."""
+        self.events.close()
         self.audit.close()
         self.replica.close()

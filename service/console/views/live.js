@@ -1,6 +1,6 @@
 // The queries of a map as they are answered: verdict, probability, who asked, and why.
 import { epoch, follow, get, key, may } from "../shared/api.js";
-import { Bar, Dialog, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
+import { Bar, Dialog, ExactMoment, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
 import { decimal, integer, metres, percent, poseText } from "../shared/formats.js";
 import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
@@ -142,6 +142,7 @@ function Details({ map, event, close }) {
       </div>
       <div class="columns">
         <${Facts} rows=${[
+          ["Asked", html`<${ExactMoment} at=${event.at} />`],
           ["Best match", best ? html`<a href=${href("maps", map, "places", best)}>${best}</a>` : "–"],
           ["Score", decimal(score)],
           ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],

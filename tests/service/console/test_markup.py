@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -125,30 +126,79 @@ def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
     check_plain(admin)
 
 
-def test_names_that_kept_frames_and_recent_answers_may_bring(admin: Operator, keyed: Server) -> None:
-    answer = {"verdict": "unknown", "reason": MARKUP, "probability": 0.1, "score": 0.1, "decision": 0.1}
-    answer |= {"threshold": 0.2, "best": MARKUP, "matches": [{"place": MARKUP, "score": 0.1}], "revision": 1}
-    answer |= dict.fromkeys(("camera", "session", "file", "operation", "request_id", "key"), MARKUP)
-    kept = {"id": 1, "at": "2026-11-20T10:00:00Z", "sha256": "0", "bytes": 1, "answer": answer}
-    kept |= {"label": {"place": MARKUP, "new": None, "stranger": False}, "labelled_at": None, "labelled_by": MARKUP}
-    page = admin.page
-    page.route(
-        "**/review?*", lambda route: route.fulfill(json={"items": [kept], "next_cursor": None, "frames": 1, "bytes": 1})
-    )
-    found = {"at": "2026-11-20T10:00:00Z", "rank": 1, "frame": 7, "milliseconds": 1, "principal": MARKUP, **answer}
-    told = {"items": [found], "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
-    page.route("**/matches?*", lambda route: route.fulfill(json=told))
+@contextmanager
+def opened(browser: Browser, server: Server, key: str) -> Iterator[Operator]:
+    """Somebody whose page serves several tests; that pictures are missing is no complaint."""
+    context = browser.new_context()
+    context.set_default_timeout(15_000)
+    page = context.new_page()
+    page.add_init_script(given_key(key))
+    yield Operator(page, f"http://127.0.0.1:{server.port}")
+    context.close()
+
+
+AT = "2026-11-20T10:00:00Z"
+RECENT = ("camera", "session", "principal")
+KEPT = ("camera", "session", "reason", "key", "request_id", "match", "label", "labelled_by")
+
+
+@pytest.fixture(scope="module")
+def recent(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
+    """A place with a recent answer for each of its texts, in which that one is markup; cameras have such names, too."""
+    answer = {
+        "at": AT,
+        "rank": 1,
+        "frame": 7,
+        "milliseconds": 1,
+        "verdict": "unknown",
+        "probability": 0.1,
+        "score": 0.1,
+    }
+    items = [answer | dict.fromkeys(RECENT) | {name: MARKUP} for name in RECENT]
+    told = {"items": items, "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
     cameras = {"items": [{"name": MARKUP, "mask": None}], "next_cursor": None}
-    page.route("**/cameras", lambda route: route.fulfill(json=cameras))
-    admin.foresee("404", "422")  # there are no such pictures
-    admin.go(f"maps/{LAB}/review")
-    check_plain(admin)
-    for text in ("Camera", "Session", "Reason", "By"):
-        expect(page.get_by_role("region", name="Frame to be labelled")).to_contain_text(text + MARKUP)
-    admin.go(f"maps/{LAB}/places/monday-03")
-    row = page.get_by_role("region", name="Answers").get_by_role("row").nth(1)
-    expect(row).to_contain_text(MARKUP)
-    check_plain(admin, MARKUP[:8])
+    with opened(browser, keyed, keys["admin"]) as operator:
+        operator.page.route("**/matches?*", lambda route: route.fulfill(json=told))
+        operator.page.route("**/cameras", lambda route: route.fulfill(json=cameras))
+        operator.go(f"maps/{LAB}/places/monday-03")
+        yield operator
+
+
+@pytest.mark.parametrize("field", RECENT)
+def test_texts_of_recent_answers(recent: Operator, field: str) -> None:
+    row = recent.page.get_by_role("region", name="Answers").get_by_role("row").nth(1 + RECENT.index(field))
+    expect(row).to_contain_text(MARKUP[:8] if field == "session" else MARKUP)
+    check_plain(recent)
+
+
+@pytest.fixture(scope="module")
+def kept(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
+    """A review with a kept frame for each of its texts, in which that one is markup."""
+    items = []
+    for number, name in enumerate(KEPT):
+        answer = live_event(key=None, camera=None, session=None, request_id=None, revision=1)
+        answer["matches"] = [{"place": MARKUP if name == "match" else "p0", "score": 0.1}]
+        frame: dict[str, Any] = {"id": number, "at": AT, "sha256": "0", "bytes": 1, "answer": answer, "label": None}
+        frame |= {"labelled_at": None, "labelled_by": None}
+        if name == "label":
+            frame["label"] = {"place": MARKUP, "new": None, "stranger": False}
+        elif name == "labelled_by":
+            frame |= {"labelled_at": AT, "labelled_by": MARKUP}
+        elif name != "match":
+            answer[name] = MARKUP
+        items.append(frame)
+    told = {"items": items, "next_cursor": None, "frames": len(items), "bytes": 1}
+    with opened(browser, keyed, keys["admin"]) as operator:
+        operator.page.route("**/review?*", lambda route: route.fulfill(json=told))
+        operator.go(f"maps/{LAB}/review")
+        yield operator
+
+
+@pytest.mark.parametrize("field", KEPT)
+def test_texts_of_kept_frames(kept: Operator, field: str) -> None:
+    kept.page.get_by_role("button", name=f"Frame {KEPT.index(field)}", exact=True).click()
+    expect(kept.page.get_by_role("region", name="Frame to be labelled")).to_contain_text(MARKUP)
+    check_plain(kept)
 
 
 LINE, DETAILS = ("key", "camera", "session", "place", "best"), ("reason", "operation", "request_id")
@@ -170,7 +220,7 @@ def told(page: Page, events: list[dict[str, Any]], name: str = "query") -> None:
 
 
 def live_event(**fields: Any) -> dict[str, Any]:
-    event: dict[str, Any] = {"at": "2026-11-20T10:00:00Z", "map": LAB, "verdict": "unknown", "probability": 0.1}
+    event: dict[str, Any] = {"at": AT, "map": LAB, "verdict": "unknown", "probability": 0.1}
     event |= {"score": 0.1, "decision": 0.1, "threshold": 0.2, "milliseconds": {"total": 1}, "pose": None, "frame": 7}
     return event | dict.fromkeys(("place", "picture", "explanation", *LINE, *DETAILS)) | fields
 
@@ -178,15 +228,10 @@ def live_event(**fields: Any) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def live(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
     """The live view with an answer for each of its texts, in which that one is markup; the last one comes first."""
-    context = browser.new_context()
-    context.set_default_timeout(15_000)
-    page = context.new_page()
-    page.add_init_script(given_key(keys["admin"]))
-    told(page, [live_event(**{name: MARKUP}) for name in (*LINE, *DETAILS)])
-    operator = Operator(page, f"http://127.0.0.1:{keyed.port}")
-    operator.go(f"maps/{LAB}/live")
-    yield operator
-    context.close()
+    with opened(browser, keyed, keys["admin"]) as operator:
+        told(operator.page, [live_event(**{name: MARKUP}) for name in (*LINE, *DETAILS)])
+        operator.go(f"maps/{LAB}/live")
+        yield operator
 
 
 @pytest.mark.parametrize("field", [*LINE, *DETAILS])

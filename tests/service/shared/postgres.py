@@ -40,7 +40,9 @@ class Postgres:
         """Forget everything."""
         with psycopg.connect(self.address) as connection:
             connection.execute("DROP SCHEMA IF EXISTS service CASCADE")
-        SharedDatabase(self.address).close()
+        database = SharedDatabase(self.address)
+        database.execute("make its tables", "SELECT 1")
+        database.close()
 
 
 @contextmanager

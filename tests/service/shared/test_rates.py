@@ -36,9 +36,8 @@ def test_what_one_lets_through_the_other_holds_back(database: SharedDatabase) ->
     assert [one.take("bob") for _ in range(6)] == [0.0] * 5 + [pytest.approx(1 / RATE, rel=0.2)]
 
 
-def test_without_the_database_each_keeps_to_it_alone(postgres: Postgres, database: SharedDatabase) -> None:
-    alone = SharedBuckets(SharedDatabase(postgres.address), "request", RATE, 3)
-    alone._database.close()
+def test_without_the_database_each_keeps_to_it_alone() -> None:
+    alone = SharedBuckets(SharedDatabase("postgresql://placerec@127.0.0.1:9/postgres"), "request", RATE, 3)
     assert [alone.take("ann") for _ in range(4)] == [0.0] * 3 + [pytest.approx(1 / RATE, rel=0.2)]
     with pytest.raises(StorageFailure):
         alone.exchange()

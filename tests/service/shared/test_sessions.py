@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 
 from service.shared.database import SharedDatabase
 from service.shared.sessions import SessionTable
+from tests.service.encoders import COARSE
 from tests.service.server import Server, assert_problem
 from tests.service.sessions.contract import STEPS, check_records
 from tests.service.sessions.test_sessions import again, begin, post, send
@@ -91,7 +92,9 @@ def test_frames_at_the_same_time(services: tuple[Server, Server]) -> None:
     assert last == [25, 26]
 
 
-def test_a_killed_service_and_a_database_that_is_away(services: tuple[Server, Server], postgres: Postgres) -> None:
+def test_a_killed_service_and_a_database_that_is_away(
+    services: tuple[Server, Server], postgres: Postgres, tmp_path: Path
+) -> None:
     one, other = services
     session = begin(one, MAP)
     for number in range(4):
@@ -101,8 +104,19 @@ def test_a_killed_service_and_a_database_that_is_away(services: tuple[Server, Se
     assert send(other, MAP, session, again(4), frame=4)["frames"] == 5
     postgres.server.end(signal.SIGINT)
     try:
-        assert post(other, MAP, session, again(5), frame=5).status_code >= 500
-        assert other.query(MAP, again(5))["matches"], "queries need no shared state"
+        refused = post(other, MAP, session, again(5), frame=5)
+        assert_problem(refused, 503, "store-unavailable")
+        assert float(refused.headers["retry-after"]) > 0
+        assert other.query(MAP, again(5))["matches"], "queries go on without it for a few seconds"
+        until = time.monotonic() + 60
+        while other.client.get("/readyz").status_code == 200:
+            assert time.monotonic() < until
+            time.sleep(0.2)
+        assert "PostgreSQL" in other.client.get("/readyz").json()["checks"]["replica"]
+        late = Server(tmp_path / "one", settings={"encoder": COARSE, "postgres": postgres.address}).wait("/livez")
     finally:
         postgres.server.start()
+    other.wait()  # it is ready again by itself, and so is one that was started in the meantime
     assert send(other, MAP, session, again(5), frame=5)["frames"] == 6
+    assert send(late.wait(), MAP, session, again(6), frame=6)["frames"] == 7
+    late.stop()
