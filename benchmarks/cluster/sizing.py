@@ -4,14 +4,14 @@
 
 Robots ask at random moments, each ``--rate`` times a second.  A query passes the front (HTTP and everything but what
 follows), an encoder, Milvus and PostgreSQL; each of these is a queue with several servers (M/M/c), and has as many
-servers as keep its mean wait under ``--wait`` of its own service time.  A robot asks one map, so that Milvus's time grows
-with the places of a map and its memory with those of all maps; that it passes over the other maps of a partition is not
-counted.
+servers as keep its mean wait under ``--wait`` of its own service time.  A robot asks one map, so that Milvus's time
+grows with the places of a map and its memory with those of all maps; that it passes over the other maps of a partition
+is not counted.
 
-Service times come from ``measured.json`` beside this file, or from what ``benchmarks.service`` and
-``benchmarks.cluster.search`` have left in ``benchmarks/results``; prices are assumptions, options of this command.
-Milvus's is the processor time of exact search, by place.  Before it is used, the
-model foretells what was measured: the embedded service with robots that each ask again when they have their answer.
+Service times come from ``measured.json`` beside this file, those of Milvus and PostgreSQL from what
+``benchmarks.cluster.search`` has left in ``benchmarks/results``, if it has; prices are assumptions, options of this
+command.  Milvus's is the processor time of exact search, by place.  Before it is used, the model foretells what was
+measured: the embedded service with robots that each ask again when they have their answer.
 """
 
 from __future__ import annotations
