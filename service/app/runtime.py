@@ -24,6 +24,7 @@ from service.places.plans import Plans
 from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
+from service.ray_serve import encoders_for
 from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
@@ -48,7 +49,7 @@ class Runtime:
         self.settings = settings
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
-            self.engine = Engine(settings, metrics)
+            self.engine = Engine(settings, metrics, encoders_for(settings))
             opened.callback(self.engine.close)
             self.jobs = Jobs(
                 settings.data_dir,
@@ -141,7 +142,8 @@ class Runtime:
         if now - self._disk_checked > DISK_CHECK_SECONDS:
             self._disk_checked = now
             self._disk_state = await in_thread(self._check_disk)
-        checks = {"encoder": self.engine.encoder_state, "maps": "ok", "disk": self._disk_state}
+        encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
+        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": "ok", "disk": self._disk_state}
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]

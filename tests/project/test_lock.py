@@ -54,7 +54,7 @@ def test_the_packages_of_ros_are_locked_within_their_ranges() -> None:
         assert requirement.specifier.contains(version(entries[package])), package
 
 
-@pytest.mark.parametrize(("name", "extras"), [("service", []), ("development", ["dev", "milvus", "report"])])
+@pytest.mark.parametrize(("name", "extras"), [("service", []), ("development", ["dev", "milvus", "ray", "report"])])
 def test_every_dependency_is_locked_within_its_range(name: str, extras: list[str]) -> None:
     texts = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"]
     for extra in extras:
