@@ -27,7 +27,7 @@ def check_usable(settings: Settings) -> None:
         MissingExtra: Ray Serve is not installed.
         SettingsError: the encoders are to compute on GPUs of which they get none.
     """
-    if importlib.util.find_spec("ray") is None or importlib.util.find_spec("ray.serve") is None:
+    if importlib.util.find_spec("ray") is None:  # to look for ray.serve would import ray
         raise MissingExtra(
             "Encoders in a Ray cluster need Ray Serve, which others do not: pip install 'placerec[ray]', or in a"
             " checkout .venv/bin/pip install --editable '.[ray]'."

@@ -246,6 +246,7 @@ def _prepare_environment(local: bool) -> None:
     if local:
         # By this variable Ray chooses the loopback address for its ports; its name tells where that is the default.
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
+    os.environ.setdefault("RAY_AUTH_MODE", "token")  # a local Ray makes one; in a cluster all machines have the same
     for name, value in QUICK.items():
         os.environ.setdefault(name, value)
 
