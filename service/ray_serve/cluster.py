@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import io
 import ipaddress
 import logging
@@ -214,6 +215,12 @@ class Cluster:
             if self._own:
                 serve.shutdown()  # type: ignore[no-untyped-call]
             _leave()
+
+    def forget(self) -> None:
+        """Let the end of this process wait for no Ray, after :meth:`close` has waited in vain."""
+        import ray
+
+        atexit.unregister(ray.shutdown)
 
     def _replica_settings(self) -> ReplicaSettings:
         chosen = self._settings

@@ -11,9 +11,11 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from contextlib import suppress
-from typing import Any
+from queue import SimpleQueue
+from typing import Any, TypeVar
 
 from core.frames.images import Limits, decode
 from service.engine.encoders import Encoded, QueuedFrame, WaitingFrames, deadline_exceeded
@@ -23,6 +25,8 @@ from service.ray_serve.metrics import CallMetrics
 from service.ray_serve.replica import ReturnedFrame, SentFrame
 from service.settings import Settings
 from service.telemetry.metrics import Metrics
+
+Made = TypeVar("Made")
 
 ATTEMPTS = 4
 """How often a frame is sent at most.  After its first loss it is sent alone, so that it harms no other."""
@@ -43,7 +47,13 @@ WATCH = 1.0
 """Seconds between two looks at the cluster."""
 
 AWAY = 10.0
-"""Seconds between two attempts to reach a cluster, and after which one that does not answer counts as away."""
+"""Seconds between two attempts to reach a cluster."""
+
+LOST = 20.0
+"""Seconds without an answer after which a cluster counts as lost.  Ray cannot be begun anew within a process."""
+
+LONGEST_START = 180.0
+"""Seconds that a Ray may take to start, or a cluster to take its deployment."""
 
 log = logging.getLogger("placerec.ray")
 
@@ -58,6 +68,7 @@ class RayEncoders:
     def __init__(self, settings: Settings, limits: Limits, metrics: Metrics) -> None:
         self._settings, self._limits = settings, limits
         self._cluster = Cluster(settings, limits)
+        self._ray = _RayThread()
         self._handle: Any = None
         self._waiting = WaitingFrames()
         self._sent: set[QueuedFrame] = set()  # on their way, or about to be sent again
@@ -112,8 +123,15 @@ class RayEncoders:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await asyncio.to_thread(self._cluster.close)
-        await self._loop.shutdown_default_executor()
+        await self._leave()
+
+    async def _leave(self) -> None:
+        """Leave the cluster; one that has died may keep its thread, but nobody waits for that."""
+        self._handle = None
+        with suppress(Exception):
+            await self._ray.ask(self._cluster.close, AWAY)
+            return
+        self._cluster.forget()
 
     async def _watch(self) -> None:
         """Open the cluster, then look at it until the end."""
@@ -122,15 +140,17 @@ class RayEncoders:
             pause = WATCH
             try:
                 if self._handle is None:
-                    self._handle = await asyncio.to_thread(self._cluster.open)
+                    self._handle = await self._ray.ask(self._cluster.open, LONGEST_START)
+                    answered = time.monotonic()
                     log.info("joined the Ray cluster", extra={"address": self._cluster.address()})
-                found = await asyncio.to_thread(self._cluster.state)
+                found = await self._ray.ask(self._cluster.state, LOST)
             except RayUnavailable as error:
                 self._note(0, str(error))
                 pause = AWAY
             except Exception as error:
-                if time.monotonic() - answered > AWAY:
-                    self._note(0, f"the Ray cluster does not answer: {error}".splitlines()[0][:500])
+                if time.monotonic() - answered > LOST:
+                    why = f"{type(error).__name__} {error}".splitlines()[0][:500]
+                    self._note(0, f"the Ray cluster does not answer: {why}; the service has to be started again")
             else:
                 answered = time.monotonic()
                 self._note(found.running, f"no encoder runs in the Ray cluster: {found.problem or 'they start'}")
@@ -286,6 +306,42 @@ class RayEncoders:
     def _back(self, frame: QueuedFrame) -> None:
         self._sent.discard(frame)
         self._add([frame])
+
+
+class _RayThread:
+    """The thread in which all that blocks is asked of Ray, one thing after the other.
+
+    It is one for good, since the processes of a local Ray end with the thread that has started them.
+    """
+
+    def __init__(self) -> None:
+        self._work: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        threading.Thread(target=self._run, name="ray", daemon=True).start()
+
+    def _run(self) -> None:
+        while True:
+            self._work.get()()
+
+    async def ask(self, work: Callable[[], Made], seconds: float) -> Made:
+        """Run blocking work, which is left alone if it takes too long.
+
+        Raises:
+            TimeoutError: it does.
+            Others: what the work raises.
+        """
+        made: Future[Made] = Future()
+
+        def run() -> None:
+            try:
+                result = work()
+            except Exception as error:
+                made.set_exception(error)
+            else:
+                made.set_result(result)
+
+        self._work.put(run)
+        # A shield, since the thread sets its result, wanted or not.
+        return await asyncio.wait_for(asyncio.shield(asyncio.wrap_future(made)), seconds)
 
 
 async def _result(response: Any) -> list[ReturnedFrame | Exception]:
