@@ -22,10 +22,10 @@ import typer
 
 from benchmarks.process import peak_memory
 from benchmarks.report import report
+from core.maps.archives.reading import Archive, check
 from core.places import PlaceFields, Pose
 from core.storage import Atlas, Enrolment, Map, MapSettings
 from core.storage.archives.building import build
-from core.storage.archives.reading import Archive, check
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)
 BATCH = 64

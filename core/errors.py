@@ -151,6 +151,14 @@ class StorageFailure(PlacerecError):
     """The disk refused a read or a write; a write was undone."""
 
 
+class StoreUnavailable(StorageFailure):
+    """The servers that keep the maps cannot be reached now, or refuse the service; a write was undone."""
+
+
+class StoreOfAnotherVersion(StorageFailure):
+    """What the servers keep was made by another version of placerec, which this one does not read."""
+
+
 class MapQuarantined(PlacerecError):
     """A map is damaged and out of service; other maps are not affected."""
 

@@ -7,10 +7,10 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, SecretStr, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from core.method.catalogue import DEFAULT_ENCODER
+from core.method import DEFAULT_ENCODER
 
 PREFIX = "PLACEREC_"
 MIB = 1024 * 1024
@@ -55,6 +55,33 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         default=Path("data"), description="Directory of the maps; only one process at a time can use it."
     )
+    postgres: SecretStr | None = Field(
+        default=None,
+        description="Address of the PostgreSQL in which services share their state (sessions, keys, jobs, rates, "
+        "statistics, events) and, with the store milvus, their maps, such as "
+        "postgresql://placerec:password@db/placerec; default: in the data directory.",
+    )
+    store: Literal["embedded", "milvus"] = Field(
+        default="embedded",
+        description="Where the maps are: in the data directory (embedded), or in a PostgreSQL and a Milvus (milvus), "
+        "which several services may use.",
+    )
+    milvus: str | None = Field(
+        default=None,
+        pattern=r"^https?://[^\s/@]+/?$",
+        description="Address of Milvus, such as http://milvus:19530; https for TLS.",
+    )
+    milvus_token: SecretStr = Field(
+        default=SecretStr(""), description="Token of Milvus, such as user:password; none by default."
+    )
+    milvus_certificate: Path | None = Field(
+        default=None,
+        description="File with the certificate of the authority that Milvus's certificate is checked by; by default "
+        "those of the system.",
+    )
+    milvus_database: str = Field(
+        default="", max_length=255, description="Database of Milvus in which its collections are; its default if empty."
+    )
     models_dir: Path | None = Field(
         default=None,
         description="Directory of encoders besides the packaged ones; default: 'models' beside the data directory.",
@@ -70,12 +97,15 @@ class Settings(BaseSettings):
         le=1024,
         description="How many frames are encoded at a time, each in a thread; 0 is one for each core.",
     )
-    precision: Literal["auto", "float32", "bfloat16"] = Field(
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto",
         description="Precision of the forward pass. auto: a lower precision only if the descriptors stay the same, as "
-        "measured at the start; bfloat16: refuse to start if they do not.",
+        "measured at the start; bfloat16, float16: refuse to start if they do not.",
     )
-    device: Literal["cpu", "cuda"] = Field(default="cpu", description="Device of the forward passes.")
+    device: Literal["cpu", "cuda"] = Field(
+        default="cpu",
+        description="Device of the forward passes; those of frames that wait together share batches on cuda.",
+    )
     ray: bool = Field(
         default=False,
         description="Encode in processes of a Ray cluster, deployed with Ray Serve; needs the extra placerec[ray].",
@@ -277,6 +307,14 @@ class Settings(BaseSettings):
             raise ValueError(f"{PREFIX}MAX_BATCH_BYTES is less than {PREFIX}MAX_IMAGE_BYTES")
         if self.max_upload_memory < self.max_batch_bytes:
             raise ValueError(f"{PREFIX}MAX_UPLOAD_MEMORY is less than {PREFIX}MAX_BATCH_BYTES")
+        return self
+
+    @model_validator(mode="after")
+    def _store_has_addresses(self) -> Settings:
+        if self.store == "milvus":
+            for name in ("milvus", "postgres"):
+                if getattr(self, name) is None:
+                    raise ValueError(f"{PREFIX}STORE is milvus, which needs {PREFIX}{name.upper()}")
         return self
 
     @property

@@ -8,7 +8,7 @@ chosen by it.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +21,9 @@ from safetensors.torch import load_file
 
 from core.frames.preprocessing import Pixels
 from core.judgement.curves import auc_pr
+from core.method.agreement import Cells, local_descriptors
 from core.method.encoder import Encoder, EncoderDefinition
+from core.method.equations import unit_length
 from core.method.features import FeatureExtractor
 from core.method.presets import PRESETS
 from core.method.projection import Projection
@@ -90,6 +92,17 @@ CHANGES: dict[str, dict[str, Any]] = {
     "second stage: share 0.5": _stage(share=0.5),
     "second stage: share 0.85": _stage(share=0.85),
 }
+STANDARDIZED = "second stage: cells standardized"
+STANDARDIZED_CHANGES: dict[str, dict[str, Any]] = {
+    STANDARDIZED: {},
+    f"{STANDARDIZED}, weights 0.45, 0.45, 0.1": _stage(weights=(0.45, 0.45, 0.1)),
+    f"{STANDARDIZED}, these weights, reach 3, 5, 60 candidates": _stage(
+        weights=(0.45, 0.45, 0.1), reach=(3, 5), candidates=60
+    ),
+}
+"""Changes of an encoder that is :class:`StandardizedEncoder`."""
+CENTERED, FLOOR = 0.75, 0.5
+"""The share of the mean that is taken from each value, and of the mean deviation that is added to each deviation."""
 REFINED = "projections refined by contrastive learning"
 REFINEMENT_CROPS, REFINEMENT_STEPS = 800, 400
 COLUMNS = (
@@ -98,11 +111,35 @@ COLUMNS = (
 )  # fmt: skip
 
 
+class StandardizedEncoder(Encoder):
+    """Compares cells after what all cells of a frame have in common, as its light and weather, is taken from them."""
+
+    def local(self, activations: Sequence[Array], products: Mapping[str, Array]) -> Cells:
+        stage = self.definition.agreement
+        assert stage is not None
+        cells = self.extractor.projected_cells(activations, products, stage.layers, stage.values)
+        return local_descriptors([standardized(layer) for layer in cells], stage)
+
+
+def standardized(cells: Array) -> Array:
+    """Each value less a share of its mean over the cells of a frame, by its deviation over them, to unit length.
+
+    Args:
+        cells: float32 [C, values], rows of unit length or zero; rows of zeros take no part and stay.
+    """
+    seen = cells.any(axis=1)
+    made = np.zeros_like(cells)
+    if seen.any():
+        mean, deviation = cells[seen].mean(axis=0), cells[seen].std(axis=0)
+        made[seen] = (cells[seen] - CENTERED * mean) / (deviation + FLOOR * deviation.mean() + 1e-12)
+    return unit_length(made)
+
+
 class Ablation:
     """Activations of all pictures, computed once, and the figures of any configuration on them."""
 
-    def __init__(self, weights: Path, datasets: Path, images: int, side: int | None = None) -> None:
-        self.weights, self.side = load_file(weights), side
+    def __init__(self, weights: Path, datasets: Path, images: int, size: tuple[int, int] | None = None) -> None:
+        self.weights, self.size = load_file(weights), size
         network = self._network(DEFAULT)
         self.projections = fit_projections(network, WIDEST, datasets / "train")
         self.extractor = FeatureExtractor(network, DEFAULT, self.projections)
@@ -145,12 +182,12 @@ class Ablation:
             further = self.projections[layer].matrix[:, STAGE.values :]
             self.projections[layer] = Projection(projection.mean, np.hstack([projection.matrix, further]))
 
-    def figures(self, definition: EncoderDefinition, seed: int) -> list[float]:
+    def figures(self, definition: EncoderDefinition, seed: int, kind: type[Encoder] = Encoder) -> list[float]:
         """One number for each of COLUMNS."""
         extractor = FeatureExtractor(self._network(definition), definition, self._projections(definition))
         frames = (extractor.regions(maps).features for maps in self.maps("vocabulary", definition))
         vocabulary = train_vocabulary(pool_features(frames, seed), definition.words, seed, extractor.origin)
-        encoder = Encoder("ablation", extractor, definition, vocabulary, UNCALIBRATED)
+        encoder = kind("ablation", extractor, definition, vocabulary, UNCALIBRATED)
         references = self.describe(encoder, "lip6 references")
         far = references.part(slice(0, DISTRACTORS))
         lip6 = scores(encoder, self.describe(encoder, "lip6 queries"), references)
@@ -168,7 +205,7 @@ class Ablation:
         ]
 
     def _network(self, definition: EncoderDefinition) -> ShallowNetwork:
-        return network_of(self.weights, definition.outputs, self.side)
+        return network_of(self.weights, definition.outputs, self.size)
 
     def _projections(self, definition: EncoderDefinition) -> dict[str, Projection]:
         return {layer: self.projections[layer] for layer in definition.projected()}
@@ -199,19 +236,22 @@ def main(
     datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
     output: Annotated[Path, typer.Option(help="JSON with every run.")] = Path("runs/ablation.json"),
     images: Annotated[int, typer.Option(min=1, help="Photographs for each vocabulary.")] = 600,
-    side: Annotated[int | None, typer.Option(min=67, help="Another input size than the network's own.")] = None,
+    size: Annotated[
+        tuple[int, int] | None, typer.Option(metavar="HEIGHT WIDTH", help="Another input size than the network's own.")
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Vocabularies a configuration.")] = 3,
     only: Annotated[list[str] | None, typer.Option(help="Just these configurations.")] = None,
 ) -> None:
     """Compare the configurations of CHANGES."""
     torch.manual_seed(0)
-    ablation = Ablation(weights, datasets, images, side)
+    ablation = Ablation(weights, datasets, images, size)
     rows: dict[str, Sequence[Sequence[float]]] = {}
-    for name, change in CHANGES.items():
+    for name, change in {**CHANGES, **STANDARDIZED_CHANGES}.items():
         if only and name not in only:
             continue
         definition = EncoderDefinition.model_validate({**DEFAULT.model_dump(), **change})
-        rows[name] = [ablation.figures(definition, seed) for seed in range(seeds)]
+        kind = StandardizedEncoder if name in STANDARDIZED_CHANGES else Encoder
+        rows[name] = [ablation.figures(definition, seed, kind) for seed in range(seeds)]
         output.parent.mkdir(parents=True, exist_ok=True)
         output.write_text(json.dumps({"columns": COLUMNS, "rows": rows}, indent=1))
         typer.echo(table({name: rows[name]}).splitlines()[-1])

@@ -42,11 +42,13 @@ def vocabulary_pictures(datasets: Path, count: int, seed: int) -> list[Pixels]:
     return [read(paths[index]) for index in sorted(chosen)]
 
 
-def network_of(weights: dict[str, Tensor], layers: Sequence[str], side: int | None = None) -> ShallowNetwork:
-    """The distilled backbone as deep as ``layers`` needs; ``side`` makes its input another size than its own."""
+def network_of(
+    weights: dict[str, Tensor], layers: Sequence[str], size: tuple[int, int] | None = None
+) -> ShallowNetwork:
+    """The distilled backbone as deep as ``layers`` needs, for an input of its own or of another height and width."""
     definition = student_definition()
-    if side is not None:
-        shown = definition.input.model_copy(update={"height": side, "width": side})
+    if size is not None:
+        shown = definition.input.model_copy(update={"height": size[0], "width": size[1]})
         definition = definition.model_copy(update={"input": shown})
     network = ShallowNetwork(definition, layers)
     network.load_weights(weights)

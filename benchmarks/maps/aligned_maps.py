@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 from benchmarks.report import report, verdict
 from core.frames.preprocessing import Pixels
+from core.maps import Enrolment, Map, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields
 from core.recognition.recognition import locate
-from core.storage import Enrolment, Map, MapSettings
 from core.threads import share_cores
 from service.app.runtime import Runtime
 from service.settings import Settings

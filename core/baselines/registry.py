@@ -12,6 +12,7 @@ from pathlib import Path
 from core.baselines import (
     attentive_attention,
     calc,
+    compact,
     context_flexible_attention,
     convnets,
     cross_region,
@@ -65,6 +66,8 @@ BASELINES: tuple[Baseline, ...] = (
     Baseline(convnets.HYBRIDNET, convnets.build_pyramid),
     Baseline(convnets.PLACES365, convnets.build_places365),
     Baseline(calc.ABOUT, calc.build),
+    Baseline(compact.MOBILENET, compact.build),
+    Baseline(compact.SQUEEZENET, compact.build),
     Baseline(fix_context.ABOUT, fix_context.build),
     Baseline(attentive_attention.ABOUT, attentive_attention.build),
     Baseline(context_flexible_attention.ABOUT, context_flexible_attention.build),

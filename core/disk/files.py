@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import secrets
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -149,6 +150,23 @@ def disk_errors(action: str, database: str = "map.sqlite") -> Iterator[None]:
         raise Damage(f"{database} cannot be read: its text is damaged") from error
     except (OSError, sqlite3.Error) as error:
         raise _named(error, action, database) from error
+
+
+def check_writable(folder: Path) -> None:
+    """Write, sync and delete a small file in a folder.
+
+    Raises:
+        StorageFull, StorageFailure: the disk refuses.
+    """
+    probe = folder / f".probe-{secrets.token_hex(4)}"
+    with disk_errors(f"write to {folder}"):
+        try:
+            probe.write_bytes(b"\x00" * 4096)
+            sync_file(probe)
+            sync_folder(folder)
+        finally:
+            with suppress(OSError):
+                probe.unlink()
 
 
 class FolderLock:

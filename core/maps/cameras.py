@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -58,3 +59,42 @@ class KnownCameras(ABC):
         """
         found = None if name is None else self.known(name)
         return None if found is None else found.intrinsics
+
+
+class ReadCameras(KnownCameras):
+    """Cameras that were read, to be asked about without waiting.
+
+    Args:
+        cameras: all of one map.
+    """
+
+    def __init__(self, cameras: Iterable[CameraRecord]) -> None:
+        self._cameras = {camera.name: camera for camera in cameras}
+
+    def known(self, name: str) -> CameraRecord | None:
+        """One camera; None if the map had none of this name."""
+        return self._cameras.get(name)
+
+
+class Cameras(KnownCameras):
+    """All cameras of one map.  Any thread may use it; every method may raise what the map's own may raise."""
+
+    @abstractmethod
+    def all(self) -> list[CameraRecord]:
+        """All cameras by name."""
+
+    @abstractmethod
+    def put(self, name: str, mask: Mask | None, intrinsics: Intrinsics | None = None) -> tuple[CameraRecord, bool]:
+        """Make a camera or replace its mask and its intrinsics, durably; returns the camera and whether it is new.
+
+        Raises:
+            InvalidField: the map has too many cameras.
+        """
+
+    @abstractmethod
+    def forget(self, name: str) -> None:
+        """Delete a camera; its places stay as they are.
+
+        Raises:
+            UnknownCamera: the map has none of this name.
+        """

@@ -9,20 +9,40 @@ never used again.  A search returns rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry.keypoints import Keypoints
-from core.maps.cameras import KnownCameras
+from core.maps.archives.reading import Archive
+from core.maps.archives.writing import Advance, Expect, Exported
+from core.maps.cameras import Cameras
+from core.maps.counterparts import Counterparts
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
-from core.maps.records import Change, Enrolment, MapRecord, MapSettings, Outline, SameFrame
+from core.maps.records import (
+    Change,
+    Enrolment,
+    KeptFrame,
+    MapRecord,
+    MapSettings,
+    Precision,
+    SameFrame,
+    SequenceSummary,
+    VerifyReport,
+)
+from core.maps.review import Review
 from core.maps.selection import Selection
+from core.maps.status import IndexStatus, Progress, StorageStatus, no_progress
+from core.maps.transfer import Transfer
 from core.places import Neighborhood, Place, PlaceFields, Whereabouts
 
 Rows = NDArray[np.int64]
+
+HANDED_OVER, HAS_PICTURE = 1, 2
+"""Flags of a place in a plan: its pose is that of another place; a picture of its frame is kept."""
 
 Ranking = tuple[Rows, NDArray[np.float32]]
 """Rows, best first, and their inner products."""
@@ -71,6 +91,11 @@ class Scope(Protocol):
     def weights_at(self, rows: Rows) -> NDArray[np.float64] | None:
         """The log prior of rows that a search returned, float64 [n], at most 0; None if nothing speaks for places."""
 
+    # For work on all places of a map; a query does not need it.
+
+    def living_rows(self) -> Rows:
+        """The rows of the places of the scope, int64 [n], ascending."""
+
 
 class Snapshot(Protocol):
     """The places of a map at one moment.  Later writes do not change it; any thread may use it."""
@@ -113,11 +138,38 @@ class Snapshot(Protocol):
         """The places of some rows, bool [rows], as a scope without a prior; only living rows count."""
 
 
-class Outlines(Protocol):
-    """Lists all places of a map in brief."""
+class Exporter(Protocol):
+    """Writes export files of one map.  Any thread may use it."""
 
-    def outline(self) -> list[Outline]:
-        """All places in the order of their enrolment."""
+    def state(self) -> object | None:
+        """A value that is the same as long as nothing is written to the map; None where that is not known."""
+
+    def write(
+        self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
+    ) -> Exported:
+        """Write the present state of the map as a new file, which a crash may lose; nothing is left if this raises.
+
+        Raises:
+            UnknownMap, MapQuarantined: the map was deleted meanwhile, or is damaged.
+            StorageFull, StorageFailure.
+        """
+
+
+class Plan(Protocol):
+    """Reads the plan of one map: where all its places are.  Any thread may use it."""
+
+    def columns(self, step: int = 1) -> str:
+        """The places in the order of their enrolment as the members of a JSON object, without its braces.
+
+        The members: ``sequences``, the names of the traverses; arrays with a value for each place: ``ids``,
+        ``sequence`` (index into ``sequences``, -1 without one) and ``flags`` (:data:`HANDED_OVER`,
+        :data:`HAS_PICTURE`); and ``x``, ``y``, ``z`` (metres), ``latitude``, ``longitude``, ``heading`` (degrees) and
+        ``timestamp`` (milliseconds since 1970 UTC), each an array with null where a place has no value, or null if no
+        place has one.
+
+        Args:
+            step: about every so many places are listed.
+        """
 
 
 class Map(Protocol):
@@ -132,12 +184,43 @@ class Map(Protocol):
         """The map's record as of its last edit."""
 
     @property
-    def cameras(self) -> KnownCameras:
+    def cameras(self) -> Cameras:
         """The cameras of the map."""
 
     @property
-    def transfer(self) -> Outlines:
-        """Lists all places in brief."""
+    def transfer(self) -> Transfer:
+        """Reads, copies and deletes many places at once."""
+
+    @property
+    def counterparts(self) -> Counterparts:
+        """Where places have counterparts in other traverses."""
+
+    @property
+    def review(self) -> Review:
+        """The frames that are kept to be reviewed."""
+
+    @property
+    def plan(self) -> Plan:
+        """Where all places are."""
+
+    @property
+    def exporter(self) -> Exporter:
+        """Writes the map as a file."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the map is ready for use; this does not wait."""
+
+    @property
+    def held(self) -> bool:
+        """Whether a search of the map needs neither the disk nor another process; this does not wait."""
+
+    @property
+    def state(self) -> object:
+        """A value that is the same until the map is written to."""
+
+    def open(self) -> None:
+        """Have the map ready for use."""
 
     # Searching
 
@@ -177,12 +260,65 @@ class Map(Protocol):
             InvalidCursor.
         """
 
+    def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """The ids of the places that fulfil some conditions, in the order of their enrolment.
+
+        Raises:
+            TooManyToForget: there are more than ``most``.
+        """
+
+    def digest(self, place_id: str) -> bytes | None:
+        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
+
+    def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
+        """A page of sequences by name, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
+
+    def unknown_sequences(self, names: Sequence[str]) -> set[str]:
+        """Those of the names that no sequence has."""
+
+    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+        """Places that keep their image or a thumbnail, and no keypoints or damaged ones.
+
+        Args:
+            after: the number of the last place of the page before; 0 for the first page.
+            limit: how many places are listed at most; fewer if there are no further ones.
+        """
+
     def picture(self, place_id: str) -> bytes | None:
         """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none.
 
         Raises:
             StorageFailure: the picture is damaged.
         """
+
+    def thumbnail(self, place_id: str) -> bytes:
+        """A small JPEG of a place.
+
+        Raises:
+            UnknownPlace: there is no such place.
+            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            StorageFailure: the picture is damaged.
+            MemoryError: its pixels do not fit into memory.
+        """
+
+    # How it is kept
+
+    def index_status(self) -> IndexStatus:
+        """How the map is searched; this does not wait."""
+
+    def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
+        """Build what makes searches fast again from the descriptors; searches use the present one meanwhile.
+
+        Args:
+            progress: is told how many rows of how many are done; what it raises leaves everything as it was.
+        """
+
+    def storage_status(self) -> StorageStatus:
+        """How much room the map takes."""
 
     # Writing
 
@@ -219,6 +355,16 @@ class Map(Protocol):
 
         Raises:
             UnknownPlace, InvalidField.
+        """
+
+    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+        """Store the keypoints of places that :meth:`without_keypoints` listed, in one write.
+
+        A place that is gone, shows another frame by now, or has got its keypoints meanwhile stays as it is; so do all
+        places of a map whose setting ``verification`` is off.
+
+        Returns:
+            How many were stored.
         """
 
     def forget(self, place_id: str) -> None:
@@ -261,16 +407,43 @@ class Store(Protocol):
         dimension: int,
         settings: MapSettings | None = None,
         local_shape: tuple[int, int] = (0, 0),
+        unlisted: bool = False,
+        precision: Precision = "half",
     ) -> Map:
         """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
+            unlisted: only :meth:`unlisted` finds the map, also after a restart, until it is published.
+            precision: how its descriptors are stored; this cannot be changed later.
 
         Raises:
             InvalidIdentifier: the id is malformed.
-            MapExists: the id is taken.
+            MapExists: the id is taken, possibly by a damaged map.
             StorageFull, StorageFailure.
+        """
+
+    def import_map(
+        self,
+        archive: Archive,
+        map_id: str,
+        advance: Callable[[int, int], None],
+        check_picture: Callable[[bytes], None],
+        most_picture_bytes: int,
+        before_listing: Callable[[], None],
+    ) -> None:
+        """Make a map of an export file; it is listed, and durable, when this returns, and not before.
+
+        Args:
+            map_id: of the new map; it may differ from that in the file.
+            advance: is called with the number of places done and of all; what it raises ends the work.
+            check_picture: raises InvalidImage for bytes that must not be shown as a picture.
+            most_picture_bytes: a larger picture is refused before it is read.
+            before_listing: is called when the map is complete; what it raises ends the work.
+
+        Raises:
+            InvalidArchive: the file is damaged, or its content is not valid for a map.
+            InvalidIdentifier, MapExists, StorageFull, StorageFailure: nothing of the map is left.
         """
 
     def get(self, map_id: str) -> Map:
@@ -278,6 +451,57 @@ class Store(Protocol):
 
         Raises:
             UnknownMap, MapQuarantined, StorageFailure.
+        """
+
+    def find(self, map_id: str) -> Map:
+        """A map whose record and number of places can be used; the rest may have to be read first.
+
+        Raises:
+            UnknownMap, MapQuarantined, StorageFailure.
+        """
+
+    def opened(self, map_id: str) -> Map | None:
+        """A map that is ready for use, if that is known without waiting; else None."""
+
+    def unlisted(self) -> Mapping[str, Map]:
+        """The maps that are being built, by id."""
+
+    def abandoned(self) -> list[str]:
+        """The ids of the unlisted maps that nobody builds unless a job of this service does.
+
+        None of a store that several services use, which removes by itself what nobody has built on for long.
+        """
+
+    def publish(self, map_id: str) -> Map:
+        """List a map that was being built and is now complete; durable when this returns.
+
+        Raises:
+            UnknownMap: no map of this id is being built.
+            StorageFull, StorageFailure.
+        """
+
+    def abandon(self, map_id: str) -> None:
+        """Delete a map that was being built; nothing happens if there is none.
+
+        Raises:
+            StorageFull, StorageFailure: the map is still there.
+        """
+
+    def quarantined(self) -> dict[str, str]:
+        """Why maps are out of service, by id; this does not wait."""
+
+    def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
+        """Read all of a map again, whether it is in service or quarantined, and report what is damaged.
+
+        Raises:
+            UnknownMap, StorageFailure.
+        """
+
+    def check_writable(self) -> None:
+        """Raise unless maps could be read and written now.
+
+        Raises:
+            StorageFull, StorageFailure.
         """
 
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:

@@ -23,6 +23,7 @@ from safetensors.numpy import save_file
 from core.disk.files import replacing
 from core.errors import InvalidModel, UnknownEncoder
 from core.judgement.verdict import Calibration
+from core.method import DEFAULT_ENCODER as DEFAULT_ENCODER
 from core.method.encoder import Encoder, EncoderDefinition, canary_frame
 from core.method.features import FeatureExtractor, projection_tensors
 from core.method.projection import Projection
@@ -33,7 +34,6 @@ from core.networks.forward import Device, Precision
 from core.networks.identity import canonical_json
 from core.networks.network import NAME
 
-DEFAULT_ENCODER = "m-region-vlad"
 PACKAGED = Path(__file__).parents[1] / "models"
 FORMAT = "placerec-encoder/1"
 PROJECTION, WHITENING = "projection.", "whitening."

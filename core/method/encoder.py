@@ -234,33 +234,41 @@ class Encoder:
         with each other, whichever machine made them.
 
         Args:
-            precision: "auto" takes bfloat16 if the processor multiplies it and the descriptors of a few frames have a
-                cosine of at least ``GOLDEN_COSINE`` to those of float32.
-            device: of the forward pass; on a GPU it is float32.
+            precision: "auto" takes bfloat16 if the processor multiplies it, or float16 on a GPU, if the descriptors of
+                a few frames have a cosine of at least ``GOLDEN_COSINE`` to those of float32.
+            device: of the forward pass.
 
         Returns:
             The precision now in use.
 
         Raises:
             InvalidModel: this machine lacks the precision or the device.
-            GoldenMismatch: bfloat16 was asked for, and it changes the descriptors too much.
+            GoldenMismatch: a lower precision was asked for, and it changes the descriptors too much.
         """
         self.extractor.compute("float32", device)
-        lower = has_bfloat16() and isinstance(self.extractor.backbone, ShallowNetwork)
-        if device == "cuda" or precision == "float32" or (precision == "auto" and not lower):
-            return "float32"
+        lower = self._lower_precision(device) if precision == "auto" else precision
+        if lower == "float32":
+            return lower
         frames = [canary_frame(), canary_frame()[:, ::-1].copy(), 255 - canary_frame()]
         exact = [self.encode(frame) for frame in frames]
         try:
-            self.extractor.compute("bfloat16")
+            self.extractor.compute(lower, device)
             for frame, wanted in zip(frames, exact, strict=True):
                 self._hold_against(self.encode(frame), wanted.descriptor, wanted.local, "those of float32")
         except (GoldenMismatch, InvalidModel):
-            self.extractor.compute("float32")
-            if precision == "bfloat16":
+            self.extractor.compute("float32", device)
+            if precision != "auto":
                 raise
             return "float32"
-        return "bfloat16"
+        return lower
+
+    def _lower_precision(self, device: Device) -> Precision:
+        """The precision that is worth a trial on a device."""
+        if not isinstance(self.extractor.backbone, ShallowNetwork):
+            return "float32"
+        if device == "cuda":
+            return "float16"
+        return "bfloat16" if has_bfloat16() else "float32"
 
     def _hold_against(self, made: Encoding, descriptor: NDArray[Any], local: Cells, what: str) -> None:
         for cosine in (_cosine(made.descriptor, descriptor), _cosine(made.local, local)):

@@ -20,7 +20,7 @@ from core.method.parts import cells, pooled
 from core.method.projection import Projection
 from core.method.regions import Regions, extract_regions, find_regions, projected_box_sums
 from core.networks.backbone import Backbone
-from core.networks.forward import Device, GraphPass, Precision, TorchPass
+from core.networks.forward import Device, GraphPass, Precision, TorchPass, cuda_pass
 from core.networks.identity import json_digest, tensors_digest
 from core.networks.network import ShallowNetwork
 from core.threads import keep_numpy_single_threaded
@@ -120,7 +120,10 @@ class FeatureExtractor:
         self.forward: Callable[[Tensor], tuple[Tensor, ...]] = network
         """The forward pass in use: float32 [B, 3, H, W] to one float32 [B, K, X, Y] for each output."""
         if isinstance(network, ShallowNetwork):
-            self.forward = GraphPass(network) if plain else TorchPass(network, precision, device)
+            if device == "cuda":
+                self.forward = cuda_pass(network, precision)
+            else:
+                self.forward = GraphPass(network) if plain else TorchPass(network, precision)
         elif not plain:
             raise InvalidModel(
                 "a plugged or imported network runs on the CPU in float32, unless it moves itself to another device."

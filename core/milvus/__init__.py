@@ -23,9 +23,10 @@ def open_store(
 ) -> MilvusStore:
     """All maps of a PostgreSQL database and a Milvus (:class:`core.milvus.store.MilvusStore`).
 
+    They are connected to when they are first used, and again after an outage.
+
     Raises:
         MissingExtra: what speaks to them is not installed.
-        StorageFailure: one of them cannot be reached, or refuses.
     """
     try:
         from core.milvus.store import MilvusStore

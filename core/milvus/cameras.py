@@ -12,12 +12,12 @@ from psycopg import Connection
 from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.maps.cameras import MOST_CAMERAS, CameraRecord, KnownCameras
+from core.maps.cameras import MOST_CAMERAS, CameraRecord, Cameras
 
 Access = Callable[[], AbstractContextManager[Connection[Any]]]
 
 
-class MilvusCameras(KnownCameras):
+class MilvusCameras(Cameras):
     """All cameras of one map.  Any thread may use it.
 
     Args:
@@ -57,6 +57,7 @@ class MilvusCameras(KnownCameras):
                 " ON CONFLICT (map, name) DO UPDATE SET record = excluded.record"
             )
             connection.execute(query, (self._map, name, made.model_dump_json()))
+            self._count(connection)
         return made, name not in known
 
     def forget(self, name: str) -> None:
@@ -69,3 +70,8 @@ class MilvusCameras(KnownCameras):
             query = "DELETE FROM cameras WHERE map = %s AND name = %s"
             if not connection.execute(query, (self._map, name)).rowcount:
                 raise UnknownCamera(f"The map has no camera {name[:80]!r}.")
+            self._count(connection)
+
+    def _count(self, connection: Connection[Any]) -> None:
+        """Count the write, so that others notice it."""
+        connection.execute("UPDATE maps SET writes = writes + 1, touched = now() WHERE number = %s", (self._map,))

@@ -8,22 +8,29 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+import threading
 import uuid
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isnan
+from typing import Any
 
+import grpc
 import numpy as np
 from numpy.typing import NDArray
 from pymilvus import Collection as Connected
 from pymilvus import CollectionSchema, DataType, FieldSchema, connections, utility
 from pymilvus.exceptions import MilvusException
 
-from core.errors import StorageFailure
+from core.errors import StoreOfAnotherVersion
 from core.milvus.expressions import NO_HEADING
+from core.milvus.indexes import indexing_for, search_settings
+from core.milvus.outage import Outage, Unreachable
 from core.places import Whereabouts
 
+warnings.filterwarnings("ignore", message=".*ORM-style PyMilvus API")
 logging.getLogger("pymilvus").setLevel(logging.CRITICAL)  # what it refuses is raised; it would log it as well
 
 MOST_FOUND = 16_384
@@ -34,6 +41,7 @@ PARTITIONS = 64
 
 _AT_ONCE = 256  # entities of one insertion: 16 MB with the default encoder; Milvus takes 64
 _PATIENCE_SECONDS = 10.0
+_CONNECTING_SECONDS = 3.0
 # A Milvus that was gone is asked again within two seconds; by default gRPC would wait for up to two minutes.
 _AGAIN_SOON = {"grpc.initial_reconnect_backoff_ms": 200, "grpc.max_reconnect_backoff_ms": 2000}
 
@@ -62,58 +70,114 @@ def collection_name(encoder: str, dimension: int) -> str:
 
 @contextmanager
 def milvus_errors(action: str) -> Iterator[None]:
-    """Turn what Milvus refuses into a StorageFailure."""
+    """Turn what Milvus refuses into a StoreUnavailable."""
     try:
         yield
-    except MilvusException as error:
-        raise StorageFailure(f"Milvus refuses to {action}: {str(error)[:300]}") from error
+    except (MilvusException, grpc.RpcError) as error:  # pymilvus lets some of gRPC's errors through
+        raise Unreachable("Milvus", f"cannot be reached, or refuses to {action}: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [""])[0][:300]
 
 
 class Connection:
-    """A connection to Milvus.  Any thread may use it.
-
-    Raises:
-        StorageFailure: Milvus cannot be reached, or refuses.
-    """
+    """A connection to Milvus, which is made when it is first used.  Any thread may use it."""
 
     def __init__(self, address: str, token: str, database: str, certificate: str | None) -> None:
-        self.name = f"placerec-{uuid.uuid4().hex}"
-        tls = {} if certificate is None else {"server_pem_path": certificate, "secure": True}
-        with milvus_errors("connect"):
-            connections.connect(
-                self.name, uri=address, token=token, db_name=database, timeout=_PATIENCE_SECONDS,
-                grpc_options=_AGAIN_SOON, **tls,
-            )  # fmt: skip
+        self._given: dict[str, Any] = {"uri": address, "token": token, "db_name": database}
+        if certificate is not None:
+            self._given |= {"server_pem_path": certificate, "secure": True}
+        self._name = f"placerec-{uuid.uuid4().hex}"
+        self._making = threading.Lock()
+        self._made = False
+        self._outage = Outage("Milvus")
+
+    @contextmanager
+    def using(self, action: str) -> Iterator[str]:
+        """The name of the connection, by which pymilvus knows it.
+
+        Raises:
+            StoreUnavailable: Milvus cannot be reached, or refuses.
+        """
+        with self._outage.noticed(), milvus_errors(action):
+            if not self._made:
+                self._connect()
+            yield self._name
+
+    def _connect(self) -> None:
+        with self._making:
+            if not self._made:
+                connections.connect(self._name, timeout=_CONNECTING_SECONDS, grpc_options=_AGAIN_SOON, **self._given)
+                self._made = True
+
+    def check(self) -> None:
+        """Ask Milvus for its version.
+
+        Raises:
+            StoreUnavailable: it does not answer, or refuses.
+        """
+        with self.using("answer") as name:
+            utility.get_server_version(using=name, timeout=_CONNECTING_SECONDS)
 
     def close(self) -> None:
         """Close it."""
-        connections.disconnect(self.name)
+        if self._made:
+            connections.disconnect(self._name)
 
 
 class Collection:
-    """The descriptors of one encoder.  Any thread may use it.
+    """The descriptors of one encoder; it is made when it is first used.  Any thread may use it.
+
+    Every method may raise StoreUnavailable (Milvus cannot be reached, or refuses) and StoreOfAnotherVersion (its
+    collection of this name was made otherwise).
 
     Args:
         encoder, dimension: its identity, and the values of a descriptor.
-
-    Raises:
-        StorageFailure: Milvus refuses, or its collection of this name was made otherwise.
     """
 
     def __init__(self, connection: Connection, encoder: str, dimension: int) -> None:
-        name, schema = collection_name(encoder, dimension), _schema(encoder, dimension)
-        with milvus_errors("make a collection"):
-            found = None
-            if utility.has_collection(name, using=connection.name, timeout=_PATIENCE_SECONDS):
-                found = Connected(name, using=connection.name).schema.description
-            if found not in (None, schema.description):
-                raise StorageFailure(f"Milvus's collection {name} is of another version: {found[:200]!r}.")
-            self._collection = Connected(
-                name, schema, connection.name, num_partitions=PARTITIONS, shards_num=1, consistency_level="Bounded"
-            )
-            if not self._collection.has_index():
-                self._collection.create_index("descriptor", {"index_type": "FLAT", "metric_type": "IP", "params": {}})
-            self._collection.load()
+        self._connection = connection
+        self._encoder, self._dimension = encoder, dimension
+        self._name = collection_name(encoder, dimension)
+        self._value: type[np.float16 | np.float32] = np.float32
+        self.index_type = "FLAT"
+        """How Milvus searches it, as far as it was used."""
+        self._making = threading.Lock()
+        self._collection: Connected | None = None
+
+    @contextmanager
+    def _using(self, action: str) -> Iterator[Connected]:
+        with self._connection.using(action) as name:
+            if self._collection is None:
+                self._make(name)
+            yield self._collection
+
+    def _make(self, connection: str) -> None:
+        with self._making:
+            if self._collection is not None:
+                return
+            chosen = indexing_for(utility.get_server_version(using=connection, timeout=_PATIENCE_SECONDS))
+            schema = _schema(self._encoder, self._dimension, chosen.half)
+            if utility.has_collection(self._name, using=connection, timeout=_PATIENCE_SECONDS):
+                made = Connected(self._name, using=connection)
+                if (found := made.schema.description) != schema.description:
+                    raise StoreOfAnotherVersion(
+                        f"Milvus's collection {self._name} was made by another version: {found[:200]!r}."
+                    )
+            else:
+                made = Connected(
+                    self._name, schema, connection, num_partitions=PARTITIONS, shards_num=1,
+                    consistency_level="Bounded",
+                )  # fmt: skip
+            if not made.has_index():
+                made.create_index("descriptor", dict(chosen.index))
+            # A collection stays as it was made when its server becomes a newer one.
+            types = {field.name: field.dtype for field in made.schema.fields}
+            self._value = np.float16 if types["descriptor"] == DataType.FLOAT16_VECTOR else np.float32
+            self.index_type = str(made.index().params["index_type"])
+            made.load()
+            self._collection = made
 
     def insert(self, map_number: int, entities: Sequence[Entity]) -> int:
         """Insert entities of a map; they are durable when this returns.
@@ -122,16 +186,43 @@ class Collection:
             From which timestamp on a search sees them.
         """
         seen_from = 0
-        with milvus_errors("store descriptors"):
+        with self._using("store descriptors") as collection:
             for start in range(0, len(entities), _AT_ONCE):
-                some = [_record(map_number, one) for one in entities[start : start + _AT_ONCE]]
-                seen_from = int(self._collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
+                some = [self._record(map_number, one) for one in entities[start : start + _AT_ONCE]]
+                seen_from = int(collection.insert(some, timeout=_PATIENCE_SECONDS).timestamp)
         return seen_from
+
+    def check(self) -> None:
+        """Raise unless the collection can be searched."""
+        with self._using("answer") as collection:
+            collection.query("key == 0", ["key"], timeout=_CONNECTING_SECONDS, consistency_level="Eventually")
 
     def delete(self, keys: Sequence[int]) -> None:
         """Delete entities."""
-        with milvus_errors("delete descriptors"):
-            self._collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
+        with self._using("delete descriptors") as collection:
+            collection.delete(f"key in {list(keys)}", timeout=_PATIENCE_SECONDS)
+
+    def keys_between(self, first: int, end: int) -> list[int]:
+        """The keys of all entities from ``first`` on and below ``end``; at most ``MOST_FOUND`` apart."""
+        with self._using("list descriptors") as collection:
+            found = collection.query(
+                f"key >= {first} and key < {end}", ["key"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
+            )
+        return [int(one["key"]) for one in found]
+
+    def descriptors_of(self, keys: Sequence[int]) -> dict[int, NDArray[np.float32]]:
+        """The descriptors of entities by key, float32 [D]; keys that Milvus does not have now are left out."""
+        with self._using("read descriptors") as collection:
+            found = collection.query(
+                f"key in {list(keys)}", ["key", "descriptor"], timeout=_PATIENCE_SECONDS, consistency_level="Strong"
+            )
+        return {int(one["key"]): self._vector(one["descriptor"]) for one in found}
+
+    def _vector(self, value: Any) -> NDArray[np.float32]:
+        """A descriptor as Milvus returns it: a list, or the bytes of halves."""
+        halves = value[0] if isinstance(value, list) and value and isinstance(value[0], bytes) else value
+        kept = np.frombuffer(halves, np.float16) if isinstance(halves, bytes) else np.asarray(halves)
+        return kept.astype(np.float32)
 
     def search(
         self, descriptors: NDArray[np.float32], expression: str, limit: int, seen_from: int
@@ -143,9 +234,13 @@ class Collection:
             limit: how many at most; at most ``MOST_FOUND``.
             seen_from: a timestamp of Milvus; what was inserted until then is searched.
         """
-        with milvus_errors("search"):
-            found = self._collection.search(
-                list(descriptors), "descriptor", {"metric_type": "IP"}, limit, expression, timeout=_PATIENCE_SECONDS,
+        with self._using("search") as collection:
+            queries, settings = (
+                list(descriptors.astype(self._value, copy=False)),
+                search_settings(self.index_type, limit),
+            )
+            found = collection.search(
+                queries, "descriptor", settings, limit, expression, timeout=_PATIENCE_SECONDS,
                 consistency_level="Customized", guarantee_timestamp=max(1, seen_from),
             )  # fmt: skip
         return [
@@ -156,8 +251,26 @@ class Collection:
             for hits in found
         ]
 
+    def _record(self, map_number: int, entity: Entity) -> dict[str, object]:
+        where = entity.where
+        heading = float(where.heading[0])
+        return {
+            "key": entity.key,
+            "map": map_number,
+            "row": entity.row,
+            "kind": int(where.kind[0]),
+            **dict(zip("xyz", where.position[0].tolist(), strict=True)),
+            "heading": NO_HEADING if isnan(heading) else heading,
+            "timestamp": int(where.timestamp[0]),
+            "sequence": int(where.sequence[0]),
+            "ordinal": int(where.ordinal[0]),
+            "camera": entity.camera or "",
+            "metadata": {"tokens": list(entity.tokens)},
+            "descriptor": entity.descriptor.astype(self._value, copy=False),
+        }
 
-def _schema(encoder: str, dimension: int) -> CollectionSchema:
+
+def _schema(encoder: str, dimension: int, half: bool) -> CollectionSchema:
     return CollectionSchema(
         [
             FieldSchema("key", DataType.INT64, is_primary=True),
@@ -171,26 +284,7 @@ def _schema(encoder: str, dimension: int) -> CollectionSchema:
             FieldSchema("ordinal", DataType.INT64),
             FieldSchema("camera", DataType.VARCHAR, max_length=64),
             FieldSchema("metadata", DataType.JSON),
-            FieldSchema("descriptor", DataType.FLOAT_VECTOR, dim=dimension),
+            FieldSchema("descriptor", DataType.FLOAT16_VECTOR if half else DataType.FLOAT_VECTOR, dim=dimension),
         ],
         description=f"placerec collection 1 of {encoder}",
     )
-
-
-def _record(map_number: int, entity: Entity) -> dict[str, object]:
-    where = entity.where
-    heading = float(where.heading[0])
-    return {
-        "key": entity.key,
-        "map": map_number,
-        "row": entity.row,
-        "kind": int(where.kind[0]),
-        **dict(zip("xyz", where.position[0].tolist(), strict=True)),
-        "heading": NO_HEADING if isnan(heading) else heading,
-        "timestamp": int(where.timestamp[0]),
-        "sequence": int(where.sequence[0]),
-        "ordinal": int(where.ordinal[0]),
-        "camera": entity.camera or "",
-        "metadata": {"tokens": list(entity.tokens)},
-        "descriptor": entity.descriptor,
-    }

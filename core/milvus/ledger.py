@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,26 @@ from typing import Any
 import numpy as np
 import psycopg
 from psycopg import Connection
+from psycopg_pool import PoolTimeout
 
-from core.errors import MapExists, StorageFailure, StorageFull, UnknownMap
+from core.errors import MapExists, StorageFailure, StorageFull, StoreUnavailable, UnknownMap
+from core.maps.counterparts import Standing
 from core.maps.place_filter import PlaceFilter
-from core.maps.records import MapRecord, Outline
+from core.maps.records import KeptFrame, MapRecord, Outline, SequenceSummary
+from core.milvus.outage import Unreachable
 from core.milvus.tokens import tokens_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
 
 TABLES = (Path(__file__).parent / "tables.sql").read_text()
+
+VERSION = 1
+"""Of the tables; it grows when a placerec that knows only the former ones could not use them."""
+
+WAIT_SECONDS = 10
+"""A write that waits for others to the same map is refused after so long."""
+
+WRITING = 7061
+"""The kind of the locks of the database by which writes to a map are paused; their number is that of the map."""
 
 LEFT_SECONDS = 60
 """What no place names any more is deleted after so many seconds; a query that still needs it has ended by then."""
@@ -38,6 +51,15 @@ def postgres_errors(action: str) -> Iterator[None]:
         yield
     except psycopg.errors.DiskFull as error:
         raise StorageFull(f"PostgreSQL has no room left to {action}.") from error
+    except psycopg.errors.LockNotAvailable as error:
+        raise StoreUnavailable(
+            f"PostgreSQL refuses to {action}: others are writing to the map for too long."
+        ) from error
+    except (psycopg.OperationalError, psycopg.InterfaceError) as error:
+        if isinstance(error, PoolTimeout):
+            raise
+        text = str(error).strip().splitlines()
+        raise Unreachable("PostgreSQL", f"cannot be reached, or refuses: {' '.join(text)[:300]}") from error
     except psycopg.Error as error:
         raise StorageFailure(f"PostgreSQL refuses to {action}: {str(error).strip()[:300]}") from error
 
@@ -70,6 +92,7 @@ class PlaceEntry:
     digest: SHA-256 of its image, 32 bytes.
     sequence: code of its sequence, NO_SEQUENCE without one.
     ordinal: its position in its sequence.
+    track, station: code of the sequence whose frames show what it shows, and where in it; None: its own.
     """
 
     number: int
@@ -79,6 +102,8 @@ class PlaceEntry:
     sequence: int
     ordinal: int
     place: Place
+    track: int | None = None
+    station: int | None = None
 
     def whereabouts(self) -> Whereabouts:
         """Where and when its frame was taken."""
@@ -116,23 +141,70 @@ def whereabouts_of(entries: Sequence[PlaceEntry]) -> Whereabouts:
         np.array([entry.ordinal for entry in entries], np.int64),
         np.array([nan if pose is None or pose.heading is None else pose.heading for pose in poses], np.float32),
         np.array([NO_TIME if moment is None else microseconds(moment) for moment in moments], np.int64),
+        np.array([entry.sequence if entry.track is None else entry.track for entry in entries], np.int32),
+        np.array([entry.ordinal if entry.station is None else entry.station for entry in entries], np.int64),
     )
 
 
 # Maps
 
 
-def create(connection: Connection[Any], record: MapRecord) -> None:
-    """Insert a map without places.
+def version_of(connection: Connection[Any]) -> int | None:
+    """The version of the tables; None if there are none."""
+    if connection.execute("SELECT to_regclass('placerec')").fetchone() == (None,):
+        return None
+    found = connection.execute("SELECT version FROM placerec").fetchone()
+    return None if found is None else int(found[0])
+
+
+def create(connection: Connection[Any], record: MapRecord, name: str | None = None, listed: bool = True) -> int:
+    """Insert a map without places; returns its number.
+
+    Args:
+        name: under which it is kept until it is published; None: its id.
 
     Raises:
         MapExists: the id is taken.
     """
-    query = "INSERT INTO maps (id, record) VALUES (%s, %s) ON CONFLICT DO NOTHING RETURNING number"
-    made = connection.execute(query, (record.id, record.model_dump_json())).fetchone()
+    query = "INSERT INTO maps (id, record, listed) VALUES (%s, %s, %s) ON CONFLICT DO NOTHING RETURNING number"
+    made = connection.execute(query, (name or record.id, record.model_dump_json(), listed)).fetchone()
     if made is None:
-        raise MapExists(f"There is already a map {record.id!r}.")
+        (taken,) = connection.execute("SELECT listed FROM maps WHERE id = %s", (record.id,)).fetchone() or (True,)
+        raise MapExists(f"There is already a map {record.id!r}." if taken else f"A map {record.id!r} is being made.")
     connection.execute("INSERT INTO sequences (map, code) VALUES (%s, %s)", (made[0], NO_SEQUENCE))
+    return int(made[0])
+
+
+def publish(connection: Connection[Any], number: int, map_id: str) -> None:
+    """List a map that was being built, under its id.
+
+    Raises:
+        UnknownMap: it is gone, or listed already.
+        MapExists: the id is taken.
+    """
+    try:
+        done = connection.execute(
+            "UPDATE maps SET id = %s, listed = true WHERE number = %s AND NOT listed", (map_id, number)
+        )
+    except psycopg.errors.UniqueViolation:
+        raise MapExists(f"There is already a map {map_id!r}.") from None
+    if not done.rowcount:
+        raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
+
+
+def is_taken(connection: Connection[Any], map_id: str) -> bool:
+    """Whether a map has this id, or is being built to have it."""
+    return connection.execute("SELECT 1 FROM maps WHERE id = %s", (map_id,)).fetchone() is not None
+
+
+def unlisted(connection: Connection[Any], untouched_seconds: float = 0) -> dict[str, int]:
+    """The numbers of the maps that are being built, by the ids under which they are kept.
+
+    Args:
+        untouched_seconds: only those that nobody has written to for so long.
+    """
+    query = "SELECT id, number FROM maps WHERE NOT listed AND touched <= now() - make_interval(secs => %s)"
+    return dict(connection.execute(query, (untouched_seconds,)).fetchall())
 
 
 def state_of(connection: Connection[Any], map_id: str, number: int | None = None, locked: bool = False) -> MapState:
@@ -145,26 +217,37 @@ def state_of(connection: Connection[Any], map_id: str, number: int | None = None
     Raises:
         UnknownMap: there is none.
     """
-    query = "SELECT number, record, places, rows, writes, inserted FROM maps WHERE id = %s"
-    found = connection.execute(query + (" FOR UPDATE" if locked else ""), (map_id,)).fetchone()
-    if found is None or number not in (None, found[0]):
+    query = "SELECT number, record, places, rows, writes, inserted FROM maps WHERE "
+    query += "id = %s AND listed" if number is None else "number = %s"
+    key = map_id if number is None else number
+    found = connection.execute(query + (" FOR UPDATE" if locked else ""), (key,)).fetchone()
+    if found is None:
         raise UnknownMap(f"There is no map {map_id[:80]!r}.")
     return MapState(found[0], MapRecord.model_validate_json(found[1]), *found[2:])
 
 
+def expect_unpaused(connection: Connection[Any], map_number: int) -> None:
+    """Wait until nobody pauses the writes to a map, and keep others from pausing them until the transaction ends."""
+    connection.execute(f"SET LOCAL lock_timeout TO '{WAIT_SECONDS}s'")
+    connection.execute("SELECT pg_advisory_xact_lock_shared(%s::int, %s::int)", (WRITING, map_number % 2**31))
+
+
 def records_after(connection: Connection[Any], after: str, limit: int) -> list[MapRecord]:
     """Up to ``limit`` records by id."""
-    query = "SELECT record FROM maps WHERE id > %s ORDER BY id LIMIT %s"
+    query = "SELECT record FROM maps WHERE id > %s AND listed ORDER BY id LIMIT %s"
     return [MapRecord.model_validate_json(text) for (text,) in connection.execute(query, (after, limit))]
 
 
-def delete(connection: Connection[Any], map_id: str) -> list[int]:
+def delete(connection: Connection[Any], map_id: str, number: int | None = None) -> list[int]:
     """Delete a map and all that belongs to it; returns the keys of its entities in Milvus.
+
+    Args:
+        number: of the map that is meant, which may be unlisted; None: the one that has the id.
 
     Raises:
         UnknownMap: there is none.
     """
-    state = state_of(connection, map_id, locked=True)
+    state = state_of(connection, map_id, number, locked=True)
     query = "SELECT key FROM places WHERE map = %s UNION SELECT key FROM leavings WHERE map = %s"
     keys = [key for (key,) in connection.execute(query, (state.number, state.number))]
     connection.execute("DELETE FROM maps WHERE number = %s", (state.number,))
@@ -173,31 +256,36 @@ def delete(connection: Connection[Any], map_id: str) -> list[int]:
 
 def update(connection: Connection[Any], state: MapState) -> None:
     """Store what a write has changed of the map itself."""
-    query = "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s WHERE number = %s"
+    query = (
+        "UPDATE maps SET record = %s, places = %s, rows = %s, writes = %s, inserted = %s, touched = now()"
+        " WHERE number = %s"
+    )
     record = state.record.model_dump_json()
     connection.execute(query, (record, state.places, state.rows, state.writes, state.inserted, state.number))
 
 
 # Places
 
-_ENTRY = "SELECT number, row, key, digest, sequence, ordinal, place FROM places WHERE map = %s"
+_ENTRY = "SELECT number, row, key, digest, sequence, ordinal, place, track, station FROM places WHERE map = %s"
 
 
-def _entry(values: tuple[Any, ...]) -> PlaceEntry:
-    number, row, key, digest, sequence, ordinal, text = values
-    return PlaceEntry(number, row, key, digest, sequence, ordinal, Place.model_validate(json.loads(text)))
+def entry_of(values: tuple[Any, ...]) -> PlaceEntry:
+    """A place from its columns, in the order of the statement above."""
+    number, row, key, digest, sequence, ordinal, text, track, station = values
+    place = Place.model_validate(json.loads(text))
+    return PlaceEntry(number, row, key, digest, sequence, ordinal, place, track, station)
 
 
 def find(connection: Connection[Any], map_number: int, place_id: str) -> PlaceEntry | None:
     """The place of this id; None if there is none."""
     values = connection.execute(f"{_ENTRY} AND id = %s", (map_number, place_id)).fetchone()
-    return None if values is None else _entry(values)
+    return None if values is None else entry_of(values)
 
 
 def entries_by(connection: Connection[Any], map_number: int, column: str, values: Sequence[Any]) -> list[PlaceEntry]:
     """The places with one of some values in a column, ``id``, ``row`` or ``key``, in any order."""
     query = f"{_ENTRY} AND {column} = ANY(%s)"
-    return [_entry(found) for found in connection.execute(query, (map_number, list(values)))]
+    return [entry_of(found) for found in connection.execute(query, (map_number, list(values)))]
 
 
 def entries_after(
@@ -217,7 +305,7 @@ def entries_after(
     conditions = {condition: value for condition, value in given.items() if value is not None}
     also = "".join(f" AND {condition}" for condition in conditions)
     query = f"{_ENTRY}{also} ORDER BY number LIMIT %s"
-    return [_entry(found) for found in connection.execute(query, (map_number, *conditions.values(), limit))]
+    return [entry_of(found) for found in connection.execute(query, (map_number, *conditions.values(), limit))]
 
 
 def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None:
@@ -225,10 +313,11 @@ def put(connection: Connection[Any], map_number: int, entry: PlaceEntry) -> None
     place = entry.place
     columns = {
         "map": map_number, "number": entry.number, "id": place.id, "row": entry.row, "key": entry.key,
-        "digest": entry.digest, "place": json.dumps(place.model_dump(mode="json")), "sequence": entry.sequence,
+        "digest": entry.digest, "picture": place.picture, "place": json.dumps(place.model_dump(mode="json")),
+        "sequence": entry.sequence,
         "ordinal": entry.ordinal, "camera": place.camera,
         "moment": None if place.timestamp is None else microseconds(place.timestamp),
-        "tokens": tokens_of(place.metadata),
+        "tokens": tokens_of(place.metadata), "track": entry.track, "station": entry.station, "pose_of": place.pose_of,
     }  # fmt: skip
     names, marks = ", ".join(columns), ", ".join(["%s"] * len(columns))
     again = ", ".join(f"{name} = excluded.{name}" for name in columns if name not in ("map", "number", "id"))
@@ -256,18 +345,72 @@ def sequence_codes(connection: Connection[Any], map_number: int, names: Sequence
     return dict(connection.execute(query, (map_number, list(names))).fetchall())
 
 
+def new_sequence(connection: Connection[Any], map_number: int, name: str) -> int:
+    """Make a sequence without places; returns its code."""
+    code = new_code(connection, map_number)
+    connection.execute("INSERT INTO sequences (map, code, name) VALUES (%s, %s, %s)", (map_number, code, name))
+    return code
+
+
+def wrong_sequence(connection: Connection[Any], map_number: int) -> tuple[str | None] | None:
+    """The name of a sequence that has no places, or some behind its end; None if there is none such."""
+    query = (
+        "SELECT s.name FROM sequences s LEFT JOIN places p ON p.map = s.map AND p.sequence = s.code WHERE s.map = %s"
+        " GROUP BY s.map, s.code HAVING coalesce(max(p.ordinal), -1) >= s.next_ordinal"
+        " OR (s.name IS NOT NULL AND count(p.number) = 0) LIMIT 1"
+    )
+    found: tuple[str | None] | None = connection.execute(query, (map_number,)).fetchone()
+    return found
+
+
+def new_code(connection: Connection[Any], map_number: int) -> int:
+    """A code that no sequence of a map has or had."""
+    query = "UPDATE maps SET codes = codes + 1 WHERE number = %s RETURNING codes - 1"
+    ((code,),) = connection.execute(query, (map_number,)).fetchall()
+    return int(code)
+
+
+def put_ordinal(connection: Connection[Any], map_number: int, code: int, ordinal: int) -> None:
+    """Have the next place of a sequence stand behind an ordinal."""
+    query = "UPDATE sequences SET next_ordinal = greatest(next_ordinal, %s) WHERE map = %s AND code = %s"
+    connection.execute(query, (ordinal + 1, map_number, code))
+
+
+def sequence_ends(connection: Connection[Any], map_number: int) -> dict[str | None, int]:
+    """The ordinal that the next place of each sequence gets, by name; None: of the places without a sequence."""
+    query = "SELECT name, next_ordinal FROM sequences WHERE map = %s ORDER BY name NULLS FIRST"
+    return dict(connection.execute(query, (map_number,)).fetchall())
+
+
+def sequences_after(connection: Connection[Any], map_number: int, after: str, limit: int) -> list[SequenceSummary]:
+    """Up to ``limit`` sequences by name."""
+    query = (
+        "SELECT s.name, count(*), min(p.moment), max(p.moment) FROM sequences s"
+        " JOIN places p ON p.map = s.map AND p.sequence = s.code WHERE s.map = %s AND s.name > %s"
+        " GROUP BY s.name ORDER BY s.name LIMIT %s"
+    )
+    return [
+        SequenceSummary(name=name, places=places, first_at=_moment(first), last_at=_moment(last))
+        for name, places, first, last in connection.execute(query, (map_number, after, limit))
+    ]
+
+
+def _moment(microseconds_since_1970: int | None) -> datetime | None:
+    if microseconds_since_1970 is None:
+        return None
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=microseconds_since_1970)
+
+
 def next_in_sequence(connection: Connection[Any], map_number: int, name: str | None) -> tuple[int, int]:
     """The code of a sequence, which is made if there is none, and the ordinal of its next place."""
     code = NO_SEQUENCE if name is None else sequence_codes(connection, map_number, [name]).get(name)
-    if code is None:
-        query = "UPDATE maps SET codes = codes + 1 WHERE number = %s RETURNING codes - 1"
-        ((code,),) = connection.execute(query, (map_number,)).fetchall()
-        connection.execute("INSERT INTO sequences (map, code, name) VALUES (%s, %s, %s)", (map_number, code, name))
+    if name is not None and code is None:
+        code = new_sequence(connection, map_number, name)
     query = (
         "UPDATE sequences SET next_ordinal = next_ordinal + 1 WHERE map = %s AND code = %s RETURNING next_ordinal - 1"
     )
     ((ordinal,),) = connection.execute(query, (map_number, code)).fetchall()
-    return int(code), int(ordinal)
+    return NO_SEQUENCE if code is None else code, int(ordinal)
 
 
 def drop_if_empty(connection: Connection[Any], map_number: int, code: int) -> None:
@@ -277,6 +420,18 @@ def drop_if_empty(connection: Connection[Any], map_number: int, code: int) -> No
         " AND NOT EXISTS (SELECT 1 FROM places p WHERE p.map = sequences.map AND p.sequence = sequences.code)"
     )
     connection.execute(query, (map_number, code))
+
+
+def standings(connection: Connection[Any], map_number: int) -> dict[str, Standing]:
+    """Where all places are along their sequences and tracks, by id, in the order of their enrolment."""
+    query = "SELECT id, digest, sequence, ordinal, track, station, pose_of FROM places WHERE map = %s ORDER BY number"
+    return {values[0]: Standing(*values) for values in connection.execute(query, (map_number,))}
+
+
+def handed_over(connection: Connection[Any], map_number: int) -> dict[int, str]:
+    """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+    query = "SELECT row, pose_of FROM places WHERE map = %s AND pose_of IS NOT NULL"
+    return dict(connection.execute(query, (map_number,)).fetchall())
 
 
 def oldest_of_last(connection: Connection[Any], map_number: int, code: int, frames: int) -> int | None:
@@ -299,10 +454,40 @@ def put_frame(connection: Connection[Any], map_number: int, row: int, frame: Fra
     connection.execute(query, values)
 
 
-def put_keypoints(connection: Connection[Any], map_number: int, row: int, keypoints: bytes) -> None:
-    """Store the keypoints of a frame that has none."""
+def put_keypoints(connection: Connection[Any], map_number: int, row: int, keypoints: bytes) -> bool:
+    """Store the keypoints of a frame if it has none; returns whether it had none."""
     query = "UPDATE frames SET keypoints = %s WHERE map = %s AND row = %s AND keypoints IS NULL"
-    connection.execute(query, (keypoints, map_number, row))
+    return connection.execute(query, (keypoints, map_number, row)).rowcount > 0
+
+
+def without_keypoints(connection: Connection[Any], map_number: int, after: int, limit: int) -> list[KeptFrame]:
+    """Up to ``limit`` places behind number ``after`` that keep a picture and no keypoints."""
+    query = (
+        "SELECT p.number, p.id, p.digest, p.camera, p.picture FROM places p"
+        " JOIN frames f ON f.map = p.map AND f.row = p.row"
+        " WHERE p.map = %s AND p.number > %s AND f.picture IS NOT NULL AND f.keypoints IS NULL"
+        " ORDER BY p.number LIMIT %s"
+    )
+    return [KeptFrame(*values) for values in connection.execute(query, (map_number, after, limit))]
+
+
+def count_without_image(connection: Connection[Any], map_number: int) -> int:
+    """How many places keep no original image."""
+    query = "SELECT count(*) FROM places WHERE map = %s AND picture <> 'image'"
+    ((count,),) = connection.execute(query, (map_number,)).fetchall()
+    return int(count)
+
+
+def room(connection: Connection[Any], map_number: int) -> tuple[int, int, int, int]:
+    """The bytes of descriptors, of other content, of keypoints, and of how many frames these are."""
+    query = (
+        "SELECT coalesce(sum(octet_length(descriptor) + octet_length(local)), 0),"
+        " coalesce(sum(octet_length(picture)), 0), coalesce(sum(octet_length(keypoints)), 0), count(keypoints)"
+        " FROM frames WHERE map = %s"
+    )
+    (sizes,) = connection.execute(query, (map_number,)).fetchall()
+    descriptors, pictures, keypoints, places = (int(size) for size in sizes)
+    return descriptors, pictures, keypoints, places
 
 
 def of_frames(connection: Connection[Any], map_number: int, column: str, rows: Sequence[int]) -> dict[int, Any]:
@@ -339,3 +524,33 @@ def clear(connection: Connection[Any], map_number: int, keys: Sequence[int]) -> 
     query = "DELETE FROM leavings WHERE map = %s AND key = ANY(%s) RETURNING row"
     rows = [row for (row,) in connection.execute(query, (map_number, list(keys))) if row is not None]
     connection.execute("DELETE FROM frames WHERE map = %s AND row = ANY(%s)", (map_number, rows))
+
+
+# All keys
+
+
+def known_keys(connection: Connection[Any], keys: Sequence[int]) -> set[int]:
+    """Those of some keys that are a place's, or were one's a while ago."""
+    query = "SELECT key FROM places WHERE key = ANY(%s) UNION SELECT key FROM leavings WHERE key = ANY(%s)"
+    return {key for (key,) in connection.execute(query, (list(keys), list(keys)))}
+
+
+def last_key(connection: Connection[Any]) -> int:
+    """No later key is at most this."""
+    ((key,),) = connection.execute("SELECT last_value FROM keys").fetchall()
+    return int(key)
+
+
+def map_numbers(connection: Connection[Any]) -> list[int]:
+    """The numbers of all maps, also of unlisted ones."""
+    return [number for (number,) in connection.execute("SELECT number FROM maps ORDER BY number")]
+
+
+def encoders(connection: Connection[Any]) -> list[tuple[str, int]]:
+    """The encoders of all maps, each with the values of its descriptors."""
+    found = {(r.encoder, r.dimension) for r in map(_record, connection.execute("SELECT record FROM maps"))}
+    return sorted(found)
+
+
+def _record(values: tuple[str]) -> MapRecord:
+    return MapRecord.model_validate_json(values[0])

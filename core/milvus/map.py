@@ -3,40 +3,64 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, overload
 
-import numpy as np
 from psycopg import Connection
 
 from core.errors import (
+    InvalidImage,
     InvalidKeypoints,
+    NoThumbnail,
     RevisionMismatch,
     StorageFailure,
     TooManyToForget,
     UnknownPlace,
     UnknownSequence,
 )
+from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from core.geometry.keypoints import Keypoints, keypoints_of
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
-from core.maps.records import Change, Enrolment, MapRecord, Outline, SameFrame, patched_fields, patched_record
+from core.maps.records import (
+    Change,
+    Enrolment,
+    History,
+    Keep,
+    KeptFrame,
+    MapRecord,
+    SameFrame,
+    SequenceSummary,
+    patched_fields,
+    patched_record,
+)
 from core.maps.selection import Selection
+from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, Tier, no_progress
 from core.milvus import ledger
 from core.milvus.cameras import MilvusCameras
 from core.milvus.collection import Collection, Entity
+from core.milvus.counterparts import MilvusCounterparts
 from core.milvus.database import Database
+from core.milvus.exporter import MilvusExporter
+from core.milvus.forms import Form
 from core.milvus.ledger import Frame, MapState, PlaceEntry
+from core.milvus.plan import MilvusPlan
+from core.milvus.review import MilvusReview
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.tokens import tokens_of
-from core.places import Place, PlaceFields
+from core.milvus.transfer import MilvusTransfer
+from core.places import Place, PlaceFields, Pose
 from core.storage.database.ledger import metadata_text, picture_of, same_fields
-from core.storage.pagination import decode_number, listing_of_places, one_more, page_of
+from core.storage.pagination import Listing, decode_name, decode_number, listing_of_places, one_more, page_of
 from core.storage.writing import check_enrolment
 
 log = logging.getLogger(__name__)
+
+REBUILT_AT_ONCE = 256
+"""Places whose entities are made again in one transaction."""
 
 
 class MilvusMap:
@@ -49,7 +73,15 @@ class MilvusMap:
     def __init__(self, database: Database, collection: Collection, state: MapState) -> None:
         """The map that was found in this state."""
         self._database, self.collection, self._state = database, collection, state
+        self._last: MilvusSnapshot | None = None
+        self._room: tuple[int, StorageStatus] | None = None
+        self._paused = threading.local()
         self.cameras = MilvusCameras(state.number, self._reading, self._locked)
+        self.transfer = MilvusTransfer(state.number, self._reading, self.writing, self.paused_writes)
+        self.counterparts = MilvusCounterparts(state.number, self._reading, self.writing)
+        self.review = MilvusReview(state.number, self._reading, database)
+        self.plan = MilvusPlan(state.number, self._reading)
+        self.exporter = MilvusExporter(self.viewing, lambda: self.state)
 
     @property
     def record(self) -> MapRecord:
@@ -57,54 +89,87 @@ class MilvusMap:
         return self._state.record
 
     @property
-    def transfer(self) -> MilvusMap:
-        """Lists all places in brief."""
-        return self
+    def is_open(self) -> bool:
+        """True: nothing has to be read before the map can be used."""
+        return True
 
     @property
-    def _number(self) -> int:
+    def held(self) -> bool:
+        """False: other processes are asked for everything."""
+        return False
+
+    @property
+    def state(self) -> object:
+        """A value that is the same until the map is written to."""
+        with self.viewing() as (_, state):
+            return state.number, state.writes
+
+    def open(self) -> None:
+        """Raise if the map is gone."""
+        with self._reading():
+            pass
+
+    @property
+    def number(self) -> int:
+        """Of the map; never used for another one, also of the same id."""
         return self._state.number
+
+    def note(self, state: MapState) -> None:
+        """Remember a state that was read, unless a later one is known."""
+        if state.writes >= self._state.writes:
+            self._state = state
+
+    @contextmanager
+    def viewing(self) -> Iterator[tuple[Connection[Any], MapState]]:
+        """A transaction that reads the map, and the map's state in it."""
+        with self._database.reading() as connection:
+            state = ledger.state_of(connection, self.record.id, self.number)
+            self.note(state)
+            yield connection, state
 
     @contextmanager
     def _reading(self) -> Iterator[Connection[Any]]:
-        with self._database.reading() as connection:
-            self._state = ledger.state_of(connection, self.record.id, self._number)
+        with self.viewing() as (connection, _):
             yield connection
 
     # Searching
 
     def snapshot(self) -> MilvusSnapshot:
-        """All places at this moment."""
-        with self._reading() as connection:
-            return self._snapshot(connection)
+        """All places at this moment; the same object until the map is written to."""
+        with self.viewing() as (connection, state):
+            self._last = self._snapshot(connection, state)
+            return self._last
 
-    def _snapshot(self, connection: Connection[Any]) -> MilvusSnapshot:
-        leavings = tuple(ledger.leavings(connection, self._number))
-        return MilvusSnapshot(self._database, self.collection, self._state, leavings)
+    def _snapshot(self, connection: Connection[Any], state: MapState) -> MilvusSnapshot:
+        last = self._last
+        if last is not None and last.state == state:
+            return last
+        leavings = tuple(ledger.leavings(connection, self.number))
+        return MilvusSnapshot(self._database, self.collection, state, leavings)
 
     def scope(self, selection: Selection | None = None) -> MilvusScope:
         """The places that a query may find at this moment; None: all."""
-        with self._reading() as connection:
-            return scope_of(connection, self._snapshot(connection), selection)
+        with self.viewing() as (connection, state):
+            return scope_of(connection, self._snapshot(connection, state), selection)
 
     def places_at(self, rows: Sequence[int]) -> list[Place | None]:
         """The places of rows that a search returned; None where a place was deleted or got another frame since."""
         with self._reading() as connection:
-            entries = ledger.entries_by(connection, self._number, "row", [int(row) for row in rows])
+            entries = ledger.entries_by(connection, self.number, "row", [int(row) for row in rows])
         found = {entry.row: entry.place for entry in entries}
         return [found.get(int(row)) for row in rows]
 
     def keypoints_at(self, rows: Sequence[int]) -> list[Keypoints | None]:
         """The keypoints of those places; None also where none are kept, and where they are damaged, which is logged."""
         with self._reading() as connection:
-            entries = ledger.entries_by(connection, self._number, "row", [int(row) for row in rows])
-            kept = ledger.of_frames(connection, self._number, "keypoints", [entry.row for entry in entries])
+            entries = ledger.entries_by(connection, self.number, "row", [int(row) for row in rows])
+            kept = ledger.of_frames(connection, self.number, "keypoints", [entry.row for entry in entries])
         return [None if (record := kept.get(int(row))) is None else _keypoints(int(row), record) for row in rows]
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The rows of places; None where there is no such place."""
         with self._reading() as connection:
-            entries = ledger.entries_by(connection, self._number, "id", place_ids)
+            entries = ledger.entries_by(connection, self.number, "id", place_ids)
         found = {entry.place.id: entry.row for entry in entries}
         return [found.get(place_id) for place_id in place_ids]
 
@@ -112,8 +177,8 @@ class MilvusMap:
 
     def count_places(self) -> int:
         """How many places the map has."""
-        with self._reading():
-            return self._state.places
+        with self.viewing() as (_, state):
+            return state.places
 
     def place(self, place_id: str) -> Place:
         """One place.
@@ -122,7 +187,7 @@ class MilvusMap:
             UnknownPlace.
         """
         with self._reading() as connection:
-            return _expect(connection, self._number, place_id).place
+            return _expect(connection, self.number, place_id).place
 
     def places(
         self, cursor: str | None, limit: int, wanted: PlaceFilter = EVERY_PLACE
@@ -136,49 +201,185 @@ class MilvusMap:
         listing = listing_of_places(self.record.id, wanted)
         after = decode_number(listing, cursor)
         with self._reading() as connection:
-            found = ledger.entries_after(connection, self._number, after, most, wanted)
+            found = ledger.entries_after(connection, self.number, after, most, wanted)
         page, more = page_of(listing, found, limit, lambda entry: entry.number)
         return [entry.place for entry in page], more
 
-    def outline(self) -> list[Outline]:
-        """All places in brief, in the order of their enrolment."""
+    def ids_of(self, wanted: PlaceFilter, most: int) -> list[str]:
+        """The ids of the places that fulfil some conditions, in the order of their enrolment.
+
+        Raises:
+            TooManyToForget: there are more than ``most``.
+        """
         with self._reading() as connection:
-            entries = ledger.entries_after(connection, self._number, -1, None, EVERY_PLACE)
-        return [entry.outline() for entry in entries]
+            found = ledger.entries_after(connection, self.number, -1, most + 1, wanted)
+        return [entry.place.id for entry in _not_more(found, most)]
+
+    def digest(self, place_id: str) -> bytes | None:
+        """SHA-256 (32 bytes) of the image of a place; None if there is no such place."""
+        with self._reading() as connection:
+            entry = ledger.find(connection, self.number, place_id)
+        return None if entry is None else entry.digest
+
+    def sequences(self, cursor: str | None, limit: int) -> tuple[list[SequenceSummary], str | None]:
+        """A page of sequences by name, and the cursor of the next page.
+
+        Raises:
+            InvalidCursor.
+        """
+        listing: Listing = ["sequences", self.record.id]
+        after = decode_name(listing, cursor)
+        with self._reading() as connection:
+            found = ledger.sequences_after(connection, self.number, after, one_more(limit))
+        return page_of(listing, found, limit, lambda sequence: sequence.name)
+
+    def unknown_sequences(self, names: Sequence[str]) -> set[str]:
+        """Those of the names that no sequence has."""
+        with self._reading() as connection:
+            return set(names) - set(ledger.sequence_codes(connection, self.number, names))
+
+    def without_keypoints(self, after: int, limit: int) -> list[KeptFrame]:
+        """Places that keep their image or a thumbnail, and no keypoints, behind the number ``after``."""
+        with self._reading() as connection:
+            return ledger.without_keypoints(connection, self.number, after, limit)
+
+    def thumbnail(self, place_id: str) -> bytes:
+        """A small JPEG of a place.
+
+        Raises:
+            UnknownPlace: there is no such place.
+            NoThumbnail: the map keeps no picture of it, or one that cannot be shown.
+            MemoryError: its pixels do not fit into memory.
+        """
+        with self._reading() as connection:
+            entry = _expect(connection, self.number, place_id)
+            kept: bytes | None = ledger.of_frames(connection, self.number, "picture", [entry.row]).get(entry.row)
+        if kept is None:
+            raise NoThumbnail(f"The map keeps no picture of place {place_id!r}.")
+        if entry.place.picture == "thumbnail":
+            return kept
+        try:
+            return encode_thumbnail(decode(kept, ANY_SIZE))
+        except InvalidImage as error:
+            raise NoThumbnail(f"The picture kept of place {place_id!r} cannot be shown: {error}") from error
+
+    # How it is kept
+
+    def index_status(self) -> IndexStatus:
+        """How the map is searched: by Milvus, which compares every place if its collection has no other index."""
+        tier: Tier = "exact" if self.collection.index_type == "FLAT" else "compact"
+        return IndexStatus(
+            setting=self.record.index,
+            tier=tier,
+            wanted=tier,
+            state="ready",
+            progress=1,
+            rows_indexed=0,
+            recall=None,
+            bytes_in_memory=0,
+        )
+
+    def rebuild_index(self, progress: Progress = no_progress) -> IndexStatus:
+        """Give Milvus all descriptors again, some at a time; searches use those that it has meanwhile.
+
+        Args:
+            progress: is told how many places of how many are done; what it raises ends the work, and what was done
+                until then stays.
+        """
+        done, after, total = 0, -1, self.count_places()
+        while True:
+            with self.writing() as write:
+                entries = write.all_of(EVERY_PLACE, REBUILT_AT_ONCE, after)
+                for entry in entries:
+                    write.renew_entity(entry)
+            if not entries:
+                return self.index_status()
+            done, after = done + len(entries), entries[-1].number
+            progress(min(done, total), total)
+
+    def storage_status(self) -> StorageStatus:
+        """How much room the map takes in PostgreSQL; Milvus takes some four bytes for each value besides."""
+        with self.viewing() as (connection, state):
+            if self._room is None or self._room[0] != state.writes:
+                descriptors, pictures, keypoints, places = ledger.room(connection, self.number)
+                whole = descriptors + pictures + keypoints
+                status = StorageStatus(
+                    precision=state.record.precision,
+                    bytes_per_place=round(whole / state.places) if state.places else 0,
+                    descriptors=descriptors,
+                    index=0,
+                    database=pictures + keypoints,
+                    keypoints=KeypointsStatus(places=places, bytes=keypoints),
+                )
+                self._room = state.writes, status
+            return self._room[1]
 
     def picture(self, place_id: str) -> bytes | None:
         """The picture kept of a place's frame, as the place's ``picture`` says; None if it is gone or keeps none."""
         with self._reading() as connection:
-            entry = ledger.find(connection, self._number, place_id)
+            entry = ledger.find(connection, self.number, place_id)
             if entry is None:
                 return None
-            found: bytes | None = ledger.of_frames(connection, self._number, "picture", [entry.row]).get(entry.row)
+            found: bytes | None = ledger.of_frames(connection, self.number, "picture", [entry.row]).get(entry.row)
             return found
 
     # Writing
 
     @contextmanager
+    def paused_writes(self) -> Iterator[None]:
+        """Nobody but this thread writes to the map during the block; if that cannot be any more, this thread neither.
+
+        Raises:
+            StoreUnavailable, StorageFailure.
+        """
+        if getattr(self._paused, "connection", None) is not None:
+            yield
+            return
+        with self._database.locked("pause the writes to a map", ledger.WRITING, self.number) as connection:
+            self._paused.connection = connection
+            try:
+                yield
+            finally:
+                self._paused.connection = None
+
+    @contextmanager
     def _locked(self) -> Iterator[Connection[Any]]:
-        with self._database.transaction("write to a map") as connection:
-            self._state = ledger.state_of(connection, self.record.id, self._number, locked=True)
+        with self._transaction() as connection:
+            self.note(ledger.state_of(connection, self.record.id, self.number, locked=True))
             yield connection
 
     @contextmanager
-    def _writing(self) -> Iterator[Write]:
-        with self._locked() as connection:
-            write = Write(connection, self.collection, self._state)
+    def _transaction(self) -> Iterator[Connection[Any]]:
+        """A transaction in which this thread may write to the map."""
+        paused: Connection[Any] | None = getattr(self._paused, "connection", None)
+        if paused is not None:
+            with ledger.postgres_errors("write to a map"), paused.transaction():
+                paused.execute("SET LOCAL synchronous_commit TO on")
+                yield paused
+            return
+        with self._database.transaction("write to a map") as connection:
+            ledger.expect_unpaused(connection, self.number)
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Write]:
+        """Collect the changes of one write, which are stored whole at the end of the block, or not at all."""
+        with self._transaction() as connection:
+            write = Write(
+                connection, self.collection, ledger.state_of(connection, self.record.id, self.number, locked=True)
+            )
             yield write
             write.finish()
-        self._state = write.state
+        self.note(write.state)
         self._tidy()
 
     def _tidy(self) -> None:
         """Delete what was left over a while ago; what cannot be deleted now is deleted after another write."""
         try:
             with self._database.transaction("delete what is left over") as connection:
-                if keys := ledger.old_leavings(connection, self._number):
+                if keys := ledger.old_leavings(connection, self.number):
                     self.collection.delete(keys)
-                    ledger.clear(connection, self._number, keys)
+                    ledger.clear(connection, self.number, keys)
         except StorageFailure as error:
             log.warning("Map %s: %s", self.record.id, error)
 
@@ -189,7 +390,7 @@ class MilvusMap:
             InvalidField: a field is unknown or fixed, or its value is not allowed.
             RevisionMismatch: the record is not at ``expected_revision``.
         """
-        with self._writing() as write:
+        with self.writing() as write:
             record = write.state.record
             if expected_revision is not None and expected_revision != record.revision:
                 raise RevisionMismatch(f"The map is at revision {record.revision}, not {expected_revision}.")
@@ -217,7 +418,7 @@ class MilvusMap:
                 check_enrolment(item, self.record.dimension, self.record.local_shape)
         if not items:
             return []
-        with self._writing() as write:
+        with self.writing() as write:
             return [write.enrol(item) if isinstance(item, Enrolment) else write.renew(item) for item in items]
 
     def set_fields(self, place_id: str, fields: PlaceFields) -> tuple[Place, Change]:
@@ -226,7 +427,7 @@ class MilvusMap:
         Raises:
             UnknownPlace, InvalidField.
         """
-        with self._writing() as write:
+        with self.writing() as write:
             return write.set_fields(write.expect(place_id), fields)
 
     def patch(self, place_id: str, changes: Mapping[str, Any]) -> Place:
@@ -235,9 +436,16 @@ class MilvusMap:
         Raises:
             UnknownPlace, InvalidField.
         """
-        with self._writing() as write:
+        with self.writing() as write:
             entry = write.expect(place_id)
             return write.set_fields(entry, patched_fields(entry.place, changes))[0]
+
+    def add_keypoints(self, found: Sequence[tuple[KeptFrame, Keypoints]]) -> int:
+        """Store the keypoints of places that have none (:meth:`core.maps.store.Map.add_keypoints`)."""
+        if not found:
+            return 0
+        with self.writing() as write:
+            return sum(write.add_keypoints(frame, of_frame) for frame, of_frame in found)
 
     def forget(self, place_id: str) -> None:
         """Delete a place.
@@ -245,7 +453,7 @@ class MilvusMap:
         Raises:
             UnknownPlace.
         """
-        with self._writing() as write:
+        with self.writing() as write:
             write.forget(write.expect(place_id))
 
     def forget_all(self, wanted: PlaceFilter, most: int) -> list[str]:
@@ -254,12 +462,8 @@ class MilvusMap:
         Raises:
             TooManyToForget: there are more than ``most``.
         """
-        with self._writing() as write:
-            found = write.all_of(wanted, most + 1)
-            if len(found) > most:
-                raise TooManyToForget(
-                    f"More than {most} places fulfil the conditions. Forget them in several requests."
-                )
+        with self.writing() as write:
+            found = _not_more(write.all_of(wanted, most + 1), most)
             for entry in found:
                 write.forget(entry)
         return [entry.place.id for entry in found]
@@ -270,7 +474,7 @@ class MilvusMap:
         Raises:
             UnknownSequence: there is none.
         """
-        with self._writing() as write:
+        with self.writing() as write:
             found = write.all_of(PlaceFilter(sequence=name), None)
             if not found:
                 raise UnknownSequence(f"The map has no sequence {name[:128]!r}.")
@@ -284,9 +488,10 @@ class Write:
 
     def __init__(self, connection: Connection[Any], collection: Collection, state: MapState) -> None:
         self.state = state
-        self._connection, self._collection = connection, collection
-        self._before = state
+        self.connection, self._collection = connection, collection
+        self._before, self._form = state, Form(state.record)
         self._entities: dict[int, Callable[[], Entity]] = {}  # by the number of the place
+        self._changed = False
         self._now = datetime.now(UTC)
 
     def expect(self, place_id: str) -> PlaceEntry:
@@ -295,43 +500,48 @@ class Write:
         Raises:
             UnknownPlace.
         """
-        return _expect(self._connection, self.state.number, place_id)
+        return _expect(self.connection, self.state.number, place_id)
 
-    def all_of(self, wanted: PlaceFilter, limit: int | None) -> list[PlaceEntry]:
-        """Places that fulfil some conditions, in the order of their enrolment."""
-        return ledger.entries_after(self._connection, self.state.number, -1, limit, wanted)
+    def all_of(self, wanted: PlaceFilter, limit: int | None, after: int = -1) -> list[PlaceEntry]:
+        """Places that fulfil some conditions, in the order of their enrolment, behind the number ``after``."""
+        return ledger.entries_after(self.connection, self.state.number, after, limit, wanted)
 
-    def enrol(self, item: Enrolment) -> tuple[Place, Change]:
-        """Create a place, replace its frame, or change its fields if the frame is the same."""
-        stored = ledger.find(self._connection, self.state.number, item.id)
+    def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
+        """Create a place, replace its frame, or change its fields if the frame is the same.
+
+        Args:
+            keep: what to keep of the frame; by default what the map's settings say.
+        """
+        stored = ledger.find(self.connection, self.state.number, item.id)
         keypoints = None if item.keypoints is None or not self.state.record.verification else item.keypoints.record()
         if stored is not None and stored.digest == item.digest:
             if keypoints is not None:
-                ledger.put_keypoints(self._connection, self.state.number, stored.row, keypoints)
+                ledger.put_keypoints(self.connection, self.state.number, stored.row, keypoints)
             return self.set_fields(stored, item.fields)
         metadata_text(item.fields.metadata)  # raises InvalidField
-        row, kept = self.state.rows, picture_of(item, self.state.record.keep)
-        halves = item.descriptor.astype("<f2")
-        frame = Frame(halves.tobytes(), item.local.tobytes(), keypoints, kept[1])
-        ledger.put_frame(self._connection, self.state.number, row, frame)
+        row, kept = self.state.rows, picture_of(item, self.state.record.keep if keep is None else keep)
+        descriptor, local = self._form.packed(item.descriptor, item.local)
+        frame = Frame(descriptor, local, keypoints, kept[1])
+        ledger.put_frame(self.connection, self.state.number, row, frame)
         self.state = replace(self.state, rows=row + 1)
         place = Place(
             **dict(item.fields), id=item.id, regions=item.regions, picture=kept[0],
             created_at=self._now if stored is None else stored.place.created_at, updated_at=self._now,
         )  # fmt: skip
         if stored is None:
-            code, ordinal = ledger.next_in_sequence(self._connection, self.state.number, place.sequence)
-            entry = PlaceEntry(self._new_key(), row, self._new_key(), item.digest, code, ordinal, place)
+            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
+            entry = PlaceEntry(self.new_key(), row, self.new_key(), item.digest, code, ordinal, place)
             self.state = replace(self.state, places=self.state.places + 1)
-            self._put(entry, halves.astype(np.float32))
+            self._put(entry, descriptor)
             return place, "created"
-        self._put(replace(self._placed(stored, place), row=row, digest=item.digest), halves.astype(np.float32))
+        shown = replace(self._placed(stored, place), row=row, digest=item.digest, track=None, station=None)
+        self._put(shown, descriptor)
         self._let_go(stored, stored.row)
         return place, "replaced"
 
     def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
         """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
-        stored = ledger.find(self._connection, self.state.number, item.id)
+        stored = ledger.find(self.connection, self.state.number, item.id)
         return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
 
     def set_fields(self, stored: PlaceEntry, fields: PlaceFields) -> tuple[Place, Change]:
@@ -342,21 +552,73 @@ class Write:
         if fields.pose != stored.place.pose:
             changed["pose_of"] = None
         place = stored.place.model_copy(update={**changed, "updated_at": self._now})
-        kept = ledger.of_frames(self._connection, self.state.number, "descriptor", [stored.row])[stored.row]
-        self._put(self._placed(stored, place), np.frombuffer(kept, "<f2").astype(np.float32))
+        self._put(self._placed(stored, place), self._kept_descriptor(stored))
         self._let_go(stored, None)
         return place, "updated"
+
+    def _kept_descriptor(self, stored: PlaceEntry) -> bytes:
+        kept: bytes = ledger.of_frames(self.connection, self.state.number, "descriptor", [stored.row])[stored.row]
+        return kept
+
+    def renew_entity(self, stored: PlaceEntry) -> None:
+        """Give Milvus the entity of a place again."""
+        if stored.number not in self._entities:
+            self._put(replace(stored, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+
+    def adopt(self, item: Enrolment, history: History) -> None:
+        """Store a place of another map with its history."""
+        self.enrol(item, history.picture)
+        stored = self.expect(item.id)
+        moments = {"created_at": history.created_at, "updated_at": history.updated_at}
+        ordinal = stored.ordinal if history.ordinal is None else history.ordinal
+        changed = replace(stored, place=stored.place.model_copy(update=moments), ordinal=ordinal)
+        if stored.number in self._entities:  # Milvus does not have it yet
+            self._put(changed, self._kept_descriptor(stored))
+        elif ordinal == stored.ordinal:
+            ledger.put(self.connection, self.state.number, changed)
+            self._changed = True
+        else:
+            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, ordinal)
+
+    def set_counterpart(
+        self, stored: PlaceEntry, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
+    ) -> None:
+        """Set the station of a place, None for its own, its pose and the place from which it got the pose."""
+        if (track, station) == (stored.sequence, stored.ordinal):
+            track = station = None
+        fields: dict[str, Any] = {"pose_of": pose_of}
+        if pose != stored.place.pose:
+            fields |= {"pose": pose, "updated_at": self._now}
+        place = stored.place.model_copy(update=fields)
+        changed = replace(stored, track=track, station=station, place=place)
+        if pose == stored.place.pose:  # Milvus knows nothing of stations
+            ledger.put(self.connection, self.state.number, changed)
+            self._changed = True
+        else:
+            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+
+    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+        """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
+        stored = ledger.find(self.connection, self.state.number, frame.id)
+        if stored is None or stored.digest != frame.digest or not self.state.record.verification:
+            return False
+        self._changed = True
+        return ledger.put_keypoints(self.connection, self.state.number, stored.row, found.record())
 
     def _placed(self, stored: PlaceEntry, place: Place) -> PlaceEntry:
         """A place with other fields, under a new key; its position in its sequence changes only with the sequence."""
         code, ordinal = stored.sequence, stored.ordinal
         if place.sequence != stored.place.sequence:
-            code, ordinal = ledger.next_in_sequence(self._connection, self.state.number, place.sequence)
-        return replace(stored, key=self._new_key(), sequence=code, ordinal=ordinal, place=place)
+            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
+        return replace(stored, key=self.new_key(), sequence=code, ordinal=ordinal, place=place)
 
     def forget(self, stored: PlaceEntry) -> None:
         """Delete a place."""
-        ledger.remove(self._connection, self.state.number, stored)
+        ledger.remove(self.connection, self.state.number, stored)
         self._entities.pop(stored.number, None)
         self.state = replace(self.state, places=self.state.places - 1)
         self._let_go(stored, stored.row)
@@ -366,20 +628,27 @@ class Write:
         changed = {"revision": self.state.record.revision + 1, "updated_at": self._now}
         self.state = replace(self.state, record=record.model_copy(update=changed))
 
-    def _new_key(self) -> int:
-        return ledger.new_key(self._connection)
+    def new_key(self) -> int:
+        """A number that was never used before."""
+        return ledger.new_key(self.connection)
 
-    def _put(self, entry: PlaceEntry, descriptor: np.ndarray[Any, np.dtype[np.float32]]) -> None:
-        ledger.put(self._connection, self.state.number, entry)
+    def _put(self, entry: PlaceEntry, descriptor: bytes) -> None:
+        ledger.put(self.connection, self.state.number, entry)
         camera, tokens = entry.place.camera, tokens_of(entry.place.metadata)
         self._entities[entry.number] = lambda: Entity(
-            entry.key, entry.row, descriptor, entry.whereabouts(), camera, tokens
+            entry.key, entry.row, self._form.descriptors([descriptor])[0], entry.whereabouts(), camera, tokens
         )
+
+    def put_new(self, entry: PlaceEntry, frame: Frame) -> None:
+        """Store a place that is not there yet, and its frame in the next row."""
+        ledger.put_frame(self.connection, self.state.number, entry.row, frame)
+        self.state = replace(self.state, rows=entry.row + 1, places=self.state.places + 1)
+        self._put(entry, frame.descriptor)
 
     def _let_go(self, stored: PlaceEntry, row: int | None) -> None:
         """Note that a place's former entity, and its former frame, are not used any more."""
-        ledger.leave(self._connection, self.state.number, stored.key, row)
-        ledger.drop_if_empty(self._connection, self.state.number, stored.sequence)
+        ledger.leave(self.connection, self.state.number, stored.key, row)
+        ledger.drop_if_empty(self.connection, self.state.number, stored.sequence)
 
     def finish(self) -> None:
         """Give Milvus what is new, before the COMMIT that makes it count.
@@ -390,9 +659,16 @@ class Write:
         if self._entities:
             inserted = self._collection.insert(self.state.number, [made() for made in self._entities.values()])
             self.state = replace(self.state, inserted=max(self.state.inserted, inserted))
-        if self.state != self._before or self._entities:
+        if self.state != self._before or self._entities or self._changed:
             self.state = replace(self.state, writes=self.state.writes + 1)
-            ledger.update(self._connection, self.state)
+            ledger.update(self.connection, self.state)
+
+
+def _not_more(entries: list[PlaceEntry], most: int) -> list[PlaceEntry]:
+    """The places; raises TooManyToForget if they are more than ``most``."""
+    if len(entries) > most:
+        raise TooManyToForget(f"More than {most} places fulfil the conditions. Forget them in several requests.")
+    return entries
 
 
 def _expect(connection: Connection[Any], map_number: int, place_id: str) -> PlaceEntry:

@@ -21,12 +21,16 @@ from core.milvus import ledger
 from core.milvus.collection import MOST_FOUND, Collection
 from core.milvus.database import Database
 from core.milvus.expressions import all_of, any_row, bounds_of, with_tokens
+from core.milvus.forms import Form
 from core.milvus.ledger import MapState, PlaceEntry, whereabouts_of
 from core.milvus.tokens import tokens_of
 from core.places import NO_POSE, Neighborhood, Whereabouts
 
 SHORTLIST = 100
 """Places of a large map that a search finds, as in a data directory; below ``COMPACT_FROM`` places it finds all."""
+
+MOST_KNOWN = 10_000
+"""Places that a snapshot remembers, so that what was read of a place stays as it was."""
 
 _SPARE = 1.25  # that more entities are asked for, because some are no place's any more or beyond an edge
 _MORE = 4  # by this factor, if these were too few
@@ -66,16 +70,21 @@ class MilvusSnapshot:
         Raises:
             UnknownPlace: the place of a row was deleted, or got another frame, before it was asked for.
         """
-        if missing := [row for row in rows.tolist() if row not in self._known]:
+        found = {row: entry for row in rows.tolist() if (entry := self._known.get(row)) is not None}
+        if missing := [row for row in rows.tolist() if row not in found]:
             with self.database.reading() as connection:
-                self.note(ledger.entries_by(connection, self.state.number, "row", missing))
+                read = ledger.entries_by(connection, self.state.number, "row", missing)
+            self.note(read)
+            found |= {entry.row: entry for entry in read}
         try:
-            return [self._known[row] for row in rows.tolist()]
+            return [found[row] for row in rows.tolist()]
         except KeyError:
             raise UnknownPlace("A place was deleted while it was read.") from None
 
     def note(self, entries: Sequence[PlaceEntry]) -> None:
-        """Remember places that were read."""
+        """Remember places that were read, as long as there are not too many."""
+        if len(self._known) + len(entries) > MOST_KNOWN:
+            return
         for entry in entries:
             self._known.setdefault(entry.row, entry)
 
@@ -85,14 +94,11 @@ class MilvusSnapshot:
 
     def descriptors_at(self, rows: Rows) -> NDArray[np.float32]:
         """The descriptors of rows: float32 [k, D]."""
-        found = self._of_frames("descriptor", rows)
-        halves = np.frombuffer(b"".join(found), "<f2").reshape(len(rows), self.state.record.dimension)
-        return halves.astype(np.float32)
+        return Form(self.state.record).descriptors(self._of_frames("descriptor", rows))
 
     def locals_at(self, rows: Rows) -> NDArray[np.int8]:
         """The local descriptors of rows: int8 [k, C, L]."""
-        shape = len(rows), *self.state.record.local_shape
-        return np.frombuffer(b"".join(self._of_frames("local", rows)), np.int8).reshape(shape)
+        return Form(self.state.record).locals(self._of_frames("local", rows))
 
     def _of_frames(self, column: str, rows: Rows) -> list[bytes]:
         with self.database.reading() as connection:
@@ -103,7 +109,7 @@ class MilvusSnapshot:
             raise UnknownPlace("A place was deleted while it was read.") from None
 
     @cached_property
-    def _entries(self) -> list[PlaceEntry]:
+    def all_entries(self) -> list[PlaceEntry]:
         """All places of the rows of the snapshot."""
         with self.database.reading() as connection:
             entries = ledger.entries_after(connection, self.state.number, -1, None, EVERY_PLACE)
@@ -115,7 +121,7 @@ class MilvusSnapshot:
     def alive(self) -> NDArray[np.bool_]:
         """Whether each row belongs to a place: bool [rows]."""
         alive = np.zeros(self.rows, np.bool_)
-        alive[[entry.row for entry in self._entries]] = True
+        alive[[entry.row for entry in self.all_entries]] = True
         return alive
 
     @cached_property
@@ -124,9 +130,9 @@ class MilvusSnapshot:
         where = Whereabouts.along_sequence(np.zeros(self.rows, np.int64)).take(np.arange(self.rows))
         columns = {name: column.copy() for name, column in vars(where).items()}
         columns["sequence"][:] = columns["track"][:] = -1
-        found = whereabouts_of(self._entries)
+        found = whereabouts_of(self.all_entries)
         for name, column in columns.items():
-            column[[entry.row for entry in self._entries]] = getattr(found, name)
+            column[[entry.row for entry in self.all_entries]] = getattr(found, name)
         return Whereabouts(**columns)
 
     def among(self, allowed: NDArray[np.bool_]) -> MilvusScope:
@@ -199,6 +205,12 @@ class MilvusScope:
             ]
             expressions.append(f"not (kind == {where.kind[0]} and {all_of(inside)})")
         return self._ranked(descriptor[np.newaxis], expressions, keep)[0]
+
+    def living_rows(self) -> Rows:
+        """The rows of the places of the scope, int64 [n], ascending."""
+        entries = self.snapshot.all_entries
+        kept = [entry.row for entry, stays in zip(entries, self.keep(entries), strict=True) if stays]
+        return np.array(sorted(kept), np.int64)
 
     def weights_at(self, rows: Rows) -> Values | None:
         """The log prior of rows, float64 [n]; None if there is no prior."""

@@ -3,17 +3,39 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 
-from core.errors import StorageFailure
-from core.maps.records import MapRecord, MapSettings
+from core.errors import MapExists, StorageFailure, UnknownMap
+from core.maps.archives.reading import Archive
+from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
+from core.maps.status import Progress, no_progress
 from core.milvus import ledger
 from core.milvus.collection import Collection, Connection
 from core.milvus.database import Database
+from core.milvus.importing import Importing
 from core.milvus.map import MilvusMap
+from core.milvus.sweep import sweep
+from core.milvus.verification import inspect
 from core.places import check_map_id
+from core.storage.archives.unpacking import check_sizes, layout_of
 from core.storage.pagination import Listing, decode_name, one_more, page_of
+
+MOST_MAPS = 1000
+"""Maps of which an object is kept, so that whoever asks for a map twice gets the same one."""
+
+IMPORTED = ".import-"
+"""How the names begin under which imports keep their maps; no map id begins like this."""
+
+ABANDONED_SECONDS = 3600
+"""An unlisted map that nobody has written to for so long is not being built any more."""
+
+SWEEP_SECONDS, AGAIN_SECONDS = 3600.0, 30.0
+"""Between two sweeps, and after one that the servers refused."""
 
 log = logging.getLogger(__name__)
 
@@ -24,26 +46,23 @@ class MilvusStore:
     def __init__(
         self, milvus: str, postgres: str, token: str = "", database: str = "", certificate: str | None = None
     ) -> None:
-        """Connect to both; PostgreSQL's tables are made if they are missing.
+        """Remember where both are; they are connected to when they are first used.
+
+        PostgreSQL's tables are made if they are missing.
 
         Args:
             milvus: the address, such as ``http://localhost:19530``; ``https`` for TLS.
             postgres: the address, such as ``postgresql://placerec@localhost/placerec``.
             token, database: of Milvus, ``user:password`` and the name of the database there.
             certificate: path of the file of the authority that Milvus's certificate is checked by.
-
-        Raises:
-            StorageFailure: one of them cannot be reached, or refuses.
         """
         self._collections: dict[str, Collection] = {}
-        self._making = threading.Lock()
-        self._closed = False
+        self._maps: OrderedDict[int, MilvusMap] = OrderedDict()
+        self._making = threading.Lock()  # of both
+        self._closed = threading.Event()
+        self._sweeper: threading.Thread | None = None
         self._database = Database(postgres)
-        try:
-            self._milvus = Connection(milvus, token, database, certificate)
-        except BaseException:
-            self._database.close()
-            raise
+        self._milvus = Connection(milvus, token, database, certificate)
 
     def create(
         self,
@@ -52,11 +71,15 @@ class MilvusStore:
         dimension: int,
         settings: MapSettings | None = None,
         local_shape: tuple[int, int] = (0, 0),
+        unlisted: bool = False,
+        precision: Precision = "half",
     ) -> MilvusMap:
         """Make an empty map for the descriptors of one encoder; it is durable when this returns.
 
         Args:
             dimension, local_shape: of the encoder's descriptors, D and (C, L).
+            unlisted: only :meth:`unlisted` finds the map until it is published.
+            precision: how its descriptors are kept in PostgreSQL, and so what Milvus compares.
 
         Raises:
             InvalidIdentifier: the id is malformed.
@@ -72,32 +95,189 @@ class MilvusStore:
             dimension=dimension,
             local_cells=local_shape[0],
             local_values=local_shape[1],
-            precision="half",
+            precision=precision,
             revision=1,
             created_at=now,
             updated_at=now,
             **(settings or MapSettings()).model_dump(),
         )
         with self._database.transaction(f"create map {map_id!r}") as connection:
-            ledger.create(connection, record)
-        return self.get(map_id)
+            number = ledger.create(connection, record, listed=not unlisted)
+        return self._map(map_id, number)
+
+    def import_map(
+        self,
+        archive: Archive,
+        map_id: str,
+        advance: Callable[[int, int], None],
+        check_picture: Callable[[bytes], None],
+        most_picture_bytes: int,
+        before_listing: Callable[[], None],
+    ) -> None:
+        """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
+        check_map_id(map_id)
+        self._expect_open()
+        check_sizes(archive.manifest)
+        record = MapRecord.model_validate({**archive.manifest.map.model_dump(), "id": map_id})
+        with self._database.transaction(f"import map {map_id!r}") as connection:
+            if ledger.is_taken(connection, map_id):
+                raise MapExists(f"There is already a map {map_id!r}.")
+            number = ledger.create(connection, record, f"{IMPORTED}{secrets.token_hex(8)}", listed=False)
+        try:
+            made = self._map(map_id, number)
+            importing = Importing(archive, layout_of(archive.manifest), advance, check_picture, most_picture_bytes)
+            importing.into(made, self._database)
+            before_listing()
+            with self._database.transaction(f"import map {map_id!r}") as connection:
+                ledger.publish(connection, number, map_id)
+        except BaseException:
+            with suppress(StorageFailure, UnknownMap):  # the next sweep removes it
+                self._remove(map_id, number)
+            raise
 
     def get(self, map_id: str) -> MilvusMap:
-        """A map, ready for use.
+        """A map, ready for use; the same object as long as the map is the same.
 
         Raises:
             UnknownMap, StorageFailure.
         """
+        return self._map(map_id, None)
+
+    def find(self, map_id: str) -> MilvusMap:
+        """The same as :meth:`get`."""
+        return self.get(map_id)
+
+    def opened(self, map_id: str) -> MilvusMap | None:
+        """None: only PostgreSQL knows whether a map is still there."""
+        return None
+
+    def _map(self, map_id: str, number: int | None) -> MilvusMap:
         self._expect_open()
         with self._database.reading() as connection:
-            state = ledger.state_of(connection, map_id)
-        return MilvusMap(self._database, self._collection(state.record), state)
+            state = ledger.state_of(connection, map_id, number)
+        with self._making:
+            found = self._maps.get(state.number)
+            if found is None:
+                found = MilvusMap(self._database, self._collection(state.record), state)
+                self._maps[state.number] = found
+                while len(self._maps) > MOST_MAPS:
+                    self._maps.popitem(last=False)
+            self._maps.move_to_end(state.number)
+        found.note(state)
+        return found
+
+    def unlisted(self) -> dict[str, MilvusMap]:
+        """The maps that are being built by jobs, by id."""
+        self._expect_open()
+        with self._database.reading() as connection:
+            found = ledger.unlisted(connection)
+        maps = {}
+        for name, number in found.items():
+            if not name.startswith(IMPORTED):
+                with suppress(UnknownMap):  # it is gone, or published
+                    maps[name] = self._map(name, number)
+        return maps
+
+    def abandoned(self) -> list[str]:
+        """None: another service may build them; a sweep removes those that nobody has written to for a while."""
+        return []
+
+    def publish(self, map_id: str) -> MilvusMap:
+        """List a map that was being built and is now complete; durable when this returns.
+
+        Raises:
+            UnknownMap: no map of this id is being built.
+            StorageFull, StorageFailure.
+        """
+        with self._database.transaction(f"publish map {map_id!r}") as connection:
+            number = ledger.unlisted(connection).get(map_id)
+            if number is None:
+                raise UnknownMap(f"No map {map_id[:80]!r} is being made.")
+            ledger.publish(connection, number, map_id)
+        return self._map(map_id, number)
+
+    def abandon(self, map_id: str) -> None:
+        """Delete a map that was being built; nothing happens if there is none.
+
+        Raises:
+            StorageFull, StorageFailure: the map is still there.
+        """
+        self._expect_open()
+        with self._database.reading() as connection:
+            number = ledger.unlisted(connection).get(map_id)
+        if number is not None:
+            with suppress(UnknownMap):
+                self._remove(map_id, number)
+
+    def quarantined(self) -> dict[str, str]:
+        """No map is ever put out of service alone."""
+        return {}
+
+    def verify(self, map_id: str, progress: Progress = no_progress) -> VerifyReport:
+        """Read all places of a map, and compare their descriptors with those that Milvus searches.
+
+        Raises:
+            UnknownMap, StorageFailure.
+        """
+        return inspect(self.get(map_id), progress)
+
+    def check_writable(self) -> None:
+        """Raise unless both servers answer, and PostgreSQL takes writes.
+
+        Raises:
+            StoreUnavailable, StoreOfAnotherVersion, StorageFailure.
+        """
+        self._expect_open()
+        self._database.check()
+        self._milvus.check()
+        for collection in list(self._collections.values()):
+            collection.check()
+
+    def sweep(self) -> int:
+        """Delete what writes that came to no end have left; returns how many descriptors that were.
+
+        Raises:
+            StoreUnavailable, StorageFailure.
+        """
+        self._expect_open()
+        with self._database.reading() as connection:
+            forgotten = ledger.unlisted(connection, ABANDONED_SECONDS)
+            encoders = ledger.encoders(connection)
+        for name, number in forgotten.items():
+            with suppress(UnknownMap):  # it was published, or removed
+                log.warning("The unfinished map %s is removed: nobody has written to it for a while", name)
+                self._remove(name, number)
+        return sweep(self._database, [self._collection_of(*encoder) for encoder in encoders])
+
+    def start_sweeping(self) -> None:
+        """Sweep now and from time to time, in a thread of its own, until the store is closed."""
+
+        def run() -> None:
+            wait = 0.0
+            while not self._closed.wait(wait):
+                try:
+                    self.sweep()
+                    wait = SWEEP_SECONDS
+                except StorageFailure as error:
+                    wait = AGAIN_SECONDS
+                    log.debug("what is left over stays for now: %s", error)
+                except Exception:  # a defect, which must not end the thread
+                    wait = SWEEP_SECONDS
+                    log.exception("what is left over stays for now")
+
+        self._sweeper = threading.Thread(target=run, name="sweep", daemon=True)
+        self._sweeper.start()
 
     def _collection(self, record: MapRecord) -> Collection:
+        if record.encoder not in self._collections:
+            self._collections[record.encoder] = Collection(self._milvus, record.encoder, record.dimension)
+        return self._collections[record.encoder]
+
+    def _collection_of(self, encoder: str, dimension: int) -> Collection:
         with self._making:
-            if record.encoder not in self._collections:
-                self._collections[record.encoder] = Collection(self._milvus, record.encoder, record.dimension)
-            return self._collections[record.encoder]
+            if encoder not in self._collections:
+                self._collections[encoder] = Collection(self._milvus, encoder, dimension)
+            return self._collections[encoder]
 
     def records(self, cursor: str | None, limit: int) -> tuple[list[MapRecord], str | None]:
         """A page of the maps' records by id, and the cursor of the next page.
@@ -119,9 +299,15 @@ class MilvusStore:
         Raises:
             UnknownMap, StorageFull, StorageFailure.
         """
-        collection = self.get(map_id).collection
+        self._remove(map_id, None)
+
+    def _remove(self, map_id: str, number: int | None) -> None:
+        found = self._map(map_id, number)
+        collection = found.collection
         with self._database.transaction(f"delete map {map_id!r}") as connection:
-            keys = ledger.delete(connection, map_id)
+            keys = ledger.delete(connection, map_id, found.number)
+        with self._making:
+            self._maps.pop(found.number, None)
         # The number of a deleted map is never used again, so what stays in Milvus is never found.
         try:
             for start in range(0, len(keys), ledger.LEAVINGS_AT_ONCE):
@@ -131,10 +317,10 @@ class MilvusStore:
 
     def close(self) -> None:
         """Close the connections, and refuse further reads and writes."""
-        self._closed = True
+        self._closed.set()
         self._milvus.close()
         self._database.close()
 
     def _expect_open(self) -> None:
-        if self._closed:
+        if self._closed.is_set():
             raise StorageFailure("The store is closed.")

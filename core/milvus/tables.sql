@@ -1,12 +1,17 @@
 -- What PostgreSQL has of the maps (core.milvus.ledger has the statements).
 
+CREATE TABLE IF NOT EXISTS placerec (single boolean PRIMARY KEY DEFAULT true CHECK (single), version integer NOT NULL);
+INSERT INTO placerec (version) VALUES (1) ON CONFLICT DO NOTHING;
+
 CREATE TABLE IF NOT EXISTS maps (
     number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
     id text COLLATE "C" NOT NULL UNIQUE,
     record text NOT NULL,               -- MapRecord as JSON
+    listed boolean NOT NULL DEFAULT true, -- false: it is being built
+    touched timestamptz NOT NULL DEFAULT now(), -- of the last write
     places bigint NOT NULL DEFAULT 0,   -- how many there are
     rows bigint NOT NULL DEFAULT 0,     -- the number of the next row
-    codes integer NOT NULL DEFAULT 0,   -- the code of the next sequence
+    codes integer NOT NULL DEFAULT 0,   -- the code of the next sequence or lost track
     writes bigint NOT NULL DEFAULT 0,   -- grows with every write
     inserted bigint NOT NULL DEFAULT 0  -- Milvus's timestamp of the last insertion that counts
 );
@@ -31,12 +36,16 @@ CREATE TABLE IF NOT EXISTS places (
     row bigint NOT NULL,                -- of its frame
     key bigint NOT NULL UNIQUE,         -- of its entity in Milvus
     digest bytea NOT NULL,
+    picture text NOT NULL,              -- what is kept of its frame
     place text NOT NULL,                -- Place as JSON
     sequence integer NOT NULL,
     ordinal bigint NOT NULL,
     camera text COLLATE "C",
     moment bigint,                      -- its timestamp, microseconds since 1970
     tokens text[] NOT NULL,             -- of its metadata
+    track integer,                      -- the sequence whose frames show what it shows, and where in it
+    station bigint,
+    pose_of text COLLATE "C",           -- the id of the place whose pose it got
     PRIMARY KEY (map, number),
     UNIQUE (map, id),
     UNIQUE (map, row)
@@ -48,8 +57,8 @@ CREATE INDEX IF NOT EXISTS places_by_metadata ON places USING gin (tokens);
 CREATE TABLE IF NOT EXISTS frames (
     map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
     row bigint NOT NULL,
-    descriptor bytea NOT NULL,          -- float16 [D]
-    local bytea NOT NULL,               -- int8 [C, L]
+    descriptor bytea NOT NULL,          -- [D], in the map's precision
+    local bytea NOT NULL,               -- [C, L], likewise
     keypoints bytea,
     picture bytea,
     PRIMARY KEY (map, row)
@@ -70,4 +79,24 @@ CREATE TABLE IF NOT EXISTS cameras (
     name text COLLATE "C" NOT NULL,
     record text NOT NULL,               -- CameraRecord as JSON
     PRIMARY KEY (map, name)
+);
+
+-- The frames that are kept to be reviewed; they go with their map.
+CREATE TABLE IF NOT EXISTS review_frames (
+    map bigint NOT NULL REFERENCES maps ON DELETE CASCADE,
+    number bigint NOT NULL,             -- grows
+    at timestamptz NOT NULL,
+    digest bytea NOT NULL,
+    size bigint NOT NULL,
+    answer text NOT NULL,               -- JSON
+    label text,                         -- JSON
+    PRIMARY KEY (map, number),
+    UNIQUE (map, digest)
+);
+CREATE TABLE IF NOT EXISTS review_pictures (
+    map bigint NOT NULL,
+    number bigint NOT NULL,
+    bytes bytea NOT NULL,
+    PRIMARY KEY (map, number),
+    FOREIGN KEY (map, number) REFERENCES review_frames ON DELETE CASCADE
 );

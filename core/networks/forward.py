@@ -19,12 +19,19 @@ from onnx import ModelProto
 from torch import Tensor
 
 from core.errors import InvalidModel
+from core.networks.gathering import GatheredPass
 from core.networks.graph import IMAGES, onnx_graph
 from core.networks.network import ShallowNetwork
 
-Precision = Literal["float32", "bfloat16"]
+Precision = Literal["float32", "bfloat16", "float16"]
 Device = Literal["cpu", "cuda"]
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+LANES = 2
+"""Batches that are on a GPU at the same time: one is computed while the other is brought there or back."""
+
+MOST_IMAGES = 64
+"""Images of one batch on a GPU."""
 
 SILENT = 4
 """ONNX Runtime's severity from which on it writes to standard error: what goes wrong is raised as well."""
@@ -105,26 +112,57 @@ class GraphPass:
 
 
 class TorchPass:
-    """A copy of a network in torch, on a device and in a precision; it is called like the network.
+    """A copy of a network in torch, on the processor and in a precision; it is called like the network."""
+
+    def __init__(self, network: ShallowNetwork, precision: Precision) -> None:
+        self._dtype = DTYPES[precision]
+        self._network = _copied(network, torch.device("cpu"), self._dtype)
+
+    def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
+        """B x 3 x H x W float32 to one B x K x X x Y float32 tensor for each output."""
+        return tuple(output.to(torch.float32) for output in self._network(images.to(self._dtype)))
+
+
+def cuda_pass(network: ShallowNetwork, precision: Precision) -> GatheredPass:
+    """A copy of a network on a GPU; threads that call it at the same time share batches.
 
     Raises:
         InvalidModel: torch finds no CUDA device.
     """
+    if not torch.cuda.is_available():
+        raise InvalidModel("torch finds no CUDA device on this machine; use the device cpu.")
+    # By default torch allows cuDNN a mantissa of ten bits, which changes regions.
+    torch.backends.cudnn.allow_tf32 = False
+    copied = _copied(network, torch.device("cuda"), DTYPES[precision])
+    return GatheredPass([_CudaLane(copied, DTYPES[precision]) for _ in range(LANES)], MOST_IMAGES)
 
-    def __init__(self, network: ShallowNetwork, precision: Precision, device: Device) -> None:
-        if device == "cuda":
-            if not torch.cuda.is_available():
-                raise InvalidModel("torch finds no CUDA device on this machine; use the device cpu.")
-            # By default torch allows cuDNN a mantissa of ten bits, which changes regions.
-            torch.backends.cudnn.allow_tf32 = False
-        self._device, self._dtype = torch.device(device), DTYPES[precision]
-        copied = copy.deepcopy(network)
-        self._network = copied.to(self._device, self._dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+class _CudaLane:
+    """Computes one batch after the other in a stream of its own, by way of memory that the GPU reads and writes itself.
+
+    Args:
+        network: on the GPU.
+        dtype: of its weights.
+    """
+
+    def __init__(self, network: ShallowNetwork, dtype: torch.dtype) -> None:
+        self._network, self._dtype = network, dtype
+        self._stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
 
     def __call__(self, images: Tensor) -> tuple[Tensor, ...]:
-        """B x 3 x H x W float32 to one B x K x X x Y float32 tensor for each output, on the CPU."""
-        outputs = self._network(images.to(self._device, self._dtype))
-        return tuple(output.to("cpu", torch.float32) for output in outputs)
+        """B x 3 x H x W float32 to one B x K x X x Y float32 tensor for each output, both on the processor."""
+        with torch.cuda.stream(self._stream):
+            there = images.pin_memory().to("cuda", non_blocking=True)
+            outputs = [output.to(torch.float32) for output in self._network(there.to(self._dtype))]
+            here = [torch.empty_like(output, device="cpu", pin_memory=True) for output in outputs]
+            for back, output in zip(here, outputs, strict=True):
+                back.copy_(output, non_blocking=True)
+            self._stream.synchronize()
+        return tuple(here)
+
+
+def _copied(network: ShallowNetwork, device: torch.device, dtype: torch.dtype) -> ShallowNetwork:
+    return copy.deepcopy(network).to(device, dtype, memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def has_bfloat16() -> bool:

@@ -15,12 +15,12 @@ from core.maps.records import (
     TierSetting,
     VerifyReport,
 )
+from core.maps.review import ReviewFrame
+from core.maps.status import IndexStatus, Recall, StorageStatus
 from core.maps.store import Ranking
 from core.storage.atlas import Atlas
 from core.storage.map import Map
-from core.storage.review import ReviewFrame
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.tiers import IndexStatus, Recall, StorageStatus
 
 __all__ = [
     "Atlas",

@@ -15,21 +15,24 @@ import os
 import secrets
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from core.disk.files import Damage, FolderLock, disk_errors, make_folder, sync_file, sync_folder, write_file
+from core.disk.files import Damage, FolderLock, check_writable, disk_errors, make_folder, sync_folder, write_file
 from core.errors import DataDirectoryTooNew, MapExists, MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.maps.archives.reading import Archive
 from core.maps.records import MapRecord, MapSettings, Precision, VerifyReport
+from core.maps.status import Progress, no_progress
 from core.places import check_map_id
+from core.storage.archives.building import build
 from core.storage.files.row_formats import HALF
 from core.storage.files.segment_files import NO_LOCAL, ROWS_PER_SEGMENT, Layout
 from core.storage.map import Map
 from core.storage.opening import UNLISTED, create_folder, read_record
 from core.storage.pagination import Listing, decode_name, one_more, page_of
-from core.storage.verification import Progress, inspect_folder, no_progress
+from core.storage.verification import inspect_folder
 
 log = logging.getLogger(__name__)
 
@@ -222,9 +225,37 @@ class Atlas:
             self._reserved.discard(map_id)
             shutil.rmtree(unfinished, ignore_errors=True)
 
+    def import_map(
+        self,
+        archive: Archive,
+        map_id: str,
+        advance: Callable[[int, int], None],
+        check_picture: Callable[[bytes], None],
+        most_picture_bytes: int,
+        before_listing: Callable[[], None],
+    ) -> None:
+        """Make a map of an export file (:meth:`core.maps.store.Store.import_map`)."""
+        try:
+            with self.building(map_id) as folder:
+                build(
+                    archive,
+                    folder,
+                    map_id,
+                    advance=advance,
+                    check_picture=check_picture,
+                    most_picture_bytes=most_picture_bytes,
+                )
+                before_listing()
+        except Damage as damage:
+            raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
+
     def unlisted(self) -> dict[str, Map]:
         """The maps that are being built, by id."""
         return self._unlisted.copy()
+
+    def abandoned(self) -> list[str]:
+        """The ids of the maps that are being built, for one process uses the directory."""
+        return list(self._unlisted)
 
     def publish(self, map_id: str) -> Map:
         """List a map that was being built and is now complete; durable when this returns.
@@ -377,15 +408,7 @@ class Atlas:
             StorageFull, StorageFailure.
         """
         self._expect_open()
-        probe = self._directory / f".probe-{secrets.token_hex(4)}"
-        with disk_errors(f"write to {self._directory}"):
-            try:
-                probe.write_bytes(b"\x00" * 4096)
-                sync_file(probe)
-                sync_folder(self._directory)
-            finally:
-                with suppress(OSError):
-                    probe.unlink()
+        check_writable(self._directory)
 
     def close(self) -> None:
         """Wait for reads and writes under way, close all maps, and release the lock on the directory."""

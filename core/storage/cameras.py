@@ -15,7 +15,8 @@ from core.disk.files import Damage
 from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.maps.cameras import MOST_CAMERAS, CameraRecord, KnownCameras
+from core.maps.cameras import MOST_CAMERAS, CameraRecord
+from core.maps.cameras import Cameras as AnyCameras
 from core.storage.database import row_checksums
 from core.storage.database.ledger import moment_text
 from core.storage.writing import Write
@@ -24,7 +25,7 @@ Connected = TypeVar("Connected")
 Access = Callable[[], AbstractContextManager[Connected]]
 
 
-class Cameras(KnownCameras):
+class Cameras(AnyCameras):
     """All cameras of one map, which are few and needed by every frame, so they stay in memory.  Any thread may use it.
 
     Every method may raise what ``reading`` and ``writing`` raise.

@@ -3,26 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
-from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 
-from core.places import NO_SEQUENCE
+from core.maps.counterparts import Correspondence, Standing, brought_over
 from core.storage.cameras import Access
 from core.storage.database import ledger
 from core.storage.writing import Write
-
-
-@dataclass(frozen=True)
-class Correspondence:
-    """What changes in a map with what an alignment found; everything is named by its row.
-
-    stations: the new track and station of places (``Whereabouts``).
-    poses: for places that get a pose, the place whose pose it is; None for those that lose the pose that they got.
-    """
-
-    stations: Mapping[int, tuple[int, int]] = field(default_factory=dict)
-    poses: Mapping[int, int | None] = field(default_factory=dict)
 
 
 class Counterparts:
@@ -80,56 +66,12 @@ class Counterparts:
             there = _standings(connection)
         with self._writing() as write:
             here = _standings(write.connection)
-            twins = {
-                place.id: twin
-                for place in there.values()
-                if (twin := here.get(names.get(place.id, place.id))) is not None and twin.digest == place.digest
-            }
-            copied = [place for place in there.values() if place.id in names and place.id in twins]
-            frames: dict[int, list[tuple[int, _Standing]]] = {p.track: [] for p in copied if p.track is not None}
-            for place in sorted((there[name] for name in twins), key=lambda place: place.ordinal):
-                if place.sequence in frames and twins[place.id].sequence != NO_SEQUENCE:
-                    frames[place.sequence].append((place.ordinal, twins[place.id]))
-            lost = {track: ledger.new_track(write.connection) for track, known in frames.items() if not known}
-            for place in copied:
-                track, station, pose_of = place.track, place.station, place.pose_of
-                if track is not None and station is not None:
-                    track, station = (lost[track], station) if track in lost else _told_by(frames[track], station)
-                if pose_of is not None:
-                    # The pose of a place that is not here is the place's own.
-                    pose_of = twins[pose_of].id if pose_of in twins else None
-                twin = twins[place.id]
-                if (twin.track, twin.station, twin.pose_of) != (track, station, pose_of):
-                    stored = ledger.expect(write.connection, twin.id)
-                    write.set_counterpart(stored, track, station, stored.place.pose, pose_of)
+            changes = brought_over(there, here, names, lambda: ledger.new_track(write.connection))
+            for place_id, track, station, pose_of in changes:
+                stored = ledger.expect(write.connection, place_id)
+                write.set_counterpart(stored, track, station, stored.place.pose, pose_of)
 
 
-@dataclass(frozen=True)
-class _Standing:
-    """Where a place is along its sequence and its track, and whose pose it has."""
-
-    id: str
-    digest: bytes
-    sequence: int
-    ordinal: int
-    track: int | None
-    station: int | None
-    pose_of: str | None
-
-
-def _standings(connection: sqlite3.Connection) -> dict[str, _Standing]:
+def _standings(connection: sqlite3.Connection) -> dict[str, Standing]:
     query = "SELECT id, digest, sequence, ordinal, track, station, pose_of FROM places ORDER BY number"
-    return {values[0]: _Standing(*values) for values in connection.execute(query)}
-
-
-def _told_by(frames: Sequence[tuple[int, _Standing]], station: int) -> tuple[int, int]:
-    """Track and station here of a station in another map.
-
-    Args:
-        frames: of the track: their ordinals in the other map, ascending, and what they are here; at least one.
-    """
-    behind = bisect_left(frames, station, key=lambda frame: frame[0])
-    ordinal, twin = min(frames[max(0, behind - 1) : behind + 1], key=lambda frame: abs(frame[0] - station))
-    if ordinal == station and twin.track is not None and twin.station is not None:
-        return twin.track, twin.station
-    return twin.sequence, twin.ordinal + station - ordinal
+    return {values[0]: Standing(*values) for values in connection.execute(query)}

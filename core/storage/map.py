@@ -38,6 +38,7 @@ from core.maps.records import (
     patched_record,
 )
 from core.maps.selection import Selection
+from core.maps.status import IndexStatus, KeypointsStatus, Progress, StorageStatus, no_progress
 from core.places import Place, PlaceFields
 from core.storage.archives.exporter import Exporter
 from core.storage.attributes import Attributes
@@ -54,9 +55,9 @@ from core.storage.review import ReviewFrames
 from core.storage.search.indexing import IndexedMap, Indexer, Stopped
 from core.storage.search.scopes import Chooser
 from core.storage.search.snapshot import SearchScope, Snapshot
-from core.storage.search.tiers import IndexStatus, KeypointsStatus, StorageStatus, storage_of, unopened
+from core.storage.search.tiers import storage_of, unopened
 from core.storage.transfer import Transfer
-from core.storage.verification import Progress, inspect, no_progress
+from core.storage.verification import inspect
 from core.storage.writing import FailedWrites, Write, check_enrolment
 
 log = logging.getLogger(__name__)
@@ -150,6 +151,11 @@ class Map:
     def is_open(self) -> bool:
         """Whether the map is in service and was read from disk."""
         return self._opened is not None
+
+    @property
+    def held(self) -> bool:
+        """Whether all descriptors are in memory, so that a search does not read from the disk."""
+        return (snapshot := self._snapshot) is not None and snapshot.holds
 
     @property
     def state(self) -> object:
@@ -517,6 +523,10 @@ class Map:
             self._recent_places.keep(state, read)
             found.update(read)
         return [found.get(row) for row in wanted]
+
+    def unknown_sequences(self, names: Sequence[str]) -> set[str]:
+        """Those of the names that no sequence has."""
+        return set(names) - set(self.attributes.sequence_codes(names))
 
     def rows_of(self, place_ids: Sequence[str]) -> list[int | None]:
         """The descriptor rows of places, for :meth:`Snapshot.descriptors_at`; None where there is no such place."""

@@ -21,6 +21,7 @@ from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.index.table import LARGEST_BLOCK
 from core.maps.records import MapRecord, validation_message
+from core.maps.status import Tier
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
 from core.storage.database import ledger, row_checksums
 from core.storage.database.columns import read_columns
@@ -43,7 +44,7 @@ from core.storage.removed_segments import RemovedSegments, clear_folder
 from core.storage.search.index_files import IndexFiles
 from core.storage.search.segment import Held, Segment
 from core.storage.search.snapshot import Snapshot
-from core.storage.search.tiers import Tier, holds_for, tier_for
+from core.storage.search.tiers import holds_for, tier_for
 
 log = logging.getLogger(__name__)
 

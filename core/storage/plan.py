@@ -7,8 +7,7 @@ import sqlite3
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-HANDED_OVER, HAS_PICTURE = 1, 2
-"""Flags of a place: its pose is that of another place; a picture of its frame is kept."""
+from core.maps.store import HANDED_OVER, HAS_PICTURE
 
 # Metres to the millimetre, degrees of position to a centimetre on the ground.
 _OPTIONAL = {

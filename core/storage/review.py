@@ -16,7 +16,7 @@ import threading
 import zlib
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
+from core.maps.review import ReviewFrame
 from core.storage.database.ledger import moment_text
 
 FILE = "review.sqlite"
@@ -51,26 +52,6 @@ _SETTINGS = {"auto_vacuum": "INCREMENTAL", **DURABLE, "foreign_keys": "ON", "jou
 _COLUMNS = "number, at, digest, size, answer, label"
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class ReviewFrame:
-    """A kept frame, without its picture.
-
-    number: counts the frames of the map; a later frame has a larger number.
-    at: when it was asked, UTC.
-    digest: the SHA-256 of the file, 32 bytes.
-    size: of the file, in bytes.
-    answer: how the map answered it; a JSON object.
-    label: what it shows, and who said so and when; a JSON object.  None: nobody has said it.
-    """
-
-    number: int
-    at: datetime
-    digest: bytes
-    size: int
-    answer: Mapping[str, Any]
-    label: Mapping[str, Any] | None = None
 
 
 class ReviewFrames:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from core.disk.files import Damage
 from core.index.flat import vectors
 from core.maps.records import VerifyReport
+from core.maps.status import Progress, no_progress
 from core.storage.database import keypoints, row_checksums
 from core.storage.database.columns import read_columns
 from core.storage.database.connections import FILE, connect, connect_without_log
@@ -28,14 +29,6 @@ from core.storage.search.segment import Segment
 from core.storage.search.snapshot import Snapshot
 
 _MOST_LISTED = 10  # damaged rows of one kind that are listed one by one; further ones are counted
-
-
-Progress = Callable[[int, int], None]
-"""Is called with the rows done and all rows; what it raises ends the work."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Ignore the progress."""
 
 
 class _Findings:

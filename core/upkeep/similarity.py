@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from core.judgement.alignment import LARGEST_STEP, SharedStretch, of_matrix, shared_stretches
 from core.maps import Snapshot
 from core.method.encoder import Encoder
 from core.places import NO_POSE, NO_SEQUENCE, Whereabouts
+from core.threads import compute_alone, in_turns
 
 Rows = NDArray[np.int64]
 
-BLOCK, TILE = 2048, 1024
-"""So many descriptors of the shorter and of the longer traverse are in memory at a time."""
+BLOCK, TILE = 2048, 512
+"""So many descriptors of the shorter traverse are in memory at a time, and of the longer one for each thread."""
+
+ROWS = 128
+"""So many rows of a matrix are worked on at a time where what lies between would take a multiple of its memory."""
 
 NONE = -1
 """The column of a frame that has none."""
@@ -39,16 +45,27 @@ def score_pairs(snapshot: Snapshot, encoder: Encoder, queries: Rows, references:
     """
     products = np.empty((len(queries), len(references)), np.float32)
     few, many = (queries, references) if len(queries) <= len(references) else (references, queries)
-    for start in range(0, len(few), BLOCK):
-        some = snapshot.descriptors_at(few[start : start + BLOCK])
-        for first in range(0, len(many), TILE):
-            found = some @ snapshot.descriptors_at(many[first : first + TILE]).T
-            rows, columns = slice(start, start + len(some)), slice(first, first + found.shape[1])
-            if few is queries:
-                products[rows, columns] = found
-            else:
-                products[columns, rows] = found.T
-    return encoder.scores_from_inner_products(products)
+    across = products if few is queries else products.T
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(threads, "scores", compute_alone) as helpers:
+        for start in range(0, len(few), BLOCK):
+            rows = few[start : start + BLOCK]
+            some = np.empty((len(rows), encoder.dimension), np.float32)
+
+            def read(part: slice, rows: Rows = rows, some: NDArray[np.float32] = some) -> None:
+                some[part] = snapshot.descriptors_at(rows[part])
+
+            def score(part: slice, start: int = start, some: NDArray[np.float32] = some) -> None:
+                found = some @ snapshot.descriptors_at(many[part]).T
+                across[start : start + len(some), part] = encoder.scores_from_inner_products(found)
+
+            in_turns(read, _parts(len(rows), ROWS), helpers, threads - 1)
+            in_turns(score, _parts(len(many), TILE), helpers, threads - 1)
+    return products
+
+
+def _parts(count: int, size: int) -> list[slice]:
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
 @dataclass(frozen=True)
@@ -65,9 +82,12 @@ class GreyScale:
 
     def values(self, scores: NDArray[np.float32]) -> NDArray[np.uint8]:
         """The values of scores, uint8 of their shape; zeros if all scores are equal."""
-        if self.high <= self.low:
-            return np.zeros(scores.shape, np.uint8)
-        return np.rint((scores.astype(np.float64) - self.low) * 255 / (self.high - self.low)).astype(np.uint8)
+        values = np.zeros(scores.shape, np.uint8)
+        if self.high > self.low:
+            for part in _parts(len(scores), ROWS):
+                some = (scores[part].astype(np.float64) - self.low) * 255 / (self.high - self.low)
+                values[part] = np.rint(some)
+        return values
 
 
 def stretches_of(scores: NDArray[np.float32]) -> list[SharedStretch]:
@@ -94,8 +114,6 @@ def nearest_by_pose(queries: Whereabouts, references: Whereabouts, radius: float
     Args:
         radius: metres.
     """
-    from scipy.spatial import cKDTree  # here, because it takes long to import
-
     found = np.full(len(queries), NONE, np.int64)
     comparable = False
     for kind in np.unique(queries.kind[queries.kind != NO_POSE]):
@@ -103,8 +121,13 @@ def nearest_by_pose(queries: Whereabouts, references: Whereabouts, radius: float
         if not len(columns):
             continue
         comparable = True
-        apart, nearest = cKDTree(references.position[columns]).query(queries.position[rows])
-        found[rows] = np.where(apart <= radius, columns[nearest], NONE)
+        for part in _parts(len(rows), ROWS):
+            some = rows[part]
+            apart = queries.position[some, np.newaxis] - references.position[columns]
+            squares = np.einsum("qrc,qrc->qr", apart, apart)
+            nearest = squares.argmin(axis=1)
+            near = np.sqrt(squares[np.arange(len(some)), nearest]) <= radius
+            found[some] = np.where(near, columns[nearest], NONE)
     return found if comparable else None
 
 

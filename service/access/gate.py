@@ -86,6 +86,12 @@ class Rates:
         self._requests = Buckets(rate, burst, clock)
         self._failures = Buckets(FAILURES_PER_SECOND, FAILURE_BURST, clock)
 
+    def __enter__(self) -> Rates:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is to be stopped."""
+
     def admit(self, caller: str) -> None:
         """Count a request.
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import hmac
 import logging
-import os
-import sqlite3
 import threading
 import time
 from collections.abc import Callable
@@ -22,7 +20,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-from service.access.keys import Key, KeyStore, digest_of, read_keys
+from service.access.keys import Key, KeyRecords, digest_of
 from service.access.roles import TOKEN, Principal
 from service.errors.faults import KeyNeeded, KeyRefused, KeysUnreadable
 
@@ -59,15 +57,6 @@ class Held:
     deadline: float | None
 
 
-@dataclass(frozen=True)
-class _File:
-    """The file as it was last read: its connection, its attributes in the file system, SQLite's count of changes."""
-
-    connection: sqlite3.Connection
-    traits: tuple[int, ...]
-    changes: int
-
-
 @dataclass
 class _Known:
     """What is known of the keys; it is replaced as a whole.
@@ -87,19 +76,23 @@ class Keyring:
     """The keys of a service.  It may be used from any thread.
 
     Args:
-        store: the file of the keys.
+        store: what keeps the keys.
         wall, monotonic: the clocks, in seconds.
+        may_open: whether everybody may be let in while there are no keys; else nobody is, if that is learnt only after
+            the start.
     """
 
     def __init__(
         self,
-        store: KeyStore,
+        store: KeyRecords,
         wall: Callable[[], float] = time.time,
         monotonic: Callable[[], float] = time.monotonic,
+        may_open: bool = True,
     ) -> None:
         self.store, self._wall, self._monotonic = store, wall, monotonic
         self._known = _Known()
-        self._file: _File | None = None
+        self._may_open, self._seen_keys = may_open, False
+        self._source = store.watch()
         self._read_at = self._looked_at = monotonic()
         self._used: dict[str, float] = {}
         self._written_at = monotonic()
@@ -113,12 +106,20 @@ class Keyring:
         return self._known.demanded
 
     def start(self) -> None:
-        """Read the file, and start the thread that watches it.
+        """Read the keys, and start the thread that watches them.
+
+        Nobody is let in until they can be read, if they are on a server that cannot be reached.
 
         Raises:
-            KeysUnreadable: the file exists but cannot be read.
+            KeysUnreadable: their file exists but cannot be read.
         """
-        self._read()
+        try:
+            self._read()
+        except KeysUnreadable as error:
+            if not self.store.remote:
+                raise
+            log.error("nobody is let in: %s", error)
+            self._known = _Known(demanded=True, broken=str(error))
         self._thread = threading.Thread(target=self._watch, name="keys", daemon=True)
         self._thread.start()
 
@@ -136,7 +137,7 @@ class Keyring:
             self._thread.join()
         with suppress(KeysUnreadable):
             self._write_uses()
-        self._forget_file()
+        self._source.close()
 
     def principal(self, authorization: bytes | None) -> Principal:
         """The holder of the key in an ``Authorization`` header.
@@ -190,7 +191,7 @@ class Keyring:
     def _look(self) -> None:
         self._looked_at = self._monotonic()
         try:
-            if self._has_changed():
+            if self._source.has_changed(self._known.demanded):
                 self._read()
             self._read_at = self._monotonic()
             if self._known.broken is not None:
@@ -200,44 +201,18 @@ class Keyring:
                 self._written_at = self._monotonic()
                 self._write_uses()
         except Exception as error:  # whatever the error is, the known keys must not hold for ever
-            self._forget_file()
+            self._source.close()
             if self._known.broken is None and self._monotonic() - self._read_at >= GRACE_SECONDS:
                 log.error("nobody is let in: %s", error)
                 self._known = _Known(demanded=True, broken=str(error))
 
-    def _has_changed(self) -> bool:
-        file = self._file
-        try:
-            status = os.stat(self.store.path)
-        except FileNotFoundError:
-            if self._known.demanded:
-                raise KeysUnreadable(f"{self.store.path} is gone.") from None
-            return False
-        except OSError as error:
-            raise KeysUnreadable(f"{self.store.path} cannot be looked at: {error.strerror}.") from error
-        if file is None or file.traits != _traits(status):
-            return True
-        try:
-            return _changes(file.connection) != file.changes
-        except sqlite3.Error as error:
-            raise KeysUnreadable(f"{self.store.path} cannot be read: {error}.") from error
-
     def _read(self) -> None:
-        if not self.store.exists():
+        keys = self._source.read()
+        if keys is None:
+            if self._known.broken is not None and not self._seen_keys:
+                self._known = _Known(demanded=not self._may_open)
             return
-        self._forget_file()
-        connection = self.store.open()
-        try:
-            status = os.stat(self.store.path)
-            changes = _changes(connection)
-            keys = read_keys(connection)
-        except (OSError, sqlite3.Error) as error:
-            connection.close()
-            raise KeysUnreadable(f"{self.store.path} cannot be read: {error}.") from error
-        except BaseException:
-            connection.close()
-            raise
-        self._file = _File(connection, _traits(status), changes)
+        self._seen_keys = True
         before = self._known.held
         held = {key.id.encode(): self._hold(key, before.get(key.id.encode())) for key in keys}
         if not self._known.demanded:
@@ -264,19 +239,3 @@ class Keyring:
             self.store.note_uses({identity: datetime.fromtimestamp(moment, UTC) for identity, moment in used.items()})
         except KeysUnreadable as error:
             log.warning("when keys were used cannot be written down: %s", error)
-
-    def _forget_file(self) -> None:
-        if self._file is not None:
-            self._file.connection.close()
-            self._file = None
-
-
-def _traits(status: os.stat_result) -> tuple[int, ...]:
-    """Attributes that change when a file is replaced, or written to without SQLite."""
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_mode
-
-
-def _changes(connection: sqlite3.Connection) -> int:
-    """A number that changes when another connection changes the file."""
-    (found,) = connection.execute("PRAGMA data_version").fetchone()
-    return int(found)

@@ -16,12 +16,13 @@ import re
 import secrets
 import sqlite3
 import stat
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 from core.disk.files import Damage, sync_folder
 from core.disk.sqlite_file import NotOurs, Schema, SqliteFile, UnreadVersion, connect, transaction
@@ -65,7 +66,7 @@ _TABLE = """CREATE TABLE keys (
     last_used_at TEXT
 ) STRICT"""
 _SCHEMA = Schema(application_id=0x706C6B79, version=1, create=[_TABLE])  # "plky"
-_COLUMNS = "id, name, role, maps, digest, created_at, expires_at, revoked_at, seal, last_used_at"
+COLUMNS = ("id", "name", "role", "maps", "digest", "created_at", "expires_at", "revoked_at", "seal", "last_used_at")
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class Key:
             self.role,
             None if self.maps is None else sorted(self.maps),
             self.digest.hex(),
-            *(_text(moment) for moment in (self.created_at, self.expires_at, self.revoked_at)),
+            *(text_of(moment) for moment in (self.created_at, self.expires_at, self.revoked_at)),
         ]
         return hashlib.sha256(json.dumps(values).encode()).digest()
 
@@ -118,25 +119,64 @@ def digest_of(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
 
 
-class KeyStore:
-    """The keys of a data directory.  Each method opens the file anew, so several processes may use it.
+class KeyChanges(Protocol):
+    """All keys, while nobody else changes them; what is put is kept when the change ends without an error."""
 
-    All methods may raise KeysUnreadable: the file is damaged, of a later version or writable by others, or the disk
-    failed.
+    def read(self) -> list[Key]: ...
+    def put(self, key: Key) -> None: ...
+
+
+class KeyWatch(Protocol):
+    """Tells a running service whether keys have changed.  Both reading methods may raise KeysUnreadable."""
+
+    def has_changed(self, demanded: bool) -> bool:
+        """Whether the keys have changed since they were read.
+
+        Args:
+            demanded: whether there were any.
+        """
+
+    def read(self) -> list[Key] | None:
+        """Every key; None if none was ever created."""
+
+    def close(self) -> None:
+        """Forget what was read."""
+
+
+class KeyRecords(ABC):
+    """What keeps keys; any number of processes may use them.
+
+    All methods may raise KeysUnreadable: the keys are damaged, of a later version or writable by others, or the disk or
+    server failed.
+
+    remote: whether they are on a server, which may be away for a while.
     """
 
-    def __init__(self, directory: Path) -> None:
-        self.path = directory / FILE
+    remote: ClassVar[bool] = False
 
+    @abstractmethod
     def exists(self) -> bool:
         """Whether keys are needed, because one was ever created."""
-        try:
-            self.path.lstat()
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-        except OSError as error:
-            raise KeysUnreadable(f"{self.path} cannot be looked at: {error.strerror}.") from error
-        return True
+
+    @abstractmethod
+    def all(self) -> list[Key]:
+        """Every key that was ever created, the oldest first."""
+
+    @abstractmethod
+    def note_uses(self, moments: dict[str, datetime]) -> None:
+        """Store when keys were last used; an earlier time never replaces a later one."""
+
+    @abstractmethod
+    def watch(self) -> KeyWatch:
+        """What a running service learns of changes by."""
+
+    @abstractmethod
+    def changing(self) -> AbstractContextManager[KeyChanges]:
+        """A change, which is durable when the context ends."""
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Make room for the first key."""
 
     def create(
         self,
@@ -173,24 +213,17 @@ class KeyStore:
         if not self.exists():
             if keep_admin:
                 _check_admin([key], now)  # before there is a file, with which keys are needed
-            self._make()
-        with self.changing() as connection:
-            keys = read_keys(connection)
+            self._prepare()
+        with self.changing() as changes:
+            keys = changes.read()
             if any(other.name == name and in_force(other, now) for other in keys):
                 raise KeyExists(f"There is already a key {name!r}. Revoke it first, or choose another name.")
             if len(keys) >= MOST_KEYS:
                 raise TooManyKeys(f"{MOST_KEYS} keys were created, which is the most that one data directory holds.")
             if keep_admin:
                 _check_admin([*keys, key], now)
-            _put(connection, key)
+            changes.put(key)
         return key, token
-
-    def all(self) -> list[Key]:
-        """Every key that was ever created, the oldest first."""
-        if not self.exists():
-            return []
-        with closing(self.open()) as connection, _refusals(self.path):
-            return read_keys(connection)
 
     def find(self, key_id: str) -> Key:
         """The key of this id.
@@ -216,8 +249,8 @@ class KeyStore:
         now = datetime.now(UTC)
         if not self.exists():
             raise _unknown(key_id)
-        with self.changing() as connection:
-            keys = read_keys(connection)
+        with self.changing() as changing:
+            keys = changing.read()
             before = _of_id(keys, key_id)
             if not in_force(before, now):
                 raise KeyEnded(f"The key {before.name!r} is revoked or has expired; create another one.")
@@ -233,7 +266,7 @@ class KeyStore:
                 raise InvalidRequest("The expiry of the key is in the past. Revoke it instead.")
             if keep_admin and is_admin(before):
                 _check_admin([after if key is before else key for key in keys], now)
-            _put(connection, after)
+            changing.put(after)
         return after
 
     def revoke(self, id_or_name: str, keep_admin: bool = False) -> Key:
@@ -249,9 +282,9 @@ class KeyStore:
         """
         now = datetime.now(UTC)
         if not self.exists():
-            raise UnknownKey("No key was ever created in this data directory.")
-        with self.changing() as connection:
-            keys = read_keys(connection)
+            raise UnknownKey("No key was ever created.")
+        with self.changing() as changes:
+            keys = changes.read()
             found = [key for key in keys if key.id == id_or_name]
             found = found or [key for key in keys if key.name == id_or_name and key.revoked_at is None]
             found = found or [key for key in keys if key.name == id_or_name]
@@ -265,15 +298,53 @@ class KeyStore:
             if keep_admin and is_admin(before) and in_force(before, now):
                 _check_admin([key for key in keys if key is not before], now)
             key = replace(before, revoked_at=now)
-            _put(connection, key)
+            changes.put(key)
         return key
 
+
+@dataclass(frozen=True)
+class _FileChanges:
+    """A change of a file of keys."""
+
+    connection: sqlite3.Connection
+
+    def read(self) -> list[Key]:
+        return read_keys(self.connection)
+
+    def put(self, key: Key) -> None:
+        marks = ", ".join("?" * len(COLUMNS))
+        self.connection.execute(f"INSERT OR REPLACE INTO keys ({', '.join(COLUMNS)}) VALUES ({marks})", row_of(key))
+
+
+class KeyStore(KeyRecords):
+    """The keys of a data directory.  Each method opens the file anew."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / FILE
+
+    def exists(self) -> bool:
+        try:
+            self.path.lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except OSError as error:
+            raise KeysUnreadable(f"{self.path} cannot be looked at: {error.strerror}.") from error
+        return True
+
+    def all(self) -> list[Key]:
+        if not self.exists():
+            return []
+        with closing(self.open()) as connection, _refusals(self.path):
+            return read_keys(connection)
+
+    def watch(self) -> KeyWatch:
+        return KeyFileWatch(self)
+
     def note_uses(self, moments: dict[str, datetime]) -> None:
-        """Store when keys were last used; an earlier time never replaces a later one."""
-        with self.changing() as connection:
+        with self._transaction() as connection:
             connection.executemany(
                 "UPDATE keys SET last_used_at = max(coalesce(last_used_at, ''), ?) WHERE id = ?",
-                [(_text(moment), identity) for identity, moment in moments.items()],
+                [(text_of(moment), identity) for identity, moment in moments.items()],
             )
 
     def open(self) -> sqlite3.Connection:
@@ -294,7 +365,12 @@ class KeyStore:
                 raise KeysUnreadable(f"{self.path} is damaged: {error}.") from error
 
     @contextmanager
-    def changing(self) -> Iterator[sqlite3.Connection]:
+    def changing(self) -> Iterator[KeyChanges]:
+        with self._transaction() as connection:
+            yield _FileChanges(connection)
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
         """A connection in a transaction, which is on disk when the context ends."""
         with closing(self.open()) as connection, _refusals(self.path):
             # A rollback journal: the file is all there is of the keys.  EXTRA syncs the folder too, or a power
@@ -303,7 +379,7 @@ class KeyStore:
             with transaction(connection):
                 yield connection
 
-    def _make(self) -> None:
+    def _prepare(self) -> None:
         """Make the file whole or not at all: one without its tables would count as damaged."""
         temporary = self.path.with_name(f"{FILE}.{secrets.token_hex(4)}.tmp")
         with _refusals(self.path):
@@ -318,6 +394,74 @@ class KeyStore:
             finally:
                 with suppress(FileNotFoundError):
                     temporary.unlink()
+
+
+@dataclass(frozen=True)
+class _File:
+    """The file as it was last read: its connection, its attributes in the file system, SQLite's count of changes."""
+
+    connection: sqlite3.Connection
+    traits: tuple[int, ...]
+    changes: int
+
+
+class KeyFileWatch:
+    """Tells whether a file of keys has changed, without reading it."""
+
+    def __init__(self, store: KeyStore) -> None:
+        self._store = store
+        self._file: _File | None = None
+
+    def has_changed(self, demanded: bool) -> bool:
+        file, path = self._file, self._store.path
+        try:
+            status = os.stat(path)
+        except FileNotFoundError:
+            if demanded:
+                raise KeysUnreadable(f"{path} is gone.") from None
+            return False
+        except OSError as error:
+            raise KeysUnreadable(f"{path} cannot be looked at: {error.strerror}.") from error
+        if file is None or file.traits != _traits(status):
+            return True
+        try:
+            return _changes(file.connection) != file.changes
+        except sqlite3.Error as error:
+            raise KeysUnreadable(f"{path} cannot be read: {error}.") from error
+
+    def read(self) -> list[Key] | None:
+        if not self._store.exists():
+            return None
+        self.close()
+        connection = self._store.open()
+        try:
+            status = os.stat(self._store.path)
+            changes = _changes(connection)
+            keys = read_keys(connection)
+        except (OSError, sqlite3.Error) as error:
+            connection.close()
+            raise KeysUnreadable(f"{self._store.path} cannot be read: {error}.") from error
+        except BaseException:
+            connection.close()
+            raise
+        self._file = _File(connection, _traits(status), changes)
+        return keys
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.connection.close()
+            self._file = None
+
+
+def _traits(status: os.stat_result) -> tuple[int, ...]:
+    """Attributes that change when a file is replaced, or written to without SQLite."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_mode
+
+
+def _changes(connection: sqlite3.Connection) -> int:
+    """A number that changes when another connection changes the file."""
+    (found,) = connection.execute("PRAGMA data_version").fetchone()
+    return int(found)
 
 
 def state_of(key: Key, now: datetime) -> KeyState:
@@ -363,33 +507,38 @@ def read_keys(connection: sqlite3.Connection) -> list[Key]:
     Raises:
         KeysUnreadable: a row is damaged.
     """
-    keys = []
-    for row in connection.execute(f"SELECT {_COLUMNS} FROM keys ORDER BY created_at, id").fetchall():
-        try:
-            key = _key(row)
-        except (ValueError, TypeError) as error:
-            raise KeysUnreadable(f"The file of the keys is damaged: a row cannot be read ({error}).") from error
-        if key.seal() != row[8]:
-            raise KeysUnreadable(f"The file of the keys is damaged: {key.id[:12]!r} does not match its checksum.")
-        keys.append(key)
-    return keys
+    query = f"SELECT {', '.join(COLUMNS)} FROM keys ORDER BY created_at, id"
+    return [key_of(row) for row in connection.execute(query).fetchall()]
 
 
-def _put(connection: sqlite3.Connection, key: Key) -> None:
-    connection.execute(
-        f"INSERT OR REPLACE INTO keys ({_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (
-            key.id,
-            key.name,
-            key.role,
-            None if key.maps is None else json.dumps(sorted(key.maps)),
-            key.digest,
-            _text(key.created_at),
-            _text(key.expires_at),
-            _text(key.revoked_at),
-            key.seal(),
-            _text(key.last_used_at),
-        ),
+def key_of(row: tuple[object, ...]) -> Key:
+    """The key of a stored row, whose columns are ``COLUMNS``.
+
+    Raises:
+        KeysUnreadable: the row is damaged.
+    """
+    try:
+        key = _key(row)
+    except (ValueError, TypeError) as error:
+        raise KeysUnreadable(f"The keys are damaged: a row cannot be read ({error}).") from error
+    if key.seal() != row[8]:
+        raise KeysUnreadable(f"The keys are damaged: {key.id[:12]!r} does not match its checksum.")
+    return key
+
+
+def row_of(key: Key) -> tuple[object, ...]:
+    """A key as it is stored."""
+    return (
+        key.id,
+        key.name,
+        key.role,
+        None if key.maps is None else json.dumps(sorted(key.maps)),
+        key.digest,
+        text_of(key.created_at),
+        text_of(key.expires_at),
+        text_of(key.revoked_at),
+        key.seal(),
+        text_of(key.last_used_at),
     )
 
 
@@ -418,5 +567,5 @@ def _refusals(path: Path) -> Iterator[None]:
         raise KeysUnreadable(f"{path} cannot be used: {error}.") from error
 
 
-def _text(moment: datetime | None) -> str | None:
+def text_of(moment: datetime | None) -> str | None:
     return None if moment is None else moment.astimezone(UTC).isoformat(timespec="microseconds")

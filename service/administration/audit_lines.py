@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 from core.disk.files import disk_errors
 from core.errors import InvalidCursor
@@ -34,8 +34,8 @@ COMPRESSED = (".gz", ".xz", ".zst", ".bz2")
 class Position:
     """Where a line begins.
 
-    file: inode of its file; 0 for lines in memory.
-    offset: of its first byte; of a line in memory, how many were written when it was.
+    file: inode of its file; 0 for lines in memory or in a table.
+    offset: of its first byte; of a line in memory, how many were written when it was; of one in a table, its number.
     """
 
     file: int
@@ -56,6 +56,13 @@ class Position:
         if not all(part.isascii() and part.isdigit() and len(part) < 20 for part in (file, offset)):
             raise InvalidCursor("The cursor was not made by this listing.")
         return cls(int(file), int(offset))
+
+
+class Trail(Protocol):
+    """An audit trail that several services write together."""
+
+    def lines(self, before: Position | None) -> Iterator[Line]:
+        """The lines from the latest to the oldest, before one of them; None: all."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from core import errors
 from core.places import Timestamp
 from core.storage.pagination import Listing, decode_name, encode_cursor
 from service.access.audit import LatestLines
-from service.administration.audit_lines import Line, Position, lines_in_memory, lines_of_files
+from service.administration.audit_lines import Line, Position, Trail, lines_in_memory, lines_of_files
 from service.errors.faults import InvalidRequest
 from service.errors.problems import problem_documentation
 from service.http.routing import EngineDep, FromState, single_values
@@ -65,8 +65,9 @@ class AuditPage(BaseModel):
 
     items: list[AuditEntry] = Field(description="It may be shorter than the limit, or empty, although more follows.")
     next_cursor: Cursor
-    source: Literal["file", "memory"] = Field(
-        description="memory: no file of the trail is configured, so there are only the latest lines of this process."
+    source: Literal["database", "file", "memory"] = Field(
+        description="database: the lines of all services that share their state. memory: no file of the trail is "
+        "configured, so there are only the latest lines of this process."
     )
 
 
@@ -101,6 +102,7 @@ def read_audit(
     options: Annotated[AuditParameters, Query()],
     engine: EngineDep,
     latest: Annotated[LatestLines | None, Depends(FromState("audit_lines"))],
+    shared: Annotated[Trail | None, Depends(FromState("audit_trail"))],
 ) -> AuditPage:
     """Read the audit trail from its latest line: who changed what, and who was refused.
 
@@ -111,12 +113,15 @@ def read_audit(
         raise InvalidRequest("after: the time is later than that of before.")
     listing, path = options.listing(), engine.settings.audit_file
     at = None if options.cursor is None else Position.parsed(decode_name(listing, options.cursor))
-    if path is not None:
+    if shared is not None:
+        items, reached = _page(shared.lines(at), options)
+    elif path is not None:
         items, reached = _page(lines_of_files(path, at), options)
     else:
         items, reached = _page(iter(()) if latest is None else lines_in_memory(latest, at), options)
     more = None if reached is None else encode_cursor(listing, reached.text())
-    return AuditPage(items=items, next_cursor=more, source="memory" if path is None else "file")
+    source: Literal["database", "file", "memory"] = "memory" if path is None else "file"
+    return AuditPage(items=items, next_cursor=more, source=source if shared is None else "database")
 
 
 def _page(lines: Iterator[Line], options: AuditParameters) -> tuple[list[AuditEntry], Position | None]:

@@ -16,15 +16,16 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from service.access.audit import audit_file
-from service.access.gate import Access, Gate, Rates, endpoints_of, warn_if_exposed
+from service.access.gate import Access, Gate, endpoints_of, warn_if_exposed
 from service.access.keyring import Keyring
-from service.access.keys import KeyStore
+from service.access.keys import KeyRecords
 from service.administration import audit_routes, key_routes
 from service.app import routes as root
 from service.app import service_state
 from service.app.gauges import gauges
 from service.app.runtime import Runtime
 from service.console import routes as console
+from service.errors.faults import KeysUnreadable
 from service.errors.problems import install_problems, problem_response
 from service.events.schemas import EnrolmentEvent, JobEvent, Listening, MapEvent, Missed, QueryEvent, SessionEvent
 from service.frames import routes as frames
@@ -43,6 +44,7 @@ from service.review import routes as review
 from service.sessions import routes as sessions
 from service.sessions import stream_routes
 from service.settings import Settings, read_settings
+from service.shared import keys_of, open_database, rates_of
 from service.telemetry.metrics import Metrics
 from service.telemetry.requests import Telemetry
 from service.upkeep import routes as upkeep
@@ -179,6 +181,16 @@ async def _not_found(scope: Scope, receive: Receive, send: Send) -> None:
     await WebSocket(scope, receive, send).send_denial_response(answer)
 
 
+def _has_keys(store: KeyRecords) -> bool:
+    """Whether a key was ever created; taken for granted while that cannot be known, for then nobody is let in."""
+    try:
+        return store.exists()
+    except KeysUnreadable:
+        if not store.remote:
+            raise
+        return True
+
+
 def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> FastAPI:
     """Create the application; nothing is opened or loaded before it starts.
 
@@ -190,21 +202,25 @@ def create_app(settings: Settings | None = None, *, as_owner: bool = False) -> F
     Raises:
         SettingsError: a setting is wrong, or would expose the service without keys.
         KeysUnreadable: the file of keys cannot be read.
+        MissingExtra: the state is in PostgreSQL, and what speaks to it is not installed.
     """
     chosen = settings if settings is not None else read_settings()
-    store = KeyStore(chosen.data_dir)
-    chosen.check_exposure(has_keys=not as_owner and store.exists())
-    keyring = None if as_owner else Keyring(store)
+    database = open_database(chosen)
+    store = keys_of(chosen, database)
+    chosen.check_exposure(has_keys=not as_owner and _has_keys(store))
+    may_open = chosen.is_loopback() or chosen.allow_anonymous
+    keyring = None if as_owner else Keyring(store, may_open=may_open)
     metrics = Metrics()
-    gate = Gate(keyring, Rates(chosen.rate_per_key, chosen.rate_burst), chosen.is_loopback())
+    rates = rates_of(chosen, database)
+    gate = Gate(keyring, rates, chosen.is_loopback())
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = chosen.storage_threads
-        with audit_file(chosen.audit_file) as latest_lines, keyring or nullcontext():
+        with audit_file(chosen.audit_file) as latest_lines, database or nullcontext(), keyring or nullcontext(), rates:
             app.state.audit_lines = latest_lines
             warn_if_exposed(gate, chosen)
-            runtime = await to_thread.run_sync(Runtime, chosen, metrics)
+            runtime = await to_thread.run_sync(Runtime, chosen, metrics, database)
             runtime.publish(app.state)
             runtime.start()
             try:

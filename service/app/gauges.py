@@ -13,7 +13,8 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from core.errors import PlacerecError
-from core.storage.search.tiers import Tier
+from core.maps import MapRecord
+from core.maps.status import Tier
 from service.app.runtime import Runtime
 from service.http.bodies import UploadMemory
 from service.jobs.records import JobState
@@ -54,7 +55,7 @@ class RuntimeCollector(Collector):
         yield _gauge("placerec_stopping", "1 if the service is about to stop, else 0.", int(runtime.stopping))
 
     def _jobs(self) -> Metric:
-        counts = Counter(job.state for job in self._runtime.jobs.all())
+        counts = self._runtime.jobs.counts()
         gauge = GaugeMetricFamily(
             "placerec_jobs", "Jobs, by state, including ended ones that are still listed.", labels=["state"]
         )
@@ -65,7 +66,10 @@ class RuntimeCollector(Collector):
     def _maps(self) -> Iterable[Metric]:
         """Counts by tier; a label with the name of each map would make too many series."""
         tiers, building, open_ = Counter[str](), 0, 0
-        for record in self._runtime.engine.all_records():
+        records: list[MapRecord] = []
+        with suppress(PlacerecError):
+            records = self._runtime.engine.all_records()
+        for record in records:
             with suppress(PlacerecError):  # it was deleted or found to be damaged since it was listed
                 map_ = self._runtime.engine.atlas.find(record.id)
                 if map_.is_open:

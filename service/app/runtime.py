@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from datetime import UTC, datetime
 from functools import partial
+from typing import TYPE_CHECKING
 
 from anyio import CapacityLimiter, to_thread
 from starlette.datastructures import State
 
-from core.errors import PlacerecError
+from core.disk.files import check_writable
+from core.errors import PlacerecError, StoreUnavailable
 from service.engine.engine import Engine
 from service.errors.faults import NotReady
 from service.jobs.jobs import Jobs
@@ -32,6 +35,10 @@ from service.upkeep import alignment, keypoints, merging, pruning, reencoding
 from service.upkeep.similarity import Matrices
 from service.worker_threads import in_thread
 
+if TYPE_CHECKING:
+    from service.shared.database import SharedDatabase
+    from service.shared.state import SharedState
+
 DISK_CHECK_SECONDS = 1.0
 """The disk is checked at most this often; a readiness probe that comes sooner gets the last result."""
 
@@ -43,35 +50,37 @@ class Runtime:
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
+
+    Args:
+        database: what services share; None: this one keeps its state in its data directory.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics) -> None:
+    def __init__(self, settings: Settings, metrics: Metrics, database: SharedDatabase | None = None) -> None:
         self.settings = settings
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
-            self.engine = Engine(settings, metrics, encoders_for(settings))
+            self.shared = None if database is None else _shared_state(settings, database)
+            events = None if self.shared is None else self.shared.events
+            self.engine = Engine(settings, metrics, events, encoders_for(settings))
             opened.callback(self.engine.close)
-            self.jobs = Jobs(
-                settings.data_dir,
-                settings.job_workers,
-                settings.job_queue,
-                settings.job_history,
-                settings.job_watchers,
-                self.engine.events,
-            )
+            self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
-            self.sessions = Sessions(settings, self.engine.events)
+            if self.shared is None:
+                self.sessions = Sessions(settings, self.engine.events)
+            else:
+                self.sessions = self.shared.sessions(self.engine.events)
             opened.pop_all()
         self.staging = Staging(settings.data_dir, settings.max_staged_bytes)
         self.batch_order, self.plans = BatchOrder(), Plans()
-        self.statistics = QueryStatistics.of_engine(self.engine)
+        statistics = QueryStatistics.of_engine if self.shared is None else self.shared.statistics
+        self.statistics = statistics(self.engine)
         self.explanation_pictures = ExplanationPictures()
         self.exports, self.imports = Exports(settings), Imports(self.engine, self.jobs)
         self.health_examinations = CapacityLimiter(1)  # each is a long search
         self.similarity_matrices = Matrices()
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
-        self._disk_state, self._disk_checked = "ok", 0.0
+        self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -100,16 +109,22 @@ class Runtime:
         state.health_examinations = self.health_examinations
         state.similarity_matrices = self.similarity_matrices
         state.exports, state.imports = self.exports, self.imports
+        state.audit_trail = None if self.shared is None else self.shared.audit
 
     def start(self) -> None:
         """Begin to load the default encoder, and start the jobs; call it from the event loop, which is not blocked."""
         for name in unknown_variables():
             log.warning("the environment sets %s, which is not a setting", name)
         self.engine.start()
-        self._remove_leftovers()
+        try:
+            self._remove_leftovers()
+            self.imports.clean()
+        except StoreUnavailable as error:
+            log.warning("what the last run has left stays until the next start: %s", error)
         self.statistics.start()
         self.exports.clean()
-        self.imports.clean()
+        if self.shared is not None:
+            self.shared.start()
         self.jobs.start()
 
     def _remove_leftovers(self) -> None:
@@ -117,7 +132,7 @@ class Runtime:
         unended = [job.arguments for job in self.jobs.all() if not job.ended]
         unfinished = {arguments.get("to") for arguments in unended}
         self.staging.clean({arguments["form"] for arguments in unended if "form" in arguments})
-        for map_id in self.engine.atlas.unlisted():
+        for map_id in self.engine.atlas.abandoned():
             if map_id not in unfinished:
                 with suppress(PlacerecError):  # the next start tries again
                     self.engine.atlas.abandon(map_id)
@@ -130,6 +145,8 @@ class Runtime:
         await to_thread.run_sync(self.jobs.close, self.settings.shutdown_timeout)
         await to_thread.run_sync(self.statistics.close)
         await to_thread.run_sync(self.sessions.close)
+        if self.shared is not None:
+            await to_thread.run_sync(self.shared.close)
         await to_thread.run_sync(self.engine.close)
 
     async def check_readiness(self) -> dict[str, str]:
@@ -141,9 +158,12 @@ class Runtime:
         now = time.monotonic()
         if now - self._disk_checked > DISK_CHECK_SECONDS:
             self._disk_checked = now
-            self._disk_state = await in_thread(self._check_disk)
+            self._maps_state, self._disk_state = await in_thread(self._check_store)
         encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
-        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": "ok", "disk": self._disk_state}
+        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": self._maps_state}
+        checks["disk"] = self._disk_state
+        if self.shared is not None:
+            checks["replica"] = self.shared.replica.state
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
@@ -151,9 +171,34 @@ class Runtime:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks
 
-    def _check_disk(self) -> str:
-        try:
-            self.engine.atlas.check_writable()
-        except PlacerecError as error:
-            return str(error)
-        return "ok"
+    def _check_store(self) -> tuple[str, str]:
+        """The states of the servers that have the maps, if there are such, and of the disk."""
+        if self.settings.store == "embedded":
+            return "ok", _outcome(self.engine.atlas.check_writable)
+        return _outcome(self.engine.atlas.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
+
+
+def _outcome(check: Callable[[], None]) -> str:
+    try:
+        check()
+    except PlacerecError as error:
+        return str(error)
+    return "ok"
+
+
+def _jobs(settings: Settings, engine: Engine) -> Jobs:
+    """The jobs of a data directory."""
+    return Jobs(
+        settings.data_dir,
+        settings.job_workers,
+        settings.job_queue,
+        settings.job_history,
+        settings.job_watchers,
+        engine.events,
+    )
+
+
+def _shared_state(settings: Settings, database: SharedDatabase) -> SharedState:
+    from service.shared.state import SharedState  # with it comes what speaks to PostgreSQL
+
+    return SharedState(settings, database, shared_maps=settings.store != "embedded")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +13,8 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Request
 from pydantic import BaseModel, ConfigDict, Field
 
+from core.errors import PlacerecError
+from core.maps import MapRecord
 from core.places import Timestamp
 from service.access.roles import Principal
 from service.app.runtime import Runtime
@@ -179,8 +180,10 @@ async def read_service(
     checks, ready = await _checks(runtime)
     settings, engine = runtime.settings, runtime.engine
     limiter = to_thread.current_default_thread_limiter()
-    states = Counter(job.state for job in runtime.jobs.all())
-    records = await in_thread(engine.all_records)
+    states = runtime.jobs.counts()
+    records: list[MapRecord] = []
+    with suppress(PlacerecError):  # the checks say what is wrong
+        records = await in_thread(engine.all_records)
     manages = principal.role == "admin" and principal.maps is None
     return ServiceState(
         version=request.app.version,

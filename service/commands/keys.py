@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 from datetime import UTC, datetime, time, timedelta
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -12,7 +13,7 @@ from service.commands.connection.client import AsJson, DataDir, read_settings
 from service.commands.console import Commands, Failure, remark, show, show_json, table
 
 if TYPE_CHECKING:
-    from service.access.keys import Key, KeyState, KeyStore
+    from service.access.keys import Key, KeyRecords, KeyState
 
 keys = typer.Typer(cls=Commands, help="Create, list and revoke the keys of a data directory.", no_args_is_help=True)
 
@@ -101,10 +102,14 @@ def moment(text: str) -> datetime:
     return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
 
 
-def _store(data_dir: Any) -> KeyStore:
-    from service.access.keys import KeyStore  # with it comes numpy
+def _store(data_dir: Any) -> KeyRecords:
+    from service.shared import keys_of, open_database  # with it comes numpy
 
-    return KeyStore(read_settings(data_dir).data_dir)
+    settings = read_settings(data_dir)
+    database = open_database(settings)
+    if database is not None:
+        atexit.register(database.close)
+    return keys_of(settings, database)
 
 
 def _state_of(key: Key) -> KeyState:

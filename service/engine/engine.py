@@ -11,20 +11,21 @@ from collections.abc import AsyncGenerator, Iterator, Sequence
 from contextlib import aclosing, contextmanager, suppress
 from dataclasses import dataclass, field
 
-from core.errors import MapQuarantined, PlacerecError, UnknownEncoder, UnknownMap, WrongEncoder
+from core.errors import MapQuarantined, PlacerecError, StoreUnavailable, UnknownEncoder, UnknownMap, WrongEncoder
 from core.frames.images import Limits
 from core.frames.masks import Mask
 from core.judgement.verdict import Calibration
+from core.maps import Map, MapRecord, Store
 from core.maps.selection import Selection
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.verification import Verify
-from core.storage import Atlas, Map, MapRecord
 from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Recognized, Searches, search_ahead
+from service.engine.stores import OpenStore
 from service.errors.faults import EncoderNotInstalled
 from service.events.events import Events
 from service.settings import Settings
@@ -77,7 +78,7 @@ async def camera_mask(map_: Map, camera: str | None) -> Mask | None:
 
 
 class Engine:
-    """The maps of a data directory, their events, the installed encoders with their queue, and a lock for each map.
+    """The maps of a store, their events, the installed encoders with their queue, and a lock for each map.
 
     Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
@@ -86,11 +87,19 @@ class Engine:
 
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
+        MissingExtra: the store of the settings needs a package that is not installed.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics, make_encoders: MakeEncoders | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        metrics: Metrics,
+        events: Events | None = None,
+        make_encoders: MakeEncoders | None = None,
+    ) -> None:
         self.settings, self.metrics = settings, metrics
-        self.atlas = Atlas(settings.data_dir)
+        self._store = OpenStore(settings)
+        self.atlas: Store = self._store.maps
         self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
         if make_encoders is not None:  # then an encoder compares descriptors here, and makes none
             self.catalogue = EncoderCatalogue(settings.models_directory, "float32")
@@ -99,7 +108,7 @@ class Engine:
             self.catalogue, limits, settings.queue_length, settings.threads, metrics, make_encoders
         )
         self.searches = Searches()
-        self.events = Events(settings.event_listeners)
+        self.events = Events(settings.event_listeners) if events is None else events
         self.review_keeper = ReviewKeeper()
         self.encoder_state = "loading"
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
@@ -119,7 +128,7 @@ class Engine:
         self.metrics.registry.unregister(self._map_collector)
         self.queue.close()
         self.review_keeper.close()
-        self.atlas.close()
+        self._store.close()
 
     def stop_loading(self) -> None:
         """Cancel the loading of the default encoder; call it from the event loop."""
@@ -149,9 +158,10 @@ class Engine:
 
     def _count_places(self) -> dict[str, int]:
         counts: dict[str, int] = {}
-        for record in self.all_records():
-            with suppress(UnknownMap, MapQuarantined):  # it was deleted or quarantined since it was listed
-                counts[record.id] = self.atlas.find(record.id).count_places()
+        with suppress(StoreUnavailable):  # the metrics of everything else are wanted most then
+            for record in self.all_records():
+                with suppress(UnknownMap, MapQuarantined):  # it was deleted or quarantined since it was listed
+                    counts[record.id] = self.atlas.find(record.id).count_places()
         return counts
 
     def all_records(self) -> list[MapRecord]:

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 from anyio import to_thread
 
+from core.maps import Map
 from core.maps.selection import Selection
 from core.method.encoder import Encoder, Encoding
 from core.recognition.recognition import Answer, locate
 from core.recognition.verification import Verifier, Verify
-from core.storage import Map
 from core.threads import cores
 from service.engine.encoders import Encoded
 
@@ -54,7 +54,7 @@ class SearchAhead:
 
     def __call__(self, encoded: Encoded) -> Answer | None:
         """The answer for a frame; None for a frame that is left to :meth:`Searches.recognize`."""
-        if not len(encoded.encoding.regions) or not self.map_.snapshot().holds:  # it would have to read from the disk
+        if not len(encoded.encoding.regions) or not self.map_.held:  # it would have to read from the disk
             return None
         verifiers = _verifiers([encoded], self.verify, self.camera)
         (answer,) = locate(self.map_, encoded.encoder, [encoded.encoding], self.k, None, verifiers)
@@ -70,7 +70,7 @@ def search_ahead(
     map_: Map, k: int, selection: Selection | None, verify: Verify = "never", camera: str | None = None
 ) -> SearchAhead | None:
     """The search to do in the encoder's thread, or None if other frames would wait too long for it."""
-    if selection is not None or map_.count_places() > MOST_AHEAD:
+    if selection is not None or not map_.held or map_.count_places() > MOST_AHEAD:
         return None
     return SearchAhead(map_, k, verify, camera)
 

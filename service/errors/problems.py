@@ -123,6 +123,8 @@ KINDS: dict[type[Exception], Kind] = {
     # Storage
     errors.StorageFull: Kind(507, "storage-full", "The disk is full"),
     errors.StorageFailure: Kind(500, "storage-failure", "The disk failed"),
+    errors.StoreUnavailable: Kind(503, "store-unavailable", "The maps cannot be reached"),
+    errors.StoreOfAnotherVersion: Kind(503, "store-of-another-version", "The maps were stored by another version"),
     errors.MapQuarantined: Kind(503, "map-quarantined", "The map is damaged and out of service"),
     errors.DataDirectoryLocked: Kind(503, "data-directory-locked", "Another process uses the data directory"),
     errors.DataDirectoryTooNew: Kind(503, "data-directory-too-new", "The data was written by a later version"),
@@ -201,6 +203,7 @@ RETRY_LATER = (
     faults.MemoryFull,
     faults.DeadlineExceeded,
     faults.NotReady,
+    errors.StoreUnavailable,
     faults.JobQueueFull,
     faults.StagingFull,
     faults.TooManyExports,

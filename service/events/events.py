@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from core.errors import PlacerecError
 from core.frames.images import ANY_SIZE, decode, encode_thumbnail
 from service.errors.faults import TooManyListeners
-from service.events.feed import Feed, Listener
+from service.events.feed import Feed, Kept, Listener
 from service.events.schemas import PRIVATE, Event, QueryEvent
 
 LINGER_SECONDS = 120.0
@@ -62,9 +62,11 @@ class Events:
             maps: ids of the maps that a caller must be allowed to use to see it; None: its own map.
         """
         feed = self._feeds.get(event.map)
-        if feed is None or self._is_forgotten(event.map, feed):
+        if feed is not None and self._is_forgotten(event.map, feed):
+            feed = None
+        if feed is None and not self._heard_elsewhere(event.map):
             return
-        if frame is not None and any(listener.pictures for listener in feed.listeners) and self._may_draw(len(frame)):
+        if frame is not None and self._shows_pictures(event.map, feed) and self._may_draw(len(frame)):
             try:
                 self._thread().submit(self._draw, feed, event, frame, maps)
             except RuntimeError:  # the service stops
@@ -72,14 +74,27 @@ class Events:
         else:
             self._add(feed, event, maps, None)
 
-    def _add(self, feed: Feed, event: Event, maps: frozenset[str | None] | None, picture: str | None) -> None:
+    def _heard_elsewhere(self, map_id: str) -> bool:
+        """Whether another service has listeners of a map."""
+        return False
+
+    def _shows_pictures(self, map_id: str, feed: Feed | None) -> bool:
+        """Whether somebody wants pictures of the frames of a map."""
+        return feed is not None and any(listener.pictures for listener in feed.listeners)
+
+    def _add(self, feed: Feed | None, event: Event, maps: frozenset[str | None] | None, picture: str | None) -> None:
         # ASCII, since some clients take characters such as U+2028 for the end of a line.
         full = event.model_dump_json(ensure_ascii=True)
         public = event.model_dump_json(ensure_ascii=True, exclude=set(PRIVATE))
         verdict = event.verdict if isinstance(event, QueryEvent) else None
+        kept = Kept(0, event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
+        self._keep(event.map, feed, kept)
+
+    def _keep(self, map_id: str, feed: Feed | None, event: Kept) -> None:
+        """Add an event to the feed of its map, if the map has one."""
         with self._lock:
-            if not feed.ended:
-                feed.add(event.kind, verdict, maps or frozenset({event.map}), full, public, picture)
+            if feed is not None and not feed.ended:
+                feed.add(event)
 
     def _is_forgotten(self, map_id: str, feed: Feed) -> bool:
         """Drop a feed that nobody has listened to for a while; whether it was dropped."""
@@ -107,7 +122,7 @@ class Events:
                 self._artist = ThreadPoolExecutor(1, "event-pictures")
             return self._artist
 
-    def _draw(self, feed: Feed, event: Event, frame: bytes, maps: frozenset[str | None] | None) -> None:
+    def _draw(self, feed: Feed | None, event: Event, frame: bytes, maps: frozenset[str | None] | None) -> None:
         picture = None
         try:
             small = encode_thumbnail(decode(frame, ANY_SIZE), PICTURE_SIDE, PICTURE_QUALITY)
@@ -141,6 +156,7 @@ class Events:
             listener = Listener(feed, resumed, pictures)
             feed.listeners.append(listener)
             self._drop_left()
+        self._listeners_changed()
         try:
             yield listener
         finally:
@@ -149,6 +165,10 @@ class Events:
                 feed.listeners.remove(listener)
                 if not feed.listeners:
                     feed.left_at = self._clock()
+            self._listeners_changed()
+
+    def _listeners_changed(self) -> None:
+        """Called whenever a listener has come or gone."""
 
     def _drop_left(self) -> None:
         """Drop the feeds without listeners that were left for long, and the longest left ones if they are too many."""

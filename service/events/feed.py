@@ -7,7 +7,7 @@ import secrets
 import threading
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 from service.events.schemas import EventKind
@@ -23,7 +23,7 @@ MOST_BYTES = 4 << 20
 class Kept:
     """An event as it is kept.
 
-    number: counts the events of the feed.
+    number: counts the events of the feed; 0 before it is in one.
     verdict: of a query; None of other kinds.
     maps: ids of the maps that a caller must be allowed to use to see it; None stands for what belongs to no map.
     full, public: the event as a JSON object, and without the fields that not everybody sees.
@@ -88,18 +88,10 @@ class Feed:
     left_at: float | None = None
     ended: bool = False
 
-    def add(
-        self,
-        kind: EventKind,
-        verdict: str | None,
-        maps: frozenset[str | None],
-        full: str,
-        public: str,
-        picture: str | None,
-    ) -> None:
-        """Append an event, and drop the oldest ones beyond the limits."""
+    def add(self, event: Kept) -> None:
+        """Append an event under the next number, and drop the oldest ones beyond the limits."""
         self.number += 1
-        event = Kept(self.number, kind, verdict, maps, full, public, picture)
+        event = replace(event, number=self.number)
         self.kept.append(event)
         self.size += event.size
         while len(self.kept) > MOST_KEPT or (self.size > MOST_BYTES and len(self.kept) > 1):

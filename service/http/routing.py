@@ -20,8 +20,8 @@ from pydantic import AfterValidator, BaseModel, ValidationError
 from starlette.responses import Response
 
 from core.errors import InvalidIdentifier
+from core.maps import Map
 from core.places import check_map_id, check_place_id
-from core.storage import Map
 from service.access.roles import Principal
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from core.errors import UnknownMap
 from core.frames.masks import Mask
-from core.storage import Atlas, Map
+from core.maps import Map, Store
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
@@ -44,9 +44,8 @@ class JobGivesWay(Exception):
 class Supervisor(Protocol):
     """The part of :class:`service.jobs.jobs.Jobs` that a job context uses."""
 
-    stopping: bool
-
     def get(self, job_id: str) -> Job: ...
+    def interrupts(self, job_id: str) -> bool: ...
     def others_wait(self, job_id: str) -> bool: ...
     def report(self, job_id: str, writing: bool, noticing: bool, **progress: Any) -> None: ...
     def note(self, job_id: str, notes: Mapping[str, Any]) -> None: ...
@@ -67,7 +66,7 @@ class JobContext:
         self.notes = job.notes
         self.maps = job.maps
 
-    def map(self, atlas: Atlas, map_id: str | None = None) -> Map:
+    def map(self, atlas: Store, map_id: str | None = None) -> Map:
         """One of the job's maps: the one with id ``map_id``, or by default the map that the job works on.
 
         Raises:
@@ -113,17 +112,17 @@ class JobContext:
 
     @property
     def is_to_stop(self) -> bool:
-        """Whether the job was asked to stop, or the service is stopping."""
-        return self._jobs.stopping or self.cancelled
+        """Whether the job was asked to stop, or has to go on later."""
+        return self._jobs.interrupts(self.id) or self.cancelled
 
     def check_cancelled(self) -> None:
         """Raise if the job has to stop.
 
         Raises:
             JobCancelled: the job was asked to stop.
-            JobInterrupted: the service is stopping.
+            JobInterrupted: the service is stopping, or has lost the job to another one.
         """
-        if self._jobs.stopping:
+        if self._jobs.interrupts(self.id):
             raise JobInterrupted
         if self.cancelled:
             raise JobCancelled

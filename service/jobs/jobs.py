@@ -14,6 +14,7 @@ import logging
 import secrets
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -28,7 +29,7 @@ from service.errors.problems import problem_of
 from service.events.events import Events
 from service.events.schemas import JobEvent
 from service.jobs.context import NOTICE_SECONDS, JobCancelled, JobContext, JobGivesWay, JobInterrupted, Work
-from service.jobs.records import DAMAGED, Job, JobRecords
+from service.jobs.records import DAMAGED, Job, JobRecords, JobState
 
 __all__ = ["NOTICE_SECONDS", "JobCancelled", "JobContext", "JobInterrupted", "Jobs", "Work"]
 
@@ -74,16 +75,22 @@ class Jobs:
         self._told: dict[str, tuple[str, float]] = {}  # of running jobs: the state that was told last, and when
         self.stopping = False
         self._changed = threading.Condition()  # held while a job is changed
-        self._records = JobRecords(directory)
         self._kinds: dict[str, Work] = {}
         self._discards: dict[str, Discard] = {}
         self._numbers = itertools.count(1)
         self._gave_way: dict[str, tuple[int, int]] = {}  # the position in the queue of jobs that gave way
         self._works: dict[str, Work] = {}
-        self._jobs = {job.id: job for job in self._records.read()}
-        self._last_number = self._records.last_number()
+        self._jobs: dict[str, Job] = {}
+        self._last_number = 0
         self._watchers: list[tuple[str, asyncio.AbstractEventLoop, asyncio.Event]] = []
         self._threads: list[threading.Thread] = []
+        self._open(directory)
+
+    def _open(self, directory: Path) -> None:
+        """Read the jobs of earlier runs."""
+        self._records = JobRecords(directory)
+        self._jobs |= {job.id: job for job in self._records.read()}
+        self._last_number = self._records.last_number()
 
     # Kinds, start and end
 
@@ -100,6 +107,14 @@ class Jobs:
 
     def start(self) -> None:
         """Resume the jobs of the last run of the service and start the workers; all kinds must be registered before."""
+        self._resume()
+        for number in range(self._workers):
+            thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def _resume(self) -> None:
+        """Let the jobs of the last run go on, and end those that cannot."""
         for job in [job for job in self.all() if not job.ended]:
             if job.resumable and job.kind in self._kinds:
                 self._works[job.id] = self._kinds[job.kind]
@@ -113,12 +128,8 @@ class Jobs:
             elif job.resumable:
                 why = f"this version of placerec knows no jobs of the kind {job.kind}"
             lost = JobLost(f"The service ended while the job was {state}, and {why}.")
-            self._end(job.id, "failed", problem=_problem(lost))
+            self._end(job.id, "failed", problem=problem_of_job(lost))
             self._discard(job)
-        for number in range(self._workers):
-            thread = threading.Thread(target=self._work, name=f"job-{number}", daemon=True)
-            thread.start()
-            self._threads.append(thread)
 
     def stop_soon(self) -> None:
         """Ask the running jobs to stop, and end the streams of watchers; returns at once."""
@@ -135,6 +146,9 @@ class Jobs:
             thread.join(max(0.0, until - time.monotonic()))
             if thread.is_alive():
                 log.warning("a job does not stop; the service stops without waiting for it")
+        self._close()
+
+    def _close(self) -> None:
         self._records.close()
 
     # Submitting, reading and cancelling
@@ -159,33 +173,44 @@ class Jobs:
             JobQueueFull: too many jobs are waiting.
             StorageFull, StorageFailure: the job was not accepted.
         """
-        resumable = work is None
-        chosen = self._kinds[kind] if work is None else work
-        with self._changed:
-            self.check_room()
-            job = Job(
-                number=self._last_number + 1,
-                id=secrets.token_hex(8),
-                kind=kind,
-                map_id=map_id,
-                arguments=dict(arguments or {}),
-                resumable=resumable,
-                created_at=datetime.now(UTC),
-                maps=dict(maps or {}),
-                asker=now_asking(),
-            )
-            self._records.put(job)
-            self._last_number = job.number
-            self._works[job.id], self._jobs[job.id] = chosen, job
-            self._changed.notify_all()
+        job = Job(
+            number=0,
+            id=secrets.token_hex(8),
+            kind=kind,
+            map_id=map_id,
+            arguments=dict(arguments or {}),
+            resumable=work is None,
+            created_at=datetime.now(UTC),
+            maps=dict(maps or {}),
+            asker=now_asking(),
+        )
+        job = self._add(job, self._kinds[kind] if work is None else work)
         self._tell(job)
         log.info("job queued", extra={"job": job.id, "kind": kind, "map": map_id})
+        return job
+
+    def _add(self, job: Job, work: Work) -> Job:
+        """Add a job to the queue; the job with its number."""
+        with self._changed:
+            self.check_room()
+            job = replace(job, number=self._last_number + 1)
+            self._records.put(job)
+            self._last_number = job.number
+            self._works[job.id], self._jobs[job.id] = work, job
+            self._changed.notify_all()
         return job
 
     def check_room(self) -> None:
         """Raise JobQueueFull if no further job may wait; a route calls it before it reads a long body."""
         if sum(job.state == "queued" for job in self._jobs.copy().values()) >= self._longest_queue:
-            raise JobQueueFull(f"{self._longest_queue} jobs are waiting already; send this one again later.")
+            raise self._queue_full()
+
+    def _queue_full(self) -> JobQueueFull:
+        return JobQueueFull(f"{self._longest_queue} jobs are waiting already; send this one again later.")
+
+    def counts(self) -> Counter[JobState]:
+        """How many of the jobs that are remembered are in each state; never waits."""
+        return Counter(job.state for job in self._jobs.copy().values())
 
     @property
     def watchers(self) -> int:
@@ -254,12 +279,12 @@ class Jobs:
     def _work(self) -> None:
         while (job := self._take()) is not None:
             if job.id not in self._gave_way:  # a job that gave way was noted when it began
-                _note(job, "running")
+                note_event(job, "running")
             try:
                 self._do(job)
             except Exception:  # this code has a defect: the job has failed, and the worker goes on
                 log.exception("job %s failed", job.id)
-                self._end(job.id, "failed", problem=_problem(RuntimeError()))
+                self._end(job.id, "failed", problem=problem_of_job(RuntimeError()))
 
     def _do(self, job: Job) -> None:
         began = time.perf_counter()
@@ -274,12 +299,9 @@ class Jobs:
         except JobInterrupted:
             ended = self._put_off(job)
         except JobGivesWay:
-            self._gave_way[job.id] = (self._last_number, next(self._numbers))
-            ended = self._change(job.id, state="queued", message="waits for the jobs of other maps")
-            with self._changed:
-                self._changed.notify_all()
+            ended = self._give_way(job)
         except Exception as error:
-            problem = _problem(error)
+            problem = problem_of_job(error)
             if problem["status"] == 500:
                 log.exception("job %s failed", job.id)
             ended = self._end(job.id, "failed", problem=problem)
@@ -320,11 +342,24 @@ class Jobs:
             own = self._jobs[job_id].map_id
             return any(job.map_id is None or job.map_id != own for job in self._ready(job_id))
 
+    def _give_way(self, job: Job) -> Job:
+        """Let a job wait behind those that were submitted until now."""
+        self._gave_way[job.id] = (self._last_number, next(self._numbers))
+        changed = self._change(job.id, state="queued", message="waits for the jobs of other maps")
+        with self._changed:
+            self._changed.notify_all()
+        return changed
+
+    def interrupts(self, job_id: str) -> bool:
+        """Whether a running job has to stop so that it can go on later."""
+        return self.stopping
+
     def _put_off(self, job: Job) -> Job:
+        """Let a job wait that was interrupted."""
         if job.resumable:
             return self._change(job.id, state="queued", message="is resumed when the service starts again")
         why = "The service was stopped while the job was running, and this kind of job cannot be resumed."
-        return self._end(job.id, "failed", problem=_problem(JobLost(why)))
+        return self._end(job.id, "failed", problem=problem_of_job(JobLost(why)))
 
     def _discard(self, job: Job) -> None:
         if (discard := self._discards.get(job.kind)) is not None:
@@ -366,7 +401,7 @@ class Jobs:
             for job in past:
                 del self._jobs[job.id]
             ended = self._change(job_id, state=state, ended_at=datetime.now(UTC), notes={}, **outcome)
-            _note(ended, state)
+            note_event(ended, state)
             self._works.pop(job_id, None)
             self._gave_way.pop(job_id, None)
             self._changed.notify_all()  # another one of the same map may run
@@ -427,11 +462,12 @@ def _event(map_id: str, job: Job) -> JobEvent:
     )
 
 
-def _problem(error: Exception) -> dict[str, Any]:
+def problem_of_job(error: Exception) -> dict[str, Any]:
+    """The problem object of a job that failed with an error."""
     return problem_of(error).model_dump(exclude_none=True)
 
 
-def _note(job: Job, event: str) -> None:
+def note_event(job: Job, event: str) -> None:
     """Write a line of the audit trail about a job."""
     line = {"job": job.id, "kind": job.kind, "map": job.map_id, "attempt": job.attempt}
     note_job(event, line, job.arguments, job.problem, job.asker)

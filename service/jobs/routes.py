@@ -34,6 +34,7 @@ from service.jobs.jobs import Jobs
 from service.jobs.records import Job, JobState
 from service.jobs.schemas import JobPage, JobView
 from service.settings import Settings
+from service.worker_threads import in_thread
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"], dependencies=[Depends(single_values)])
 
@@ -72,7 +73,7 @@ Wait = Annotated[
 
 
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
-async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> JobPage:
+def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) -> JobPage:
     """List jobs, the newest first; only the latest ended jobs are kept."""
     listing: Listing = ["jobs", page.map, page.kind, page.state]
     after = decode_number(listing, page.cursor)
@@ -92,14 +93,14 @@ async def list_jobs(page: JobPageQuery, jobs: JobsDep, principal: PrincipalDep) 
 @router.get("/{job}", responses=problem_documentation(UnknownJob, TooManyWatchers))
 async def read_job(job_id: JobId, jobs: JobsDep, principal: PrincipalDep, wait: Wait = 0.0) -> JobView:
     """Read the state of a job. With `wait` the answer comes when the job has ended, or when that time is over."""
-    job = _job_for(jobs, principal, job_id)
+    job = await in_thread(_job_for, jobs, principal, job_id)
     if wait and not job.ended:
         until = time.monotonic() + wait
         with jobs.watching(job_id) as changed:
-            while not (job := jobs.get(job_id)).ended and not jobs.stopping:
+            while not (job := await in_thread(jobs.get, job_id)).ended and not jobs.stopping:
                 if not await set_within(changed, until - time.monotonic()):
                     break
-    return JobView.of(jobs.get(job_id))
+    return JobView.of(await in_thread(jobs.get, job_id))
 
 
 @router.get(
@@ -122,7 +123,7 @@ async def follow_job(
     Each event contains the whole job, so a client that connects late, or again with `Last-Event-ID`, misses nothing
     that still holds.
     """
-    job = _job_for(jobs, principal, job_id)
+    job = await in_thread(_job_for, jobs, principal, job_id)
     if job.ended and last_event_id == job.version:
         return Response(status_code=204)  # this status stops a browser from reconnecting
     stream = _events(jobs, job_id, last_event_id, lambda: request.app.state.gate.identify(request.scope))
@@ -163,7 +164,7 @@ async def _events(jobs: Jobs, job_id: str, last: str | None, check_key: Callable
         yield OPENING
         while True:
             try:
-                job = jobs.get(job_id)
+                job = await in_thread(jobs.get, job_id)
             except UnknownJob:
                 return  # the job ended and was forgotten before the caller read on
             if job.version != last:

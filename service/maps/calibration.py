@@ -17,6 +17,7 @@ from core import errors
 from core.errors import RevisionMismatch
 from core.judgement.trials import Trials
 from core.judgement.verdict import Calibration
+from core.maps import Map, Snapshot
 from core.method.encoder import Encoder, Encoding
 from core.recognition.calibration import (
     TOGETHER,
@@ -32,7 +33,6 @@ from core.recognition.calibration import (
     calibrate_map as fit_calibration,
 )
 from core.recognition.stages import calibration_of
-from core.storage import Map, Snapshot
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import (

@@ -13,7 +13,7 @@ from starlette.responses import Response, StreamingResponse
 
 from core import errors
 from core.judgement.verdict import Verdict
-from core.storage import Map
+from core.maps import Map
 from service.access.roles import OPERATIONS, Principal, covers
 from service.engine.engine import Engine
 from service.errors.faults import Fault, InvalidRequest, RoleTooLow, TooManyListeners
@@ -32,6 +32,7 @@ from service.http.event_stream import (
 )
 from service.http.routing import EngineDep, MapId, PrincipalDep, single_values
 from service.http.schemas import Parameters
+from service.worker_threads import in_thread
 
 GATHER_SECONDS = 0.05
 """A listener gets what happens within this time together."""
@@ -162,7 +163,7 @@ class MapStream:
                     return
                 if await set_within(listener.changed, HEARTBEAT_SECONDS):
                     await asyncio.sleep(GATHER_SECONDS)
-                elif self._is_gone():
+                elif await in_thread(self._is_gone):
                     return
                 else:
                     yield HEARTBEAT
@@ -178,7 +179,9 @@ class MapStream:
     def _is_gone(self) -> bool:
         """Whether the map was deleted, replaced or found to be damaged."""
         try:
-            return self._engine.atlas.find(self._map.record.id) is not self._map
+            return self._engine.atlas.find(self._map.record.id).record.created_at != self._map.record.created_at
+        except errors.StoreUnavailable:
+            return False
         except errors.PlacerecError:
             return True
 

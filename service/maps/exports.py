@@ -19,11 +19,12 @@ from starlette.responses import FileResponse
 from starlette.types import Message, Receive, Scope, Send
 
 from core.errors import StorageFull
-from core.storage import Map
-from core.storage.archives.exporter import Exported
+from core.maps import Map
+from core.maps.archives.writing import Exported
 from service.errors.faults import NotReady, RangeNotSatisfiable, TooManyExports
 from service.places.staging import RESERVE
 from service.settings import Settings
+from service.worker_threads import in_thread
 
 FOLDER = "exports"
 MEDIA_TYPE = "application/x-tar"
@@ -39,7 +40,7 @@ class Export:
     """A map as it was at one time.
 
     map: the object, since a later map of the same id is another map.
-    state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same object.
+    state: what ``map.exporter.state()`` was then; the map has not changed as long as it gives the same.
     file: the export file.
     readers: how many responses read it now.
     used: when it was last asked for, on the monotonic clock.
@@ -81,10 +82,10 @@ class Exports:
         """The export of a map that has one of these tags, even if the map was changed or deleted since."""
         return next((found for tag in tags if (found := self._exports.get((map_id, tag)))), None)
 
-    def tag_of(self, map_: Map) -> str | None:
+    async def tag_of(self, map_: Map) -> str | None:
         """The tag that an export of the map would have now; None if that is not known without writing one."""
         state, tag = self._tags.get(map_, (None, ""))
-        return tag if state is not None and state is map_.exporter.state() else None
+        return tag if state is not None and state == await in_thread(map_.exporter.state) else None
 
     async def create(self, map_: Map) -> Export:
         """The export of a map as it is now; one that is kept if the map has not changed since.
@@ -96,9 +97,9 @@ class Exports:
             StorageFull, StorageFailure.
         """
         while True:
-            state = map_.exporter.state()
+            state = await in_thread(map_.exporter.state)
             for export in self._exports.values():
-                if export.map is map_ and export.state is state and state is not None:
+                if export.map is map_ and export.state == state and state is not None:
                     return export
             begun_with, task = self._under_way.get(map_, (None, None))
             if task is None:
@@ -106,7 +107,7 @@ class Exports:
                 task = asyncio.create_task(self._create(map_))
                 self._under_way[map_] = state, task
                 task.add_done_callback(lambda done: self._created(map_, done))
-            elif state is None or begun_with is not state:  # it may lack what was written since
+            elif state is None or begun_with != state:  # it may lack what was written since
                 await asyncio.wait([task])
                 continue
             export = await asyncio.shield(task)  # other requests may wait for it, too

@@ -19,16 +19,16 @@ from typing import Any
 
 from anyio import CapacityLimiter
 
-from core.disk.files import Damage, disk_errors, write_at
-from core.errors import InvalidArchive, StorageFailure, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
+from core.disk.files import disk_errors, write_at
+from core.errors import InvalidArchive, StorageFull, TooManyPixels, UnknownMap, WrongEncoder
 from core.frames.containers import read_header
 from core.frames.images import Limits
+from core.maps.archives.manifest import Manifest
+from core.maps.archives.reading import Archive, opening_of
+from core.maps.archives.tar_layout import BLOCK
 from core.method.catalogue import EncoderSummary
 from core.places import check_map_id
-from core.storage.archives.building import build, check_sizes
-from core.storage.archives.manifest import Manifest
-from core.storage.archives.reading import Archive, opening_of
-from core.storage.archives.tar_layout import BLOCK
+from core.storage.archives.unpacking import check_sizes
 from service.engine.engine import Engine
 from service.errors.faults import ClientGone, DigestMismatch, TooManyImports, TooManyPlaces
 from service.http.arrivals import Arrival, arriving
@@ -237,20 +237,15 @@ class Imports:
             archive = Archive(self._folder / name)
         with archive:
             self.check_encoder(archive.manifest)
-            try:
-                with self._engine.atlas.building(map_id) as folder:
-                    limits = self._picture_limits()
-                    build(
-                        archive,
-                        folder,
-                        map_id,
-                        advance=advance,
-                        check_picture=partial(_check_picture, limits=limits),
-                        most_picture_bytes=limits.max_bytes,
-                    )
-                    before_listing(archive)
-            except Damage as damage:
-                raise StorageFailure(f"The disk did not keep what was written: {damage}.") from damage
+            limits = self._picture_limits()
+            self._engine.atlas.import_map(
+                archive,
+                map_id,
+                advance,
+                partial(_check_picture, limits=limits),
+                limits.max_bytes,
+                lambda: before_listing(archive),
+            )
         log.info("map imported", extra={"map": map_id, "places": archive.manifest.places, "manifest": archive.tag})
 
     def _picture_limits(self) -> Limits:

@@ -10,9 +10,9 @@ from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.judgement.calibration import Measurement, Target
 from core.judgement.verdict import Calibration, Verdict
+from core.maps import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, StorageStatus, TierSetting
 from core.maps.records import COMPACT_FROM
 from core.places import Timestamp
-from core.storage import IndexStatus, Keep, MapSettings, Precision, ReviewSetting, StorageStatus, TierSetting
 from service.http.schemas import IDENTITY_EXAMPLE, CameraName, Cursor
 from service.queries.statistics import VerdictCounts
 

@@ -13,8 +13,8 @@ from pydantic import AfterValidator, Field
 from starlette.responses import JSONResponse, Response
 
 from core import errors
+from core.maps.archives.manifest import Manifest
 from core.places import check_map_id
-from core.storage.archives.manifest import Manifest
 from service.errors.faults import (
     BodyTooLarge,
     DigestMismatch,
@@ -107,7 +107,7 @@ async def export_map(map_id: MapId, request: Request, engine: EngineDep, exports
     export = exports.find(map_id, named_tags(request.headers))
     if export is None:
         map_ = await engine.map(map_id)
-        tag = exports.tag_of(map_)
+        tag = await exports.tag_of(map_)
         if tag is None or not is_known(request.headers, tag):
             export = await exports.create(map_)
             tag = export.file.tag

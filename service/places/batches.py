@@ -9,8 +9,8 @@ from typing import Any
 from starlette.requests import Request
 
 from core import errors
+from core.maps.cameras import KnownCameras
 from core.places import check_place_id
-from core.storage import Map
 from service.errors.faults import Fault, FrameNeeded, InvalidRequest, UnsupportedMediaType
 from service.errors.problems import Problem, request_problem
 from service.http.multipart import Part
@@ -84,7 +84,7 @@ def check_batch(entries: Any, names: list[str], most: int) -> None:
 
 
 def read_entry(
-    entry: Any, names: Collection[str], read: Callable[[str], Part], map_: Map, settings: Settings
+    entry: Any, names: Collection[str], read: Callable[[str], Part], cameras: KnownCameras, settings: Settings
 ) -> FrameToEnrol:
     """The frame that one entry of a batch describes.
 
@@ -92,6 +92,7 @@ def read_entry(
         entry: one JSON value of the part ``places``.
         names: the names of the file parts.
         read: returns the file part of a name.
+        cameras: of the map.
 
     Raises:
         InvalidRequest, InvalidIdentifier, InvalidField: the entry is malformed.
@@ -101,7 +102,7 @@ def read_entry(
     item = validated(BatchItem, entry)
     check_place_id(item.id)
     fields = item.fields(item.metadata, settings)
-    mask = map_.cameras.mask(fields.camera)
+    mask = cameras.mask(fields.camera)
     if item.file is None:
         return FrameToEnrol(item.id, fields, None, mask, sha256=bytes.fromhex(str(item.sha256)))
     if item.file not in names:

@@ -12,7 +12,7 @@ from typing import Any
 
 from starlette.requests import Request
 
-from core.storage import Map
+from core.maps import Map
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline
 from service.errors.faults import BodyTooLarge, InvalidRequest, UnsupportedMediaType
@@ -219,7 +219,7 @@ class _BulkEnrolment:
 
     def _frame(self, position: int) -> FrameToEnrol:
         entry = self.entries[position]
-        frame = read_entry(entry, self.files, self._read, self.map, self.engine.settings)
+        frame = read_entry(entry, self.files, self._read, self.map.cameras, self.engine.settings)
         if self.first[frame.id] != position:
             raise InvalidRequest(f"id: the form has {frame.id} twice.")
         return frame

@@ -9,9 +9,9 @@ from contextlib import aclosing, nullcontext
 from dataclasses import dataclass, field
 
 from core.frames.masks import Mask
+from core.maps import Change, Enrolment, Map, SameFrame
 from core.places import Place, PlaceFields
 from core.recognition.recognition import describe, frame_digest
-from core.storage import Change, Enrolment, Map, SameFrame
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from anyio import CapacityLimiter
 
-from core.storage import Map
+from core.maps import Map
 from service.errors.faults import PlanTooLarge
 
 MOST_PLACES = 200_000
@@ -63,7 +63,7 @@ class Plans:
         state = map_.state
         with self._lock:
             found = self._kept.get(_key(map_, step))
-            if found is None or found.state is not state:
+            if found is None or found.state != state:
                 return None
             self._kept.move_to_end(_key(map_, step))
             return found

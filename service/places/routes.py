@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from core import errors
+from core.maps.cameras import ReadCameras
 from core.maps.records import merge_patch
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
@@ -190,7 +191,7 @@ async def _enrol_now(
     entries, files = json_part(await read_many(request, engine.settings), "places")
     engine.assert_encoder(map_, options.encoder)
     check_batch(entries, [part.name for part in files], engine.settings.max_batch_items)
-    await in_thread(map_.cameras.all)  # so that the cameras are in memory
+    cameras = ReadCameras(await in_thread(map_.cameras.all))
     engine.metrics.batches.labels("enrol").observe(len(entries))
 
     results: list[BatchResult | None] = [None] * len(entries)
@@ -204,7 +205,7 @@ async def _enrol_now(
     by_name = {part.name: part for part in files}
     for position, entry in enumerate(entries):
         try:
-            frame = read_entry(entry, by_name, by_name.__getitem__, map_, engine.settings)
+            frame = read_entry(entry, by_name, by_name.__getitem__, cameras, engine.settings)
             if frame.id in ids:
                 raise InvalidRequest(f"id: the batch has {frame.id} twice.")
             ids.add(frame.id)

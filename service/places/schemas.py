@@ -6,8 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, PlainSerializer
 
+from core.maps import Change, Keep, SequenceSummary
 from core.places import Place, Pose, Sequence, Timestamp
-from core.storage import Change, Keep, SequenceSummary
 from service.errors.problems import Problem
 from service.http.schemas import IDENTITY_EXAMPLE, Cursor, Milliseconds
 

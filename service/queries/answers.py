@@ -10,9 +10,9 @@ from fastapi import Depends
 
 from core.errors import PlacerecError
 from core.judgement.position import PoseEstimate
+from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import Candidates, calibration_of
-from core.storage import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.engine.searches import Recognized

@@ -11,6 +11,7 @@ import numpy as np
 from core.errors import NoThumbnail, UnknownCamera, UnknownPlace
 from core.frames.preprocessing import Pixels
 from core.geometry.verification import LEAST_MATCHES
+from core.maps import Map
 from core.method.encoder import Encoder
 from core.method.equations import assign
 from core.method.explanation import Explanation, Shown, explain
@@ -18,7 +19,6 @@ from core.method.region_drawing import boxes, layer_grids
 from core.method.regions import Regions
 from core.places import Place
 from core.recognition.recognition import Answer
-from core.storage import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from core.storage import Map
+from core.maps import Map
 from service.access.audit import ASKER
 from service.engine.engine import Engine
 from service.events.schemas import QueryEvent

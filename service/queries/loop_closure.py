@@ -9,11 +9,11 @@ from fastapi import APIRouter, Depends, Query, Request
 from starlette.responses import Response
 
 from core import errors
+from core.maps import Map
 from core.maps.selection import Selection
 from core.places import Place, check_place_id
 from core.recognition.recognition import Answer, locate
 from core.recognition.verification import Verifier, Verify
-from core.storage import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.errors.faults import (

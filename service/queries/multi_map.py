@@ -12,11 +12,11 @@ from core.frames.masks import Mask
 from core.judgement.fusion import ALIKE, joint_probabilities, log_odds_of
 from core.judgement.priors import decision_slope
 from core.judgement.verdict import Verdict
+from core.maps import Map
 from core.maps.selection import Selection
 from core.recognition.recognition import Answer
 from core.recognition.rigs import locate_rig
 from core.recognition.verification import Verifier, Verify
-from core.storage import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, Query, Request
 
 from core import errors
 from core.judgement.probability import sigmoid
-from core.storage import Map
+from core.maps import Map
 from service.engine.encoders import Encoded
 from service.engine.engine import Engine
 from service.errors.faults import (

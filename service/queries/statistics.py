@@ -23,8 +23,8 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import PlacerecError, UnknownMap
 from core.judgement.verdict import Verdict
+from core.maps import Map
 from core.places import Timestamp
-from core.storage import Map
 from core.upkeep.drift import SCORE_BINS, Week
 from service.engine.engine import Engine
 from service.queries.recent_answers import MapKey, RecentAnswers
@@ -139,7 +139,7 @@ class Statistics:
 
 
 @dataclass
-class _Counts:
+class Counts:
     """The counts of one map that are not written yet."""
 
     since: str
@@ -147,7 +147,7 @@ class _Counts:
     weeks: dict[date, Week] = field(default_factory=dict)
     hours: dict[int, Counter[Verdict]] = field(default_factory=dict)
 
-    def add(self, other: _Counts) -> None:
+    def add(self, other: Counts) -> None:
         for place, count in other.places.items():
             self.places[place] = self.places.get(place, PlaceCount()) + count
         for monday, week in other.weeks.items():
@@ -179,7 +179,7 @@ class QueryStatistics:
         self._database = SqliteFile(directory / FILE, _SCHEMA, settings, readable, check_whole=False)
         self._seconds, self._sizes, self._present = seconds, sizes, present
         self._lock = threading.Lock()
-        self._counts: dict[MapKey, _Counts] = {}
+        self._counts: dict[MapKey, Counts] = {}
         self._waiting = 0
         self.recent = RecentAnswers()
         """The latest answers, which are in memory alone."""
@@ -198,7 +198,11 @@ class QueryStatistics:
             if engine.atlas.quarantined():
                 return None  # a map that is quarantined may come back
             found = {}
-            for record in engine.all_records():
+            try:
+                records = engine.all_records()
+            except PlacerecError:
+                return None
+            for record in records:
                 try:
                     map_ = engine.atlas.find(record.id)
                 except UnknownMap:
@@ -240,9 +244,9 @@ class QueryStatistics:
         now = datetime.now(UTC)
         counted = Week.of(_monday(now.date()), verdict, score, decision)
         with self._lock:
-            counts = self._counts.setdefault(key, _Counts(since=now.isoformat()))
+            counts = self._counts.setdefault(key, Counts(since=now.isoformat()))
             counts.weeks[counted.monday] = counts.weeks.get(counted.monday, Week(counted.monday)) + counted
-            counts.hours.setdefault(_hour(now), Counter())[verdict] += 1
+            counts.hours.setdefault(hour_of(now), Counter())[verdict] += 1
             if best is None:
                 return
             if best not in counts.places:
@@ -269,7 +273,7 @@ class QueryStatistics:
             places = connection.execute("SELECT id, best, recognized, last FROM places WHERE map = ?", (code,))
             counts = {place: PlaceCount(*values) for place, *values in places.fetchall()}
             weeks = connection.execute("SELECT * FROM weeks WHERE map = ? ORDER BY monday", (code,)).fetchall()
-            return Statistics(datetime.fromisoformat(since), counts, tuple(_week(row[1:]) for row in weeks))
+            return Statistics(datetime.fromisoformat(since), counts, tuple(week_of(row[1:]) for row in weeks))
         return Statistics()
 
     def of_place(self, key: MapKey, place_id: str) -> PlaceCount:
@@ -312,20 +316,29 @@ class QueryStatistics:
         found = self._last_hours(key)
         return {one: sum(hours.values(), VerdictCounts()) for one, hours in found.items()}
 
-    def _last_hours(self, key: MapKey | None) -> dict[MapKey, dict[int, VerdictCounts]]:
-        """The counts of the last hours by map and hour, in order."""
-        oldest = _hour(datetime.now(UTC) - timedelta(hours=HOURS - 1))
+    def _kept_hours(self, oldest: int, key: MapKey | None) -> list[tuple[Any, ...]]:
+        """The counts from an hour on that are kept: id and creation time of the map, hour, and count of each verdict.
+
+        Args:
+            key: of the only map that is wanted; None: all.
+        """
         query = (
             "SELECT m.id, m.made, h.hour, h.recognized, h.ambiguous, h.unknown FROM hours h JOIN maps m"
             " ON m.code = h.map WHERE h.hour >= ?"
         )
         only, values = ("", ()) if key is None else (" AND m.id = ? AND m.made = ?", key)
+        with self._replacing_damage():
+            return self._open().execute(query + only, (oldest, *values)).fetchall()
+        return []
+
+    def _last_hours(self, key: MapKey | None) -> dict[MapKey, dict[int, VerdictCounts]]:
+        """The counts of the last hours by map and hour, in order."""
+        oldest = hour_of(datetime.now(UTC) - timedelta(hours=HOURS - 1))
         found: dict[MapKey, dict[int, VerdictCounts]] = {}
         with self._file:  # so that no counts are on their way from memory to the file
-            with self._replacing_damage():
-                for map_id, made, hour, *counts in self._open().execute(query + only, (oldest, *values)).fetchall():
-                    known = dict(zip(("recognized", "ambiguous", "unknown"), counts, strict=True))
-                    found.setdefault((map_id, made), {})[hour] = VerdictCounts(**known)
+            for map_id, made, hour, *counts in self._kept_hours(oldest, key):
+                known = dict(zip(("recognized", "ambiguous", "unknown"), counts, strict=True))
+                found.setdefault((map_id, made), {})[hour] = VerdictCounts(**known)
             with self._lock:
                 for one, waiting in self._counts.items():
                     if key in (None, one):
@@ -393,18 +406,22 @@ class QueryStatistics:
             if not taken:
                 return
             try:
-                with self._replacing_damage():
-                    self._write(taken)
-                    return
-                with disk_errors("write down the statistics of queries", FILE):
-                    self._write(taken)  # into a new file
+                self._keep(taken)
             except BaseException:
                 with self._lock:  # add the counts of the meantime to those that could not be written
                     for key, newer in self._counts.items():
-                        taken.setdefault(key, _Counts(newer.since)).add(newer)
+                        taken.setdefault(key, Counts(newer.since)).add(newer)
                     self._counts = taken
                     self._waiting = sum(len(counts.places) for counts in taken.values())
                 raise
+
+    def _keep(self, counts: Mapping[MapKey, Counts]) -> None:
+        """Add counts to those that are kept, all or none."""
+        with self._replacing_damage():
+            self._write(counts)
+            return
+        with disk_errors("write down the statistics of queries", FILE):
+            self._write(counts)  # into a new file
 
     def _run(self) -> None:
         while not self._stop.wait(self._seconds):
@@ -420,7 +437,7 @@ class QueryStatistics:
             self._connection.execute("PRAGMA synchronous = NORMAL")
         return self._connection
 
-    def _write(self, counts: Mapping[MapKey, _Counts]) -> None:
+    def _write(self, counts: Mapping[MapKey, Counts]) -> None:
         connection, sizes = self._open(), self._sizes()
         with transaction(connection):
             if sizes is not None:
@@ -431,7 +448,7 @@ class QueryStatistics:
                 if sizes is None or key in sizes:
                     self._add(connection, key, counted, None if sizes is None else sizes[key])
 
-    def _add(self, connection: sqlite3.Connection, key: MapKey, counted: _Counts, places: int | None) -> None:
+    def _add(self, connection: sqlite3.Connection, key: MapKey, counted: Counts, places: int | None) -> None:
         code = _code(connection, key, counted.since)
         connection.executemany(
             "INSERT INTO places VALUES (?1, ?2, ?3, ?4, ?5) ON CONFLICT DO UPDATE SET"
@@ -442,7 +459,7 @@ class QueryStatistics:
             stored = connection.execute(
                 "SELECT * FROM weeks WHERE map = ? AND monday = ?", (code, week.monday.isoformat())
             ).fetchone()
-            columns = _columns(week if stored is None else _week(stored[1:]) + week)
+            columns = columns_of(week if stored is None else week_of(stored[1:]) + week)
             marks = ", ".join("?" * (len(columns) + 1))
             connection.execute(f"INSERT OR REPLACE INTO weeks VALUES ({marks})", (code, *columns))
         connection.executemany(
@@ -453,7 +470,7 @@ class QueryStatistics:
                 for hour, verdicts in counted.hours.items()
             ],
         )
-        last = _hour(datetime.now(UTC) - timedelta(hours=HOURS))
+        last = hour_of(datetime.now(UTC) - timedelta(hours=HOURS))
         connection.execute("DELETE FROM hours WHERE map = ? AND hour < ?", (code, last))
         oldest = "SELECT monday FROM weeks WHERE map = ?1 ORDER BY monday DESC LIMIT 1 OFFSET ?2"
         connection.execute(f"DELETE FROM weeks WHERE map = ?1 AND monday <= ({oldest})", (code, MOST_WEEKS))
@@ -476,16 +493,18 @@ def _monday(day: date) -> date:
     return day - timedelta(days=day.weekday())
 
 
-def _hour(moment: datetime) -> int:
+def hour_of(moment: datetime) -> int:
     """The hour of a moment, counted since 1970 in UTC."""
     return int(moment.timestamp()) // 3600
 
 
-def _columns(week: Week) -> tuple[object, ...]:
+def columns_of(week: Week) -> tuple[object, ...]:
+    """A week as it is stored."""
     verdicts = (week.recognized, week.ambiguous, week.unknown, week.blank)
     sums = (week.score, week.score_squares, week.decision, week.decision_squares)
     return (week.monday.isoformat(), *verdicts, *sums, *week.bins)
 
 
-def _week(row: tuple[Any, ...]) -> Week:
+def week_of(row: tuple[Any, ...]) -> Week:
+    """A stored week."""
     return Week(date.fromisoformat(row[0]), *row[1:9], tuple(row[9:]))  # type: ignore[call-arg]

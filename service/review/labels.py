@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from core.errors import PlacerecError, StorageFailure, UnknownCamera
 from core.frames.masks import Mask
+from core.maps import Map
 from core.method.encoder import Encoding
-from core.storage import Map
 from service.engine.encoders import Encoded
 
 TOGETHER = 32

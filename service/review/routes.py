@@ -11,8 +11,8 @@ from starlette.responses import Response
 
 from core import errors
 from core.frames.containers import read_header
+from core.maps import Map
 from core.places import check_place_id
-from core.storage import Map
 from core.storage.pagination import Listing, decode_number, page_of
 from service.access.audit import ASKER
 from service.engine.engine import Engine, camera_mask

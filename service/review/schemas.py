@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from core.judgement.verdict import Verdict
+from core.maps import ReviewFrame
 from core.places import Timestamp
-from core.storage import ReviewFrame
 from service.http.schemas import Cursor
 from service.places.parameters import PlaceDescription
 from service.places.schemas import PlaceView

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from core.belief import NOTHING, Candidate, Estimate, Evidence, Run, Step, View, evidence, view_of
+from core.maps import Map
 from core.recognition.recognition import Answer
 from core.recognition.stages import neighborhood_of
-from core.storage import Map
 from service.engine.engine import Engine, camera_mask
 from service.engine.queue import RequestDeadline
 from service.errors.faults import FrameOutOfOrder, InvalidRequest
@@ -31,7 +31,7 @@ from service.sessions.schemas import (
     SessionReport,
     SessionView,
 )
-from service.sessions.sessions import Session, Sessions, alive_rows
+from service.sessions.sessions import Session, SessionMoved, Sessions, alive_rows
 from service.worker_threads import in_thread
 
 
@@ -78,9 +78,17 @@ async def process_frame(
         single = counted_answer(engine, statistics, map_, recognized, asked)
         try:
             view = await in_thread(view_of, recognized.encoded.pixels, mask)
-            answer = await in_thread(
-                _advance, sessions, map_, session, run, recognized.answer, view, single, options, request_id, began
-            )
+            while True:
+                try:
+                    answer = await in_thread(
+                        _advance, sessions, map_, session, run, recognized.answer, view, single, options, request_id,
+                        began,
+                    )  # fmt: skip
+                    break
+                except SessionMoved:  # the frame comes after the one that another service has processed
+                    run = await in_thread(_found_run, sessions, map_, session)
+                    if (repeated := _repeated(session, options, request_id)) is not None:
+                        return repeated
         except Exception:
             session.run = None  # the next frame restores the run as it was saved after the frame before
             raise

@@ -21,15 +21,15 @@ from pydantic import ValidationError
 from core.belief import DamagedRecord, PlaceGraph, Run, RunState, from_bytes, place_graph, to_bytes
 from core.disk.files import disk_errors
 from core.errors import UnknownSequence
+from core.maps import Map, Snapshot
 from core.maps.selection import Conditions, Selection
 from core.recognition.stages import neighborhood_of
-from core.storage import Map, Snapshot
 from service.access.audit import ASKER
 from service.errors.faults import QueueFull, SessionExpired, TooManySessions, UnknownSession
 from service.events.events import Events
 from service.events.schemas import NOBODY_ASKED, SessionEvent
 from service.sessions.schemas import NewSession
-from service.sessions.store import SessionStore, StoredSession
+from service.sessions.store import SessionRecords, SessionStore, StoredSession
 from service.settings import Settings
 
 WAITING = 8
@@ -72,6 +72,7 @@ class Session:
     streaming: whether a WebSocket streams into the session.
     begun_by: who began it, and the id of that request; None after a restart.
     waiting: how many frames are being processed or wait for that.
+    revision: of its record, where services share it; grows with every frame.
     idle_since: when the last frame came, by the monotonic clock: the session expires by this clock, because the other
         one may be set.
     """
@@ -93,6 +94,7 @@ class Session:
     streaming: bool = False
     begun_by: tuple[str, str | None, str | None] | None = None
     waiting: int = 0
+    revision: int = 0
     idle_since: float = field(default_factory=time.monotonic)
     _lock: asyncio.Lock = field(default_factory=asyncio.Lock)
 
@@ -147,16 +149,21 @@ class _CachedGraph:
         return self.snapshot is snapshot or now - self.made < GRAPH_REUSE * self.took
 
 
+class SessionMoved(Exception):
+    """Another service that shares the session has processed a frame of it in the meantime."""
+
+
 class Sessions:
     """All sessions.  Thread-safe.
 
     Args:
         events: is told when a session begins and ends.
+        store: keeps the sessions; None: a file in the data directory.
     """
 
-    def __init__(self, settings: Settings, events: Events) -> None:
+    def __init__(self, settings: Settings, events: Events, store: SessionRecords | None = None) -> None:
         self._settings, self._events = settings, events
-        self._store = SessionStore(settings.data_dir)
+        self._store = SessionStore(settings.data_dir) if store is None else store
         self._lock = threading.RLock()
         self._graph_lock = threading.Lock()
         self._graphs: dict[tuple[str, str, tuple[str, ...]], _CachedGraph] = {}
@@ -179,20 +186,15 @@ class Sessions:
                     self._ended[stored.id] = (stored.map, stored.ended)
                 continue
             try:
-                content = json.loads(stored.options)
-                expires_after = float(content.pop("expires_after"))
-                options = NewSession.model_validate(content)
+                session = session_of(stored)
             except (ValueError, KeyError, TypeError, ValidationError) as error:
                 log.error("session %s cannot be restored: %s", stored.id, error)
                 self._store.end(stored.id, STATE_LOST, now)
                 self._ended[stored.id] = (stored.map, STATE_LOST)
                 continue
             kept.append(stored.id)
-            self._living[stored.id] = Session(
-                stored.id, stored.map, stored.map_created_at, options, expires_after, stored.created, stored.used,
-                stored.number, stored.moment, stored.request, stored.lost, restored=True,
-                idle_since=time.monotonic() - max(0.0, now - stored.used),
-            )  # fmt: skip
+            session.restored, session.idle_since = True, time.monotonic() - max(0.0, now - stored.used)
+            self._living[stored.id] = session
         if kept:
             log.info("sessions are restored", extra={"sessions": len(kept)})
 
@@ -209,7 +211,7 @@ class Sessions:
             StorageFull, StorageFailure: the session cannot be saved.
         """
         names = options.sequences or []
-        if absent := set(names) - set(map_.attributes.sequence_codes(names)):
+        if absent := map_.unknown_sequences(names):
             raise UnknownSequence(f"The map has no sequence {min(absent)!r}.")
         if (begun := self._begun_before(map_, options)) is not None:
             return begun
@@ -217,37 +219,48 @@ class Sessions:
         now, longest = time.time(), self._settings.session_expiry
         expires_after = min(options.expires_after or longest, longest)
         session = Session(
-            f"s-{secrets.token_hex(8)}", map_.record.id, _creation_time(map_), options, expires_after, now, now,
+            f"s-{secrets.token_hex(8)}", map_.record.id, creation_time(map_), options, expires_after, now, now,
             run=Run(options.run_options(), graph),
         )  # fmt: skip
-        assert session.run is not None
+        self._keep(session)
+        session.begun_by = asking_now()
+        self._tell(session, "begun")
+        return session
+
+    def _keep(self, session: Session) -> None:
+        """Keep a new session, if there is room for it."""
         with self._lock:
             self._sweep()
             if len(self._living) >= self._settings.max_sessions:
                 raise TooManySessions(f"There are {len(self._living)} sessions already; delete one that is over.")
-            graphs = {id(one.run.graph): one.run.graph.bytes for one in self._living.values() if one.run}
-            graphs[id(graph)] = graph.bytes
-            held = sum(graphs.values()) + sum(one.run.bytes for one in self._living.values() if one.run)
-            if held + session.run.bytes > self._settings.max_session_memory:
-                raise TooManySessions(
-                    f"The sessions would hold {(held + session.run.bytes) >> 20} MiB, more than they are allowed to; "
-                    "delete one that is over."
-                )
-            self._living[session.id] = session
+            self._hold(session)
         try:
             with disk_errors("keep a session"):
-                self._store.write(_stored(session))
+                self._store.write(stored_of(session))
         except BaseException:
             with self._lock:
                 self._living.pop(session.id, None)
             raise
-        session.begun_by = _asking()
-        self._tell(session, "begun")
-        return session
+
+    def _hold(self, session: Session) -> None:
+        """Hold a new session in memory; the caller holds the lock.
+
+        Raises:
+            TooManySessions: it would need too much memory.
+        """
+        assert session.run is not None
+        runs = [one.run for one in (*self._living.values(), session) if one.run]
+        graphs = {id(run.graph): run.graph.bytes for run in runs}
+        held = sum(graphs.values()) + sum(run.bytes for run in runs)
+        if held > self._settings.max_session_memory:
+            raise TooManySessions(
+                f"The sessions would hold {held >> 20} MiB, more than they are allowed to; delete one that is over."
+            )
+        self._living[session.id] = session
 
     def _begun_before(self, map_: Map, options: NewSession) -> Session | None:
         """The session without a frame that this request has begun a moment ago; None if it comes for the first time."""
-        asking, oldest = _asking(), time.monotonic() - REPEATED_SECONDS
+        asking, oldest = asking_now(), time.monotonic() - REPEATED_SECONDS
         if asking is None:
             return None
         with self._lock:
@@ -255,7 +268,7 @@ class Sessions:
             for one in self._living.values():
                 same = one.begun_by == asking and one.idle_since >= oldest and one.options == options
                 unused = one.number is None and one.answer is None and not one.waiting and not one.streaming
-                if same and unused and (one.map_id, one.map_created_at) == (map_.record.id, _creation_time(map_)):
+                if same and unused and (one.map_id, one.map_created_at) == (map_.record.id, creation_time(map_)):
                     return one
         return None
 
@@ -272,7 +285,7 @@ class Sessions:
             if (
                 session is not None
                 and session.map_id == map_.record.id
-                and session.map_created_at != _creation_time(map_)
+                and session.map_created_at != creation_time(map_)
             ):
                 self._end(session, MAP_GONE)
                 session = None
@@ -288,7 +301,7 @@ class Sessions:
         with self._lock:
             self._sweep()
             found = [one for one in self._living.values() if one.map_id == map_.record.id]
-        return sorted((one for one in found if one.map_created_at == _creation_time(map_)), key=lambda one: one.id)
+        return sorted((one for one in found if one.map_created_at == creation_time(map_)), key=lambda one: one.id)
 
     def count(self) -> int:
         """The number of sessions of all maps that have not ended."""
@@ -348,7 +361,7 @@ class Sessions:
     def graph(self, map_: Map, selection: Selection | None) -> PlaceGraph:
         """The graph of the places that a session is about; while the map changes it may be slightly out of date."""
         names = selection.filters.sequences or () if selection else ()
-        key = (map_.record.id, _creation_time(map_), names)
+        key = (map_.record.id, creation_time(map_), names)
         neighborhood = neighborhood_of(map_)
         with self._graph_lock:
             snapshot, known, now = map_.snapshot(), self._graphs.get(key), time.monotonic()
@@ -356,8 +369,7 @@ class Sessions:
                 return known.graph
             scope = map_.scope(selection)
             snapshot = scope.snapshot
-            living = snapshot.alive if scope.allowed is None else snapshot.alive & scope.allowed
-            graph = place_graph(snapshot.whereabouts, np.flatnonzero(living), snapshot.rows, neighborhood)
+            graph = place_graph(snapshot.whereabouts, scope.living_rows(), snapshot.rows, neighborhood)
             done = time.monotonic()
             self._graphs[key] = _CachedGraph(snapshot, graph, done, done - now)
             if len(self._graphs) > self._settings.max_sessions:  # some are of refused or ended sessions
@@ -384,15 +396,18 @@ class Sessions:
                 stored = self._store.read(session.id)
                 state = None if stored is None or stored.state is None else from_bytes(stored.state)
             except (sqlite3.Error, DamagedRecord) as error:
-                log.error("session %s cannot be restored: %s", session.id, error)
-                with self._lock:
-                    self._end(session, STATE_LOST)
-                raise SessionExpired(f"The session {session.id} is over. {STATE_LOST} Begin a new one.") from error
-            options = session.options.run_options()
-            session.run = Run(options, graph) if state is None else Run.restored(options, graph, state)
+                raise self._damaged(session, error) from error
+            session.run = restored_run(session, graph, state)
             session.answer = None if stored is None else stored.answer
         session.run.place_on(graph)
         return session.run
+
+    def _damaged(self, session: Session, error: Exception) -> SessionExpired:
+        """End a session whose saved belief cannot be read; the error of its next frame."""
+        log.error("session %s cannot be restored: %s", session.id, error)
+        with self._lock:
+            self._end(session, STATE_LOST)
+        return SessionExpired(f"The session {session.id} is over. {STATE_LOST} Begin a new one.")
 
     def frames_of(self, session: Session) -> int:
         """How many frames a session has processed; 0 if that cannot be read.  The session is not restored for this."""
@@ -405,10 +420,14 @@ class Sessions:
             return 0
 
     def save(self, session: Session) -> bool:
-        """Save a session; returns whether it was saved: not if the disk refuses, or if the session has ended."""
+        """Save a session; returns whether it was saved: not if the disk refuses, or if the session has ended.
+
+        Raises:
+            SessionMoved: another service has saved a frame of it in the meantime; the session is read again.
+        """
         try:
             # The lock is not held: writing to disk takes a while, and other sessions need the lock.
-            return self._store.renew(_stored(session))
+            return self._store.renew(stored_of(session), session.revision)
         except sqlite3.Error as error:
             log.warning("session %s is not saved: %s", session.id, error)
             return False
@@ -419,17 +438,34 @@ def alive_rows(map_: Map) -> NDArray[np.bool_]:
     return map_.snapshot().alive
 
 
-def _creation_time(map_: Map) -> str:
+def creation_time(map_: Map) -> str:
     return map_.record.created_at.isoformat()
 
 
-def _asking() -> tuple[str, str | None, str | None] | None:
+def asking_now() -> tuple[str, str | None, str | None] | None:
     """Who asks now, and the id of the request; None if nothing tells one request from another."""
     asker = ASKER.get()
     return None if asker.request_id is None else (asker.principal, asker.key, asker.request_id)
 
 
-def _stored(session: Session) -> StoredSession:
+def session_of(stored: StoredSession) -> Session:
+    """A session without its run; raises ValueError, KeyError or TypeError if its record is damaged."""
+    content = json.loads(stored.options)
+    expires_after = float(content.pop("expires_after"))
+    options = NewSession.model_validate(content)
+    return Session(
+        stored.id, stored.map, stored.map_created_at, options, expires_after, stored.created, stored.used,
+        stored.number, stored.moment, stored.request, stored.lost,
+    )  # fmt: skip
+
+
+def restored_run(session: Session, graph: PlaceGraph, state: RunState | None) -> Run:
+    """A session's run as it was saved; a new one for None."""
+    options = session.options.run_options()
+    return Run(options, graph) if state is None else Run.restored(options, graph, state)
+
+
+def stored_of(session: Session) -> StoredSession:
     options = {**session.options.model_dump(mode="json"), "expires_after": session.expires_after}
     state: RunState | None = None if session.run is None else session.run.state()
     return StoredSession(

@@ -10,6 +10,7 @@ import threading
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from core.disk.files import disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile
@@ -69,6 +70,21 @@ HEAD = COLUMNS[:-2]
 """The columns that are read at the start; the others are read when a session goes on."""
 
 
+class SessionRecords(Protocol):
+    """What keeps sessions.
+
+    A write is durable when it returns.  Every method but ``close`` may raise an error if the disk or server refuses.
+    """
+
+    def all(self) -> list[StoredSession]: ...
+    def read(self, session_id: str) -> StoredSession | None: ...
+    def write(self, session: StoredSession) -> None: ...
+    def renew(self, session: StoredSession, revision: int) -> bool: ...
+    def end(self, session_id: str, reason: str, moment: float) -> None: ...
+    def forget(self, session_id: str) -> None: ...
+    def close(self) -> None: ...
+
+
 class SessionStore:
     """The file of the sessions.  Thread-safe.
 
@@ -114,8 +130,12 @@ class SessionStore:
         with self._lock:
             self._connection.execute(f"INSERT OR REPLACE INTO sessions VALUES ({marks})", values)
 
-    def renew(self, session: StoredSession) -> bool:
-        """Write a changed session; returns False, and writes nothing, if it was deleted or has ended."""
+    def renew(self, session: StoredSession, revision: int = 0) -> bool:
+        """Write a changed session; returns False, and writes nothing, if it was deleted or has ended.
+
+        Args:
+            revision: of the record that is changed.  Nobody else writes to this file, so it is not looked at.
+        """
         assignments = ", ".join(f"{name} = ?" for name in COLUMNS)
         values = [getattr(session, name) for name in COLUMNS]
         with self._lock, closing(self._connection.cursor()) as cursor:

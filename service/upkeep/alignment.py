@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from core.errors import UnknownSequence
 from core.judgement.alignment import LARGEST_STEP, LEAST_FRAMES, shared_stretches
+from core.maps import Correspondence, Map, Snapshot
 from core.maps.records import Outline
 from core.places import NO_POSE
-from core.storage import Map, Snapshot
-from core.storage.counterparts import Correspondence
 from core.upkeep.correspondence import common_stations, handed_over, on_its_own
 from service.engine.engine import Engine
 from service.errors.faults import InvalidRequest, TooFewFrames
@@ -124,12 +123,14 @@ class Traverses:
     """The traverses of a map at one moment, with at least one frame each.
 
     snapshot: what is searched at that moment.
+    whereabouts: of its rows.
     places: the places by their rows.
     """
 
     def __init__(self, map_: Map) -> None:
         outline = map_.transfer.outline()
         self.snapshot = map_.snapshot()
+        self.whereabouts = self.snapshot.whereabouts  # of now: some stores read them only when they are asked for
         # A place that is being stored at this moment is listed before its row is in a snapshot.
         self.places = {place.row: place for place in outline if place.row < self.snapshot.rows}
         self._members: dict[str, list[Outline]] = {}
@@ -222,7 +223,7 @@ def _change(
         forget: whether all that is stored of its counterparts is forgotten.
     """
     then, snapshot = traverses.snapshot, map_.snapshot()
-    before = then.whereabouts
+    before = traverses.whereabouts
     still = snapshot.alive[: then.rows].copy()
     for name in ("sequence", "ordinal"):
         still &= getattr(snapshot.whereabouts, name)[: then.rows] == getattr(before, name)

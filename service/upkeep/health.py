@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from core.maps import Map
 from core.method.encoder import Encoder
 from core.recognition.self_queries import TOGETHER, SelfQueries, spread_order
-from core.storage import Map
 from core.upkeep import coverage, hubness
 from core.upkeep.coverage import Gap, Measure
 from core.upkeep.drift import Trend, score_trend, unknown_trend

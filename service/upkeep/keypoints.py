@@ -16,8 +16,8 @@ from core.frames.images import ANY_SIZE, decode
 from core.frames.masks import Mask
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
+from core.maps import KeptFrame, Map
 from core.networks.xfeat import packaged_xfeat
-from core.storage import KeptFrame, Map
 from service.engine.engine import Engine
 from service.jobs.context import JobContext, yield_to_requests
 

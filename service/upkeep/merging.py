@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from core.errors import InvalidIdentifier, PlacerecError, StorageFailure, UnknownCamera, UnknownMap, WrongEncoder
+from core.maps import Enrolment, History, Map, Snapshot
 from core.maps.records import Outline
 from core.method.encoder import Encoding
 from core.method.regions import Regions
 from core.places import PlaceFields, check_place_id
 from core.recognition.recognition import locate
 from core.recognition.self_queries import TOGETHER, spread_order
-from core.storage import Enrolment, History, Map, Snapshot
 from service.engine.engine import Engine
 from service.errors.faults import MergeConflict
 from service.jobs.context import JobContext, JobInterrupted, yield_to_requests

@@ -18,8 +18,8 @@ from starlette.responses import JSONResponse, Response
 
 from core import errors
 from core.judgement.alignment import SharedStretch
+from core.maps import Map
 from core.method.encoder import Encoder
-from core.storage import Map
 from core.upkeep.similarity import NONE, GreyScale, Rows, counterparts, nearest_by_pose, score_pairs, stretches_of
 from service.errors.faults import EncoderNotInstalled, TooManyPairs
 from service.errors.problems import problem_documentation

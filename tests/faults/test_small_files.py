@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from core.errors import ArchiveTooNew, DataDirectoryTooNew, InvalidArchive, StorageFailure, StorageFull
+from core.maps.archives.reading import Archive, check
 from core.storage import Atlas
-from core.storage.archives.reading import Archive, check
 from service.access.keys import KeyStore
 from service.errors.faults import KeysUnreadable
 from service.jobs.records import Job, JobRecords

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import httpx
 import pytest
@@ -48,15 +49,37 @@ STRICT: dict[str, object] = {
 }
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--store",
+        choices=("embedded", "milvus"),
+        default="embedded",
+        help="where the server of most tests keeps its maps; milvus starts a PostgreSQL and a Milvus",
+    )
+
+
+@contextmanager
+def store_settings(kind: str) -> Iterator[dict[str, object]]:
+    """The settings of a store, whose servers run as long as the block."""
+    if kind == "embedded":
+        yield {}
+        return
+    from tests.core.milvus.servers import running_servers  # needs what speaks to them
+
+    with running_servers() as servers:
+        yield {"store": kind, "milvus": servers.milvus_address, "postgres": servers.postgres_address}
+
+
 @pytest.fixture(scope="session")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """The service with its default settings."""
+def server(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Config) -> Iterator[Server]:
+    """The service with its default settings, but for the store."""
     folder = tmp_path_factory.mktemp("server")
     install_coarse_encoder(folder / "models")
     install_two_stage_encoder(folder / "models")
-    running = Server(folder).wait()
-    yield running
-    assert running.stop() == 0
+    with store_settings(pytestconfig.getoption("--store", "embedded")) as settings:
+        running = Server(folder, settings).wait()
+        yield running
+        assert running.stop() == 0
 
 
 @pytest.fixture(scope="session")

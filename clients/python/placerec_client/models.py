@@ -112,7 +112,7 @@ class AuditPage(Model):
 
     items: list[AuditEntry]
     next_cursor: str | None = None
-    source: Known[Literal["file", "memory"]]
+    source: Known[Literal["database", "file", "memory"]]
 
 
 class Problem(Model, extra="allow"):

@@ -1,6 +1,5 @@
-"""Exporting a map as one portable file, and importing such a file, of which everything is checked.
+"""The file of a map in a data directory (:mod:`core.maps.archives`).
 
-manifest, tar_layout, lines     what the file holds, and where each part lies in it
-exporter                        writing the file of a map, as it is at one moment
-reading, building               reading and checking a file; making the folder of a new map from it
+stored_lines, exporter      writing the file of a map, as it is at one moment
+building                    making the folder of a new map from a file, of which everything is checked
 """

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from core.index import Coder, Codes
+from core.maps.status import Recall
 from core.storage.database.ledger import SegmentEntry
 from core.storage.files.array_files import StaleArrays, check_arrays, read_arrays, write_arrays
 from core.storage.files.segment_files import Layout
-from core.storage.search.tiers import Recall
 
 GROUP_ROWS = 4096
 """About so many rows have their codes in one file: some 9 MB with the default encoder."""

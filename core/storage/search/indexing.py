@@ -22,6 +22,7 @@ from core.errors import MapQuarantined, UnknownMap
 from core.index import CodeTable
 from core.index.flat import flat_index, vectors
 from core.maps.records import TierSetting
+from core.maps.status import IndexStatus, Recall, Tier
 from core.storage.database.ledger import SegmentEntry
 from core.storage.files.array_files import StaleArrays
 from core.storage.search.index_files import IndexFiles
@@ -29,7 +30,7 @@ from core.storage.search.rebuilding import codes_of, extended, rebuilt
 from core.storage.search.recall import measure_recall
 from core.storage.search.segment import Held
 from core.storage.search.snapshot import Snapshot, threads
-from core.storage.search.tiers import IndexStatus, Recall, Tier, holds_for, tier_for
+from core.storage.search.tiers import holds_for, tier_for
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from core.maps.status import Recall
 from core.storage.search.snapshot import SHORTLIST, Snapshot
-from core.storage.search.tiers import Recall
 
 QUERIES = 128
 OWN_SHARE = 1 / 3

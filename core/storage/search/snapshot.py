@@ -405,6 +405,11 @@ class SearchScope:
         """The log prior of rows, float64 [n]; None if there is no prior."""
         return None if self.weights is None else self.weights[rows]
 
+    def living_rows(self) -> NDArray[np.int64]:
+        """The rows of the places of the scope, int64 [n], ascending."""
+        alive = self.snapshot.alive
+        return np.flatnonzero(alive if self.allowed is None else alive & self.allowed)
+
 
 def _best(rows: NDArray[np.int64], products: NDArray[np.float32], count: int) -> Ranking:
     """The at most ``count`` rows with the largest products, ascending by row."""

@@ -209,7 +209,7 @@ def _rename(downloaded: Path, file: Path) -> None:
 
 
 def _manifest_of(file: Path) -> Any:
-    from core.storage.archives.reading import Archive
+    from core.maps.archives.reading import Archive
 
     with Archive(file) as archive:
         return archive.manifest

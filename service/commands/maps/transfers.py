@@ -11,7 +11,7 @@ from service.commands.connection.client import Service, failures
 from service.commands.console import Failure, progress
 
 if TYPE_CHECKING:
-    from core.storage.archives.reading import Archive
+    from core.maps.archives.reading import Archive
 
 PATIENCE = 3600.0
 """Seconds for which the request for a piece is repeated while the service is overloaded, restarts or writes the file of
@@ -31,7 +31,7 @@ def check_file(path: Path, expected: str | None = None) -> Archive:
         Failure: the file cannot be read, is damaged, or is another file than expected.
     """
     from core.errors import PlacerecError
-    from core.storage.archives.reading import Archive, check
+    from core.maps.archives.reading import Archive, check
 
     try:
         with Archive(path) as archive:

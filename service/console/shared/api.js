@@ -288,12 +288,12 @@ export function save(blob, name) {
 /** Follow server-sent events until the signal is aborted; a lost stream is taken up where it ended.
  *
  * onEvent gets the event's name and its data; onState gets true while the stream is open.  A problem ends it.
+ * heard: its `last` is the id of the last event that was heard, after which a stream that is given it goes on.
  */
-export async function follow(path, { query, onEvent, onState = () => {}, signal: abort, endless = true }) {
-  let last = null;
+export async function follow(path, { query, onEvent, onState = () => {}, signal: abort, endless = true, heard = { last: null } }) {
   for (let wait = 500; !abort.aborted; wait = Math.min(wait * 2, 8000)) {
     try {
-      const headers = withKey(last === null ? {} : { "Last-Event-ID": last });
+      const headers = withKey(heard.last === null ? {} : { "Last-Event-ID": heard.last });
       const options = { headers, signal: abort, cache: "no-store", credentials: "omit" };
       const answer = await fetch(address(path, query), options);
       if (answer.status === 204) return;
@@ -301,7 +301,8 @@ export async function follow(path, { query, onEvent, onState = () => {}, signal:
       onState(true);
       wait = 500;
       for await (const event of eventsOf(answer.body)) {
-        if (event.id !== null) last = event.id;
+        if (abort.aborted) return;
+        if (event.id !== null) heard.last = event.id;
         onEvent(event.name, JSON.parse(event.data));
       }
       if (!endless) return;

@@ -50,6 +50,11 @@ export function Moment({ at }) {
   return html`<time datetime=${at} title=${exact(at)}>${relative(at, Math.max(now.value, Date.now()))}</time>`;
 }
 
+/** The same with the exact moment beside it, where there is room. */
+export function ExactMoment({ at }) {
+  return html`<${Moment} at=${at} />${at && html` <span class="faint small">${exact(at)}</span>`}`;
+}
+
 const SIGNS = { recognized: "●", ambiguous: "◐", unknown: "○" };
 
 export function Verdict({ verdict }) {

@@ -81,7 +81,7 @@ function drawLines(canvas, data, layers, [row, column]) {
     for (const { query, reference } of data.stretches) {
       context.beginPath();
       query.forEach((one, place) => context.lineTo(...at(one, reference[place])));
-      context.stroke();
+      edged(context, () => context.stroke());
     }
   }
   if (layers.includes("truth") && data.truth) drawColumns(context, data.truth, at, colour("recognized"));
@@ -100,12 +100,25 @@ function drawLines(canvas, data, layers, [row, column]) {
   context.strokeRect(x - 5 * devicePixelRatio, y - 5 * devicePixelRatio, 10 * devicePixelRatio, 10 * devicePixelRatio);
 }
 
+/** Draw a line with an edge, by which it is seen on any shade. */
+function edged(context, draw) {
+  const { lineWidth, strokeStyle } = context;
+  [context.lineWidth, context.strokeStyle] = [2 * lineWidth, colour("surface")];
+  draw();
+  [context.lineWidth, context.strokeStyle] = [lineWidth, strokeStyle];
+  draw();
+}
+
 function drawColumns(context, columns, at, tint) {
-  context.fillStyle = tint;
-  const half = (columns.length > 300 ? 1 : 2.5) * devicePixelRatio;
-  columns.forEach((column, row) => {
+  const few = columns.length <= 300;
+  const half = (few ? 2.5 : 1) * devicePixelRatio;
+  const squares = (size) => columns.forEach((column, row) => {
     if (column === null) return;
     const [x, y] = at(row, column);
-    context.fillRect(x - half, y - half, 2 * half, 2 * half);
+    context.fillRect(x - size, y - size, 2 * size, 2 * size);
   });
+  context.fillStyle = colour("surface");
+  if (few) squares(half + devicePixelRatio);
+  context.fillStyle = tint;
+  squares(half);
 }

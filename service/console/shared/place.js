@@ -1,6 +1,6 @@
 // One place, large: what is kept of it, its neighbours, and what matched it lately.
 import { get, may, patch, remove } from "./api.js";
-import { ByName, Facts, Field, FormDialog, Head, Moment, say, Verdict } from "./elements.js";
+import { ByName, ExactMoment, Facts, Field, FormDialog, Head, Moment, say, Verdict } from "./elements.js";
 import { decimal, integer, metres, milliseconds, percent, poseText } from "./formats.js";
 import { mapPath } from "./map_path.js";
 import { Thumbnail } from "./pictures.js";
@@ -45,12 +45,12 @@ function About({ map, place }) {
         ["Pose", poseText(place.pose)],
         place.pose_of && ["Pose from", html`<a href=${href("maps", map, "places", place.pose_of)}>${place.pose_of}</a>`],
         ["Traverse", place.sequence ? html`<a href=${href("maps", map, "places", { sequence: place.sequence })}>${place.sequence}</a>` : "–"],
-        ["Taken", html`<${Moment} at=${place.timestamp} />`],
+        ["Taken", html`<${ExactMoment} at=${place.timestamp} />`],
         ["Camera", place.camera || "–"],
         ["Regions", integer(place.regions)],
         ["Picture", place.picture],
-        ["Enrolled", html`<${Moment} at=${place.created_at} />`],
-        ["Changed", html`<${Moment} at=${place.updated_at} />`],
+        ["Enrolled", html`<${ExactMoment} at=${place.created_at} />`],
+        ["Changed", html`<${ExactMoment} at=${place.updated_at} />`],
       ]}
     />
     <h2>Metadata</h2>

@@ -294,9 +294,11 @@ export class PlanCanvas {
     context.strokeStyle = tints.surface;
     context.lineWidth = 4;
     context.lineJoin = "round";
-    context.strokeText(robot.label, px + 12, py - 8);
+    const room = this.width - px - 16 - context.measureText(robot.label).width;
+    const beside = px > this.width || room > 0 ? [px + 12, py - 8] : [px + 12 + room, py - 18];
+    context.strokeText(robot.label, ...beside);
     context.fillStyle = tints.text;
-    context.fillText(robot.label, px + 12, py - 8);
+    context.fillText(robot.label, ...beside);
   }
 
   // Hands

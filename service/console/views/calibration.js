@@ -1,7 +1,7 @@
 // When answers are believed: how probable they really are, what a threshold costs, and another one to try and apply.
 import { getTagged, get, may, patch, post } from "../shared/api.js";
 import { Chart } from "../shared/chart.js";
-import { Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
+import { ByName, Facts, Field, FormDialog, Head, Moment, Nothing, Pill, say, Trouble } from "../shared/elements.js";
 import { decimal, integer, percent } from "../shared/formats.js";
 import { JobProgress } from "../shared/jobs.js";
 import { mapPath } from "../shared/map_path.js";
@@ -12,7 +12,10 @@ export default function Calibration({ map }) {
   const state = useResource((signal) => getTagged(mapPath(map, "calibration"), {}, signal), [map]);
   const [dialog, setDialog] = useState(null);
   const [job, setJob] = useState(null);
-  const calibrate = () => setDialog(html`<${Order} map=${map} tag=${state.data?.tag} started=${setJob} close=${() => setDialog(null)} />`);
+  const close = () => setDialog(null);
+  const own = state.data !== undefined && !ofEncoder(state.data.data.calibration);
+  const calibrate = () => setDialog(html`<${Order} map=${map} own=${own} tag=${state.data?.tag} started=${setJob} close=${close} />`);
+  const giveUp = () => setDialog(html`<${GiveUp} map=${map} tag=${state.data.tag} changed=${state.reload} close=${close} />`);
   const ended = (told) => {
     if (told.state === "succeeded") {
       say(told.result?.stored ? "The calibration was stored." : "The dry run is done.");
@@ -24,24 +27,42 @@ export default function Calibration({ map }) {
       ${may("admin") && html`<button type="button" class="primary" onClick=${calibrate}>Calibrate</button>`}
     <//>
     ${job && html`<section class="panel"><${JobProgress} key=${job.id} job=${job} onEnd=${ended} what=${job.arguments.dry_run ? "Dry run" : "Calibration"} /></section>`}
-    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} />`}<//>
+    <${Shown} resource=${state}>${({ data, tag }) => html`<${State} map=${map} data=${data} tag=${tag} changed=${state.reload} giveUp=${giveUp} />`}<//>
     ${dialog}
   `;
 }
 
-function State({ map, data, tag, changed }) {
+function ofEncoder(calibration) {
+  return calibration.source === "encoder-default";
+}
+
+function GiveUp({ map, tag, changed, close }) {
+  const send = async () => {
+    await patch(mapPath(map), { calibration: null }, tag);
+    say("The encoder's calibration is in force.");
+    changed();
+  };
+  return html`
+    <${ByName} title="Back to the encoder's calibration" name=${map} action="Give up its own" close=${close} send=${send}>
+      <p>The map's own threshold, margin and curve are forgotten. This cannot be undone, but the map can be calibrated again.</p>
+    <//>
+  `;
+}
+
+function State({ map, data, tag, changed, giveUp }) {
   const { calibration, measured } = data;
   return html`
     <div class="columns">
       <section class="panel">
         <h2>In force</h2>
         <${Facts} rows=${[
-          ["Source", html`<${Pill} tone=${calibration.source === "encoder-default" ? "" : "good"}>${calibration.source}<//>`],
+          ["Source", html`<${Pill} tone=${ofEncoder(calibration) ? "" : "good"}>${calibration.source}<//>`],
           ["Threshold", decimal(calibration.threshold, 4)],
           ["Margin", decimal(calibration.margin, 4)],
           calibration.frames && ["Frames it rests on", integer(calibration.frames)],
           ["Probabilities", calibration.curve ? "by its curve" : "none: it has no curve"],
         ]} />
+        ${may("admin") && !ofEncoder(calibration) && html`<div class="row"><button type="button" class="danger" onClick=${giveUp}>Back to the encoder's</button></div>`}
       </section>
       ${measured && html`<${Measured} measured=${measured} />`}
     </div>
@@ -98,7 +119,7 @@ function Threshold({ map, data, tag, changed }) {
   const apply = async () => {
     setError(null);
     const before = { threshold: calibration.threshold, margin: calibration.margin };
-    const fallback = calibration.source === "encoder-default" ? null : before;
+    const fallback = ofEncoder(calibration) ? null : before;
     try {
       await patch(mapPath(map), { calibration: { threshold, margin } }, tag);
       say("The threshold was applied.", () => patch(mapPath(map), { calibration: fallback }).then(changed, setError));
@@ -232,12 +253,14 @@ const BESIDE = {
   none: "nothing",
 };
 
-function Order({ map, tag, started, close }) {
+function Order({ map, own, tag, started, close }) {
   const sequences = useResource((signal) => get(mapPath(map, "sequences"), { limit: 1000 }, { signal }), [map]);
-  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true, beside: "encoder" });
+  const [fields, setFields] = useState({ method: "map", sequence: "", rule: "precision", value: 0.95, dry: true, beside: "encoder", typed: "" });
   const change = (changes) => setFields((old) => ({ ...old, ...changes }));
   const names = (sequences.data?.items || []).map((one) => one.name);
   const aimed = fields.method !== "labels" || fields.beside !== "encoder";
+  const replaces = own && !fields.dry;
+  const ready = (fields.method !== "sequence" || names.length > 1) && (!replaces || fields.typed === map);
   const order = async () => {
     const { method, sequence, rule, value, dry, beside } = fields;
     const target = rule === "mean_of_negatives" ? { rule } : { rule, value };
@@ -247,7 +270,7 @@ function Order({ map, tag, started, close }) {
     started(await post(mapPath(map, "calibrate"), body, { headers: tag && !dry ? { "If-Match": tag } : {} }));
   };
   return html`
-    <${FormDialog} title=${`Calibrate ${map}`} action=${fields.dry ? "Try it" : "Calibrate"} close=${close} send=${order} ready=${fields.method !== "sequence" || names.length > 1}>
+    <${FormDialog} title=${`Calibrate ${map}`} action=${fields.dry ? "Try it" : "Calibrate"} close=${close} send=${order} ready=${ready}>
       <${Field} label="Ask" hint=${HINTS[fields.method]}>
         <select value=${fields.method} onChange=${(event) => change({ method: event.target.value })}>
           ${Object.entries(METHODS).map(([id, text]) => html`<option value=${id}>${text}</option>`)}
@@ -274,6 +297,11 @@ function Order({ map, tag, started, close }) {
         ${fields.rule !== "mean_of_negatives" && html`<${Field} label="Share"><input type="number" min="0.001" max="0.999" step="any" value=${fields.value} onInput=${(event) => change({ value: event.target.valueAsNumber })} /><//>`}
       </div>`}
       <label class="field check"><input type="checkbox" checked=${fields.dry} onChange=${() => change({ dry: !fields.dry })} /><span>Dry run: only measure, store nothing</span></label>
+      ${replaces && html`
+        <${Field} label=${html`Type <code>${map}</code> to replace the calibration that it has of its own`}>
+          <input value=${fields.typed} onInput=${(event) => change({ typed: event.target.value })} autocomplete="off" spellcheck=${false} />
+        <//>
+      `}
     <//>
   `;
 }

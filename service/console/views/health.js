@@ -104,7 +104,7 @@ function Hubs({ map, items, unit }) {
 function Aliases({ map, items }) {
   if (items.length === 0) return html`<p>None.</p>`;
   return html`
-    <ul class="stack">
+    <ul class="aliases">
       ${items.slice(0, 6).map((one) => html`
         <li class="alias">
           <a href=${href("maps", map, "places", one.place)}><${Thumbnail} map=${map} place=${one.place} /><span class="small">${one.place}</span></a>

@@ -1,6 +1,6 @@
 // The queries of a map as they are answered: verdict, probability, who asked, and why.
-import { epoch, follow, get, may } from "../shared/api.js";
-import { Bar, Dialog, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
+import { epoch, follow, get, key, may } from "../shared/api.js";
+import { Bar, Dialog, ExactMoment, Facts, Field, Head, Moment, Nothing, Pill, Trouble, Verdict } from "../shared/elements.js";
 import { decimal, integer, metres, percent, poseText } from "../shared/formats.js";
 import { blobOf, handedOver } from "../shared/frames.js";
 import { mapPath } from "../shared/map_path.js";
@@ -38,30 +38,34 @@ export default function Live({ map }) {
       ${allowed && html`<label class="row"><input type="checkbox" checked=${pictures} onChange=${() => setPictures(!pictures)} /> frames as thumbnails</label>`}
     </div>
     ${stream.error && html`<${Trouble} error=${stream.error} again=${stream.again} />`}
-    ${stream.missed > 0 && html`<p class="notice">${integer(stream.missed)} events came faster than they could be sent, and are missing here.</p>`}
     ${shown.length === 0
       ? html`<${Nothing} title="Nothing was asked yet">Answers appear here as robots, cameras and this console ask.<//>`
       : html`
         <ol class="stream" aria-label="Answers">
-          ${shown.map((one) => html`<${Line} key=${one.number} map=${map} event=${one} open=${setOpen} />`)}
+          ${shown.map((one) => (one.missed === undefined ? html`<${Line} key=${one.number} map=${map} event=${one} open=${setOpen} />` : html`<${Gap} key=${one.number} missed=${one.missed} />`))}
         </ol>
       `}
     ${open && html`<${Details} map=${map} event=${open} close=${() => setOpen(null)} />`}
   `;
 }
 
-function matches({ key, camera, place, best, session, operation }, text) {
+function matches({ key, camera, place, best, session, operation, missed }, text) {
   const wanted = text.trim().toLowerCase();
-  return !wanted || [key, camera, place, best, session, operation].some((one) => one?.toLowerCase().includes(wanted));
+  return !wanted || missed !== undefined || [key, camera, place, best, session, operation].some((one) => one?.toLowerCase().includes(wanted));
 }
 
-/** The events of a map, the newest first; while it is paused they are held back. */
+/** The answers of a map, the newest first; while it is paused they are held back.
+ *
+ * After a lost connection, and with other verdicts, it goes on after the last event that was heard.  Where some are lost
+ * an item says so: `missed` is how many, or null.
+ */
 function useStream(map, { wanted, pictures, paused }) {
-  const [state, setState] = useState({ items: [], open: false, missed: 0, error: null, held: 0 });
+  const [state, setState] = useState({ items: [], open: false, error: null, held: 0 });
   const [attempt, setAttempt] = useState(0);
   const held = useRef([]);
   const stopped = useRef(paused);
   const number = useRef(0);
+  const heard = useRef({});
   stopped.current = paused;
   const change = (changes) => setState((old) => ({ ...old, ...(typeof changes === "function" ? changes(old) : changes) }));
   useEffect(() => {
@@ -72,9 +76,8 @@ function useStream(map, { wanted, pictures, paused }) {
   useEffect(() => {
     const controller = new AbortController();
     const onEvent = (name, event) => {
-      if (name === "missed") return change((old) => ({ missed: old.missed + (event.count || 1) }));
-      if (name !== "query") return undefined;
-      const one = { ...event, number: (number.current += 1) };
+      if (name !== "query" && name !== "missed") return undefined;
+      const one = { ...(name === "missed" ? { missed: event.count } : event), number: (number.current += 1) };
       if (stopped.current) {
         held.current = [one, ...held.current].slice(0, MOST);
         return change({ held: held.current.length });
@@ -83,17 +86,27 @@ function useStream(map, { wanted, pictures, paused }) {
     };
     const query = { kinds: "query", pictures: pictures ? "true" : "" };
     if (wanted.length < VERDICTS.length) query.verdicts = wanted.join(",");
+    if (heard.current.map !== map || heard.current.key !== key.value) heard.current = { map, key: key.value, last: null };
     change({ error: null, open: false });
     if (wanted.length > 0) {
-      follow(mapPath(map, "events"), { query, onEvent, onState: (open) => change({ open }), signal: controller.signal }).catch((error) => change({ error, open: false }));
+      const options = { query, onEvent, onState: (open) => change({ open }), signal: controller.signal, heard: heard.current };
+      follow(mapPath(map, "events"), options).catch((error) => change({ error, open: false }));
     }
     return () => controller.abort();
   }, [map, wanted.join(), pictures, attempt, epoch.value]);
   const clear = () => {
     held.current = [];
-    change({ items: [], missed: 0, held: 0 });
+    change({ items: [], held: 0 });
   };
   return { ...state, clear, again: () => setAttempt((one) => one + 1) };
+}
+
+/** What stands between two answers where others may be missing. */
+function Gap({ missed }) {
+  const text = missed === null
+    ? "Answers may be missing here: the connection was lost for long, or the service was restarted."
+    : `${integer(missed)} events are missing here: they came while the connection was lost, or faster than they could be sent.`;
+  return html`<li class="missed">${text}</li>`;
 }
 
 function Line({ map, event, open }) {
@@ -129,6 +142,7 @@ function Details({ map, event, close }) {
       </div>
       <div class="columns">
         <${Facts} rows=${[
+          ["Asked", html`<${ExactMoment} at=${event.at} />`],
           ["Best match", best ? html`<a href=${href("maps", map, "places", best)}>${best}</a>` : "–"],
           ["Score", decimal(score)],
           ["Decision value", html`${decimal(decision)} <span class="faint">threshold ${decimal(threshold)}</span>`],

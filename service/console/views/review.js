@@ -1,6 +1,6 @@
 // Frames that the map was told to keep because their answers were in doubt: somebody says what they show.
 import { get, getTagged, may, patch, post, save } from "../shared/api.js";
-import { complain, Facts, Field, FormDialog, Head, Moment, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
+import { complain, ExactMoment, Facts, Field, FormDialog, Head, Moment, Nothing, Pager, Pill, say, Verdict } from "../shared/elements.js";
 import { bytes, counted, decimal, percent } from "../shared/formats.js";
 import { mapPath } from "../shared/map_path.js";
 import { Picture, Thumbnail } from "../shared/pictures.js";
@@ -165,13 +165,13 @@ function Labelling({ map, frame, label, discard }) {
         <button type="button" class="danger" disabled=${busy} onClick=${() => discard(frame)}>Throw away</button>
       </div>
       <${Facts} rows=${[
-        ["Asked", html`<${Moment} at=${frame.at} />`],
+        ["Asked", html`<${ExactMoment} at=${frame.at} />`],
         answer.key && ["By", answer.key],
         ["Decision value", html`${decimal(answer.decision)} <span class="faint">threshold ${decimal(answer.threshold)}</span>`],
         answer.reason && ["Reason", answer.reason],
         answer.camera && ["Camera", answer.camera],
         answer.session && ["Session", answer.session],
-        frame.labelled_at && ["Labelled", html`<${Moment} at=${frame.labelled_at} /> ${frame.labelled_by && `by ${frame.labelled_by}`}`],
+        frame.labelled_at && ["Labelled", html`<${ExactMoment} at=${frame.labelled_at} /> ${frame.labelled_by && `by ${frame.labelled_by}`}`],
         ["Request", html`<code>${answer.request_id}</code>`],
       ]} />
       ${dialog}

@@ -80,7 +80,7 @@ function Latencies({ operations }) {
         <tbody>
           ${operations.map((one) => html`
             <tr>
-              <td class="long small">${one.method} <code>${one.path}</code></td>
+              <td class="long small">${one.method} <code>${one.path.split(/(?=\/)/).map((part) => html`${part}<wbr />`)}</code></td>
               <td class="number">${integer(one.count)}</td>
               <td class="number">${one.errors ? html`<span class=${one.path === "/readyz" ? "" : "pill bad"}>${integer(one.errors)}</span>` : "0"}</td>
               <td class="number">${milliseconds(one.p50)}</td><td class="number">${milliseconds(one.p90)}</td><td class="number">${milliseconds(one.p99)}</td><td class="number">${milliseconds(one.max)}</td>

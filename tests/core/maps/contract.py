@@ -6,7 +6,12 @@ A suite of one store derives a class from :class:`StoreContract` that says how t
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -15,13 +20,15 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from core import errors
+from core.frames.masks import Mask
 from core.judgement.priors import Disc, Period
-from core.maps import Map, PlaceFilter, SameFrame, Selection, Store
+from core.maps import Correspondence, History, Map, PlaceFilter, ReviewSetting, SameFrame, Selection, Store
+from core.maps.archives.reading import Archive, check
 from core.maps.selection import Conditions, RecentFrames
-from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, microseconds
+from core.places import NO_TIME, Neighborhood, PlaceFields, Pose, Whereabouts, microseconds
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of
 from tests.durability.contents import sha
-from tests.durability.model import MapModel, PlaceModel, Refused, changed, differences
+from tests.durability.model import GONE, MapModel, PlaceModel, Refused, changed, differences
 from tests.durability.storage.operations import DEFAULTS, enrolment, shown
 
 MAP = "lab"
@@ -190,6 +197,118 @@ class StoreContract(RuleBasedStateMachine):
 
         self.agree(edited, lambda lab: lab.edit({"description": text}, expected).revision)
 
+    @rule(place_id=ids, picture=pictures, given=fields, ordinal=st.none() | st.integers(0, 9))
+    def adopt(self, place_id: str, picture: str, given: dict[str, Any], ordinal: int | None) -> None:
+        """A place of another map keeps its history."""
+        of, moment = shown(picture), datetime(2026, 1, 2, tzinfo=UTC)
+        made = PlaceModel(of, given, "none", 0, created="2026-01-02T00:00:00Z", updated="2026-01-02T00:00:00Z",
+                          keypoints=of.keypoints)  # fmt: skip
+        item = enrolment(place_id, picture, given, True)
+        self.agree(
+            lambda model: model.adopt(place_id, made, ordinal),
+            lambda lab: lab.transfer.adopt([(item, History("none", ordinal, moment, moment))]),
+        )
+
+    @rule(chosen=st.lists(ids, max_size=3, unique=True), stale=st.booleans())
+    def forget_many(self, chosen: list[str], stale: bool) -> None:
+        digests = {name: self.map.digest(name) for name in chosen}
+        there = {name: b"?" * 32 if stale else digest for name, digest in digests.items() if digest is not None}
+
+        def forgotten(model: MapModel) -> int:
+            for name in () if stale else there:
+                model.forget(name)
+            return 0 if stale else len(there)
+
+        self.agree(forgotten, lambda lab: lab.transfer.forget(there))
+
+    @rule(limit=st.integers(1, 3))
+    def find_keypoints_later(self, limit: int) -> None:
+        found = [(one, enrolment("any", _picture_of(one.digest), {}, True).keypoints)
+                 for one in self.map.without_keypoints(0, limit)]  # fmt: skip
+        self.agree(
+            lambda model: model.fill_in(limit),
+            lambda lab: lab.add_keypoints([(one, keypoints) for one, keypoints in found if keypoints is not None]),
+        )
+
+    @rule(pair=st.tuples(ids, ids), hand_over=st.booleans(), paused=st.booleans())
+    def align(self, pair: tuple[str, str], hand_over: bool, paused: bool) -> None:
+        """One place is put to the station of another, and may get its pose."""
+        (one, other), places = pair, self.model.places
+        if one == other or one not in places or other not in places or places[other].station is None:
+            return
+        poses = [pair] if hand_over and places[other].fields.get("pose") is not None else []
+
+        def stored(lab: Map) -> None:
+            with lab.transfer.paused_writes() if paused else nullcontext():
+                first, second = lab.rows_of(pair)
+                assert first is not None and second is not None
+                where = lab.snapshot().whereabouts
+                at = int(where.track[second]), int(where.station[second])
+                lab.counterparts.store(Correspondence({first: at}, {first: second} if poses else {}))
+
+        self.agree(lambda model: model.store_counterparts([pair], poses), stored)
+
+    @rule(name=st.sampled_from(["front", "rear"]), covered=st.sampled_from([None, 0.5]))
+    def put_camera(self, name: str, covered: float | None) -> None:
+        mask = None if covered is None else Mask(polygons=(((0, 0), (covered, 0), (0, covered)),))
+
+        def put(model: MapModel) -> bool:
+            is_new = name not in model.cameras
+            model.cameras[name] = mask
+            return is_new
+
+        self.agree(put, lambda lab: lab.cameras.put(name, mask)[1])
+
+    @rule(name=st.sampled_from(["front", "rear"]))
+    def forget_camera(self, name: str) -> None:
+        def forgotten(model: MapModel) -> None:
+            if name not in model.cameras:
+                raise Refused("UnknownCamera")
+            del model.cameras[name]
+
+        self.agree(forgotten, lambda lab: lab.cameras.forget(name))
+
+    @rule(picture=pictures, most=st.integers(1, 3))
+    def keep_for_review(self, picture: str, most: int) -> None:
+        """The oldest frame without a label goes first; a label is found again."""
+        review, data = self.map.review, picture.encode()
+        numbers = [frame.number for frame in review.page(None, 10)]
+        known = next((frame for frame in review.page(None, 10) if frame.digest == sha256(data).digest()), None)
+        setting = ReviewSetting(most_frames=most)
+        assert review.keep(data, {"verdict": "unknown"}, setting) == (known is None)
+        review.shrink(setting)
+        kept = self.map.review.page(None, 10)
+        assert len(kept) == min(most, len(numbers) + (known is None))
+        unlabelled = [frame.number for frame in kept if frame.label is None]
+        assert unlabelled == sorted(unlabelled, reverse=True)
+        latest = kept[0]
+        assert review.label(latest.number, {"place": "p1"}).label == {"place": "p1"}
+        assert latest.number in [frame.number for frame in self.map.review.labelled()]
+        assert sha256(self.map.review.picture(latest.number)).digest() == latest.digest
+        assert review.size() == (len(kept), sum(frame.size for frame in kept))
+        if len(kept) == 3:
+            review.discard(latest.number)
+            with pytest.raises(errors.UnknownFrame):
+                self.map.review.find(latest.number)
+
+    @rule()
+    def copy_through_a_file(self) -> None:
+        """What is exported, imported and exported again is the same, to the last bit of each part."""
+        with TemporaryDirectory() as folder:
+            first, second = Path(folder) / "first.tar", Path(folder) / "second.tar"
+            self.map.exporter.write(first)
+            with Archive(first) as archive:
+                check(archive)
+                self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda: None)
+                with pytest.raises(errors.MapExists):
+                    self.store.import_map(archive, "copy", lambda *_: None, lambda _: None, 10**6, lambda: None)
+            copy = self.store.get("copy")
+            copy.exporter.write(second)
+            with Archive(first) as archive, Archive(second) as other:
+                assert other.manifest.parts == archive.manifest.parts
+                assert other.manifest.map == archive.manifest.map.model_copy(update={"id": "copy"})
+            self.store.delete("copy")
+
     @rule()
     def reopen(self) -> None:
         """What was acknowledged is there after a restart."""
@@ -259,6 +378,14 @@ class StoreContract(RuleBasedStateMachine):
         assert len(found) == len(expected["places"])
         assert not (wrong := differences(wanted, found)), "\n".join(wrong)
         self.model.told(found)
+        assert {camera.name: camera.mask for camera in lab.cameras.all()} == expected["cameras"]
+        ends = sorted(([name, end] for name, end in lab.transfer.sequence_ends().items()), key=str)
+        assert ends == expected["ends"]
+        names = sorted({place.sequence for place in self.model.places.values() if place.sequence is not None})
+        assert [(one.name, one.places) for one in lab.sequences(None, 10)[0]] == [
+            (name, sum(place.sequence == name for place in self.model.places.values())) for name in names
+        ]
+        assert lab.unknown_sequences([*NAMES, "never"]) == {*NAMES, "never"} - set(names)
 
     def _allowed(self, selection: Selection) -> list[str]:
         """The ids of the places that a query may find, by the model."""
@@ -295,6 +422,19 @@ def _holds(condition: Any, place: PlaceModel) -> bool:
     return bool(apart <= condition.radius + 1e-6)
 
 
+def _picture_of(digest: bytes) -> str:
+    """Which of the pictures has this digest."""
+    return next(f"picture {number}" for number in range(12) if shown(f"picture {number}").digest == digest.hex())
+
+
+def _track(where: Whereabouts, at: int, names: Mapping[int, str | None]) -> list[Any] | None:
+    """At which station of which track a place is, as the model has it; None for its own."""
+    track, station = int(where.track[at]), int(where.station[at])
+    if (track, station) == (int(where.sequence[at]), int(where.ordinal[at])):
+        return None
+    return [names.get(track) or GONE, station]
+
+
 def _places(lab: Map) -> list[dict[str, Any]]:
     """All places of a map, as the model has them."""
     outline, snapshot = lab.transfer.outline(), lab.snapshot()
@@ -307,6 +447,7 @@ def _places(lab: Map) -> list[dict[str, Any]]:
     assert np.flatnonzero(snapshot.alive).tolist() == sorted(rows.tolist()) and snapshot.rows > max(rows, default=-1)
     descriptors, local, where = snapshot.descriptors_at(rows), snapshot.locals_at(rows), snapshot.whereabouts_at(rows)
     keypoints = lab.keypoints_at(rows.tolist())
+    names = {int(where.sequence[at]): place.sequence for at, place in enumerate(outline)}
     for at, place in enumerate(listed):
         pose, moment = place.pose, place.timestamp
         assert where.timestamp[at] == (NO_TIME if moment is None else microseconds(moment))
@@ -318,6 +459,7 @@ def _places(lab: Map) -> list[dict[str, Any]]:
             **place.model_dump(mode="json"),
             "digest": outline[at].digest.hex(),
             "ordinal": int(where.ordinal[at]),
+            "track": _track(where, at, names),
             "kept": None if (picture := lab.picture(place.id)) is None else sha(picture),
             "keypoints": None if (of_frame := keypoints[at]) is None else sha(of_frame.record()),
             "descriptor": sha(descriptors[at].tobytes()),

@@ -9,6 +9,7 @@ PostgreSQL is that of the system (Debian: ``apt-get install postgresql``).  Milv
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
 import socket
@@ -16,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -26,9 +27,32 @@ from core.errors import StorageFailure
 from core.milvus.collection import Connection
 
 ROOT = Path(__file__).parents[3]
-MILVUS = ROOT / ".venv-cluster/bin/milvus-server"
-START_SECONDS = 120.0
+MILVUS_PYTHON = ROOT / ".venv-cluster/bin/python"
+START_SECONDS = 300.0
 NICENESS = 10
+
+MILVUS_SETTINGS = {"common.session.ttl": "10"}
+"""Other than Milvus's own.  After a SIGKILL it searches again when what it was has expired: in 15 s, not in 34."""
+
+# The system gives none of these to connections, so that a killed server gets its own ports again.
+_FIXED_PORTS = range(20_000, 32_000)
+_CONFIGURE = """
+import sys
+import milvus
+
+folder, ports, *settings = sys.argv[1:]
+server = milvus.default_server
+server.set_base_dir(folder)
+names = [name for name in server.config_keys if name.endswith("_port")]
+for name, port in zip(names, ports.split(",")):
+    server.config.set(name, int(port))
+server.config.set("proxy_port", int(ports.rpartition(",")[2]))
+for setting in settings:
+    server.config.set(*setting.split("=", 1))
+server.config.resolve()
+milvus._initialize_data_files(server.config.base_data_dir)
+"""
+"""Unpacks the server and writes its configuration: the package's own starter chooses other ports at each start."""
 
 
 class Missing(Exception):
@@ -55,11 +79,40 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
+_ETCD = """
+listen-client-urls: http://127.0.0.1:{client}
+advertise-client-urls: http://127.0.0.1:{client}
+listen-peer-urls: http://127.0.0.1:{peer}
+initial-advertise-peer-urls: http://127.0.0.1:{peer}
+initial-cluster: default=http://127.0.0.1:{peer}
+"""
+"""Without it, two Milvus on one machine would want the same port."""
+
+
+def fixed_ports(count: int) -> list[int]:
+    """Ports that nobody listens at, and of which the system makes no use."""
+    found: list[int] = []
+    while len(found) < count:
+        port = random.choice(_FIXED_PORTS)
+        with socket.socket() as listener, suppress(OSError):
+            listener.bind(("127.0.0.1", port))
+            found.append(port)
+    return found
+
+
 class Server:
     """A server in a process group of its own."""
 
-    def __init__(self, command: list[str | Path], folder: Path, answers: Callable[[], None], user: str | None) -> None:
+    def __init__(
+        self,
+        command: list[str | Path],
+        folder: Path,
+        answers: Callable[[], None],
+        user: str | None = None,
+        variables: Mapping[str, str] | None = None,
+    ) -> None:
         self._command, self._folder, self._answers, self._user = command, folder, answers, user
+        self._variables = {**os.environ, **(variables or {})}
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> None:
@@ -71,7 +124,7 @@ class Server:
         with (self._folder / "output.log").open("ab") as log:
             self._process = subprocess.Popen(
                 self._command, cwd=self._folder, stdout=log, stderr=log, start_new_session=True, user=self._user,
-                preexec_fn=lambda: os.nice(NICENESS) and None,
+                env=self._variables, preexec_fn=lambda: os.nice(NICENESS) and None,
             )  # fmt: skip
         until = time.monotonic() + START_SECONDS
         while True:
@@ -101,12 +154,12 @@ class Server:
 class Servers:
     """Both servers, and their addresses."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, milvus_settings: Mapping[str, str] = MILVUS_SETTINGS) -> None:
         programs = postgres_programs()
-        if not MILVUS.exists():
+        if not MILVUS_PYTHON.exists():
             raise Missing("Milvus is not installed in .venv-cluster: scripts/test --cluster does it.")
         user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
-        ports = free_port(), free_port()
+        ports = fixed_ports(2)
         self.postgres_address = f"postgresql://placerec@127.0.0.1:{ports[0]}/postgres"
         self.milvus_address = f"http://127.0.0.1:{ports[1]}"
         data = [folder / "postgres", folder / "milvus"]
@@ -130,14 +183,35 @@ class Servers:
         subprocess.run(initdb, cwd=data[0], user=user, check=True, stdout=subprocess.DEVNULL)
         serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(ports[0]), "-k", data[0]]
         self.postgres = Server(serve, data[0], self._ask_postgres, user)
-        milvus: list[str | Path] = [MILVUS, "--data", data[1] / "data", "--proxy-port", str(ports[1])]
-        self.milvus = Server(milvus, data[1], self._ask_milvus, None)
+        self.milvus = _milvus(data[1], ports[1], milvus_settings, self._ask_milvus)
 
     def _ask_postgres(self) -> None:
         psycopg.connect(self.postgres_address, connect_timeout=5).close()
 
     def _ask_milvus(self) -> None:
-        Connection(self.milvus_address, "", "", None).close()
+        connection = Connection(self.milvus_address, "", "", None)
+        try:
+            connection.check()
+        finally:
+            connection.close()
+
+
+def _milvus(folder: Path, port: int, settings: Mapping[str, str], answers: Callable[[], None]) -> Server:
+    """A Milvus that keeps its data and its ports when it is started again."""
+    others = fixed_ports(20)
+    ports = ",".join(str(other) for other in (*others[3:], port))
+    named = [f"{name}={value}" for name, value in settings.items()]
+    subprocess.run([MILVUS_PYTHON, "-c", _CONFIGURE, folder, ports, *named], check=True)
+    (folder / "etcd.yaml").write_text(_ETCD.format(client=others[1], peer=others[2]))
+    variables = {
+        "ETCD_CONFIG_PATH": str(folder / "etcd.yaml"),
+        "DEPLOY_MODE": "STANDALONE",
+        "METRICS_PORT": str(others[0]),
+        "MILVUS_RUN_DIR": str(folder / "run"),
+        "MILVUSCONF": str(folder / "configs"),
+        "LD_LIBRARY_PATH": str(folder / "bin"),
+    }
+    return Server([folder / "bin/milvus", "run", "standalone"], folder, answers, variables=variables)
 
 
 @contextmanager

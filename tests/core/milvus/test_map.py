@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from core.errors import RevisionMismatch, StorageFailure
+from core.errors import RevisionMismatch, StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
 from core.maps import Map, MapSettings, PlaceFilter, Selection
@@ -123,7 +123,7 @@ def test_writers_at_the_same_time_lose_nothing(servers: Servers, store: MilvusSt
     lab = store.get("lab")
     listed, _ = lab.places(None, 100, PlaceFilter(sequence="shared"))
     assert {place.id for place in listed} == {f"w{which}-{number}" for which in range(3) for number in range(8)}
-    outline = lab.outline()
+    outline = lab.transfer.outline()
     assert sorted(place.ordinal for place in outline if place.sequence == "shared") == list(range(24))
     assert lab.count_places() == 25 and lab.record.revision == 1 + 24 - refused
     for name in ("w0-0", "w2-7"):
@@ -150,7 +150,19 @@ def test_what_was_left_over_is_deleted(store: MilvusStore, monkeypatch: pytest.M
 
 
 def test_a_server_that_is_gone(servers: Servers, store: MilvusStore) -> None:
-    with pytest.raises(StorageFailure, match="Milvus refuses to connect"):
-        open_store("http://127.0.0.1:9", servers.postgres_address)
-    with pytest.raises(StorageFailure, match="PostgreSQL"):
-        open_store(servers.milvus_address, "postgresql://placerec@127.0.0.1:9/postgres")
+    made(store).enrol([frame("a")])
+    without_milvus = open_store("http://127.0.0.1:9", servers.postgres_address)
+    lab = without_milvus.get("lab")
+    assert lab.place("a").id == "a"
+    with pytest.raises(StoreUnavailable, match="Milvus cannot be reached"):
+        lab.scope().search(descriptor_of("a")[np.newaxis])
+    with pytest.raises(StoreUnavailable, match="Milvus cannot be reached"):
+        lab.enrol([frame("b")])
+    assert [place.id for place in lab.places(None, 10)[0]] == ["a"]
+    with pytest.raises(StoreUnavailable, match="Milvus"):
+        without_milvus.check_writable()
+    without_milvus.close()
+    without_postgres = open_store(servers.milvus_address, "postgresql://placerec@127.0.0.1:9/postgres")
+    with pytest.raises(StoreUnavailable, match="PostgreSQL cannot be reached"):
+        without_postgres.get("lab")
+    without_postgres.close()

@@ -12,7 +12,7 @@ from torch import nn
 from core.errors import InvalidModel
 from core.frames.preprocessing import InputDefinition
 from core.method.catalogue import PACKAGED
-from core.networks.forward import GraphPass, TorchPass
+from core.networks.forward import GraphPass, TorchPass, cuda_pass
 from core.networks.network import (
     Convolution,
     Layer,
@@ -134,15 +134,13 @@ def test_what_cannot_be_computed_is_refused(capfd: pytest.CaptureFixture[str]) -
 
 def test_bfloat16_comes_near_and_gives_float32(packaged: ShallowNetwork) -> None:
     with torch.inference_mode():
-        for made, wanted in zip(
-            TorchPass(packaged, "bfloat16", "cpu")(images(1, 227)), packaged(images(1, 227)), strict=True
-        ):
+        for made, wanted in zip(TorchPass(packaged, "bfloat16")(images(1, 227)), packaged(images(1, 227)), strict=True):
             assert made.dtype == torch.float32
             cosine = nn.functional.cosine_similarity(made.flatten(), wanted.flatten(), dim=0)
             assert 0.9999 < cosine < 1 and not torch.equal(made, wanted)
 
 
-@pytest.mark.parametrize("make", [GraphPass, partial(TorchPass, precision="float32", device="cpu")])
+@pytest.mark.parametrize("make", [GraphPass, partial(TorchPass, precision="float32")])
 def test_the_weights_are_copied(make: Callable[[ShallowNetwork], GraphPass | TorchPass]) -> None:
     network = network_of(Convolution(name="a", channels=8, kernel=3), outputs=("a",))
     made = make(network)
@@ -157,14 +155,20 @@ def test_the_weights_are_copied(make: Callable[[ShallowNetwork], GraphPass | Tor
 def test_a_machine_without_cuda_says_so() -> None:
     network = network_of(Convolution(name="a", channels=8, kernel=3), outputs=("a",))
     with pytest.raises(InvalidModel, match="CUDA"):
-        TorchPass(network, "float32", "cuda")
+        cuda_pass(network, "float32")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-def test_a_cuda_device_gives_what_the_processor_gives() -> None:
+def test_a_cuda_device_gives_what_the_processor_gives_to_many_threads() -> None:
     network = load_network(PACKAGED / "placerec-hybrid.network.safetensors", OUTPUTS)
+    shown, on_device = images(24, 227), cuda_pass(network, "float32")
+
+    def compute(index: int) -> tuple[torch.Tensor, ...]:
+        with torch.inference_mode():
+            return on_device(shown[index : index + 1])
+
     with torch.inference_mode():
-        for made, wanted in zip(
-            TorchPass(network, "float32", "cuda")(images(2, 227)), network(images(2, 227)), strict=True
-        ):
-            torch.testing.assert_close(made, wanted, atol=1e-3, rtol=1e-3)
+        wanted = network(shown)
+    for index, outputs in enumerate(each(compute, range(len(shown)), 8)):
+        for made, other in zip(outputs, wanted, strict=True):
+            torch.testing.assert_close(made[0], other[index], atol=1e-3, rtol=1e-3)

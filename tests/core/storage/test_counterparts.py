@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from core.maps import Correspondence
 from core.places import Neighborhood
 from core.storage import Atlas, History, Map, MapSettings
-from core.storage.counterparts import Correspondence
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 

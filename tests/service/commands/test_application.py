@@ -23,8 +23,11 @@ def test_each_command_has_help(placerec: Placerec, command: str) -> None:
     assert "--help" in placerec(*command.split(), "--help").stdout
 
 
-def test_help_loads_nothing_heavy() -> None:
-    check = "import service.commands, sys; print([n for n in ('torch', 'faiss', 'cv2', 'fastapi') if n in sys.modules])"
+def test_help_keys_and_settings_load_nothing_heavy() -> None:
+    check = (
+        "import service.commands, service.settings, service.access.keys, sys;"
+        "print([n for n in ('torch', 'faiss', 'cv2', 'fastapi') if n in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", check], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

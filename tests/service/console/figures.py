@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from core.frames.preprocessing import Pixels
 from tests.service.scenes import encoded, seen_again
@@ -187,6 +187,7 @@ def take(browser: Browser, url: str, theme: str, size: tuple[int, int], act: Cal
     page = context.new_page()
     page.goto(url)
     page.locator("main .view h1").wait_for()
+    expect(page.locator("main .loading")).to_have_count(0, timeout=30_000)
     page.wait_for_timeout(1500)
     if act is not None:
         act(page)

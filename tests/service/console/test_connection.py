@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 from playwright.sync_api import expect
@@ -12,6 +15,55 @@ from service.access.keys import KeyStore
 from tests.service.console.conftest import Visit, given_key
 from tests.service.console.world import frame
 from tests.service.server import Server
+
+JPEG = {"Content-Type": "image/jpeg"}
+
+
+class Cable:
+    """The way to a service, which can be cut: what is open breaks off, and nothing can be opened."""
+
+    def __init__(self, port: int) -> None:
+        self._service, self._whole = port, True
+        self._open: list[socket.socket] = []
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._listening.getsockname()[1])
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with suppress(OSError):
+            while True:
+                near, _ = self._listening.accept()
+                if not self._whole:
+                    near.close()
+                    continue
+                far = socket.create_connection(("127.0.0.1", self._service))
+                self._open += [near, far]
+                for ends in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=ends, daemon=True).start()
+
+    @staticmethod
+    def _pass(source: socket.socket, target: socket.socket) -> None:
+        with suppress(OSError):
+            while data := source.recv(65536):
+                target.sendall(data)
+            target.shutdown(socket.SHUT_WR)
+
+    def cut(self) -> None:
+        """Break off what is open."""
+        self._whole = False
+        while self._open:
+            with suppress(OSError):
+                self._open.pop().shutdown(socket.SHUT_RDWR)
+
+    def mend(self) -> None:
+        """Let connections be opened again."""
+        self._whole = True
+
+    def close(self) -> None:
+        """End it."""
+        self.cut()
+        self._listening.shutdown(socket.SHUT_RDWR)
+        self._listening.close()
 
 
 @pytest.fixture(scope="module")
@@ -55,28 +107,51 @@ def test_a_lost_connection_is_said_and_mended_without_reloading(visit: Visit, sl
     assert page.evaluate("window.notReloaded")
 
 
-def test_live_answers_go_on_after_the_connection_was_lost(visit: Visit, slow: tuple[Server, str]) -> None:
+@pytest.fixture
+def cable(slow: tuple[Server, str]) -> Iterator[Cable]:
+    """The way to the service."""
+    made = Cable(slow[0].port)
+    yield made
+    made.close()
+
+
+def test_live_answers_go_on_after_the_last_one_that_was_heard(
+    visit: Visit, slow: tuple[Server, str], cable: Cable
+) -> None:
     server, key = slow
     operator = visit(None, server=server)
+    operator.root = f"http://127.0.0.1:{cable.port}"
     operator.page.add_init_script(given_key(key))
-    operator.foresee("ERR_", "429", "Failed to fetch dynamically imported module")
-    page = operator.go("maps/lab/live")
+    operator.foresee("ERR_", "429", "404")
+    server.create_map("live")
+    page = operator.go("maps/live/live")
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    missing, lost = page.get_by_text("missing here"), page.get_by_text("The connection to the service is lost.")
+
+    def ask(number: int) -> None:
+        while server.client.post("/v1/maps/live/query", content=frame(number), headers=JPEG).status_code == 429:
+            time.sleep(0.1)
+
     page.get_by_text("listening").wait_for()
-    page.context.set_offline(True)
-    page.get_by_role("link", name="Places").click()
-    page.get_by_text("The connection to the service is lost.").wait_for()
-    page.get_by_role("link", name="Live").click()
-    page.context.set_offline(False)
+    ask(0)
+    expect(lines).to_have_count(1)
+    cable.cut()
+    lost.wait_for()
+    ask(1)
+    cable.mend()
+    expect(lines).to_have_count(2)  # what was answered in between
     page.get_by_text("listening").wait_for()
-    answers = page.get_by_role("list", name="Answers").get_by_role("listitem")
-    for _ in range(
-        30
-    ):  # the stream is opened anew once the connection is back; what is answered in between is not heard
-        server.client.post("/v1/maps/lab/query", content=frame(0), headers={"Content-Type": "image/jpeg"})
-        page.wait_for_timeout(300)
-        if answers.count():
-            break
-    expect(answers.first).to_be_visible()
+    ask(2)
+    expect(lines).to_have_count(3)  # and nothing twice
+    expect(missing).to_have_count(0)
+
+    cable.cut()
+    lost.wait_for()
+    server.client.delete("/v1/maps/live").raise_for_status()  # what was told is forgotten, as after a restart
+    server.create_map("live")
+    cable.mend()
+    expect(lines.first).to_contain_text("Answers may be missing here")
+    expect(lines).to_have_count(4)
 
 
 def test_a_page_of_another_version_asks_to_be_reloaded(visit: Visit) -> None:

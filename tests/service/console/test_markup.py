@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.service.console.conftest import Operator
+from tests.service.console.conftest import Operator, given_key
 from tests.service.console.world import LAB, frame
 from tests.service.scenes import jpeg
 from tests.service.server import Server
@@ -122,27 +126,156 @@ def test_names_that_an_answer_may_bring(admin: Operator, keyed: Server) -> None:
     check_plain(admin)
 
 
-def test_names_that_kept_frames_and_recent_answers_may_bring(admin: Operator, keyed: Server) -> None:
-    answer = {"verdict": "unknown", "reason": MARKUP, "probability": 0.1, "score": 0.1, "decision": 0.1}
-    answer |= {"threshold": 0.2, "best": MARKUP, "matches": [{"place": MARKUP, "score": 0.1}], "revision": 1}
-    answer |= dict.fromkeys(("camera", "session", "file", "operation", "request_id", "key"), MARKUP)
-    kept = {"id": 1, "at": "2026-11-20T10:00:00Z", "sha256": "0", "bytes": 1, "answer": answer}
-    kept |= {"label": {"place": MARKUP, "new": None, "stranger": False}, "labelled_at": None, "labelled_by": MARKUP}
-    page = admin.page
-    page.route(
-        "**/review?*", lambda route: route.fulfill(json={"items": [kept], "next_cursor": None, "frames": 1, "bytes": 1})
-    )
-    found = {"at": "2026-11-20T10:00:00Z", "rank": 1, "frame": 7, "milliseconds": 1, "principal": MARKUP, **answer}
-    told = {"items": [found], "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
-    page.route("**/matches?*", lambda route: route.fulfill(json=told))
+@contextmanager
+def opened(browser: Browser, server: Server, key: str) -> Iterator[Operator]:
+    """Somebody whose page serves several tests; that pictures are missing is no complaint."""
+    context = browser.new_context()
+    context.set_default_timeout(15_000)
+    page = context.new_page()
+    page.add_init_script(given_key(key))
+    yield Operator(page, f"http://127.0.0.1:{server.port}")
+    context.close()
+
+
+AT = "2026-11-20T10:00:00Z"
+RECENT = ("camera", "session", "principal")
+KEPT = ("camera", "session", "reason", "key", "request_id", "match", "label", "labelled_by")
+
+
+@pytest.fixture(scope="module")
+def recent(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
+    """A place with a recent answer for each of its texts, in which that one is markup; cameras have such names, too."""
+    answer = {
+        "at": AT,
+        "rank": 1,
+        "frame": 7,
+        "milliseconds": 1,
+        "verdict": "unknown",
+        "probability": 0.1,
+        "score": 0.1,
+    }
+    items = [answer | dict.fromkeys(RECENT) | {name: MARKUP} for name in RECENT]
+    told = {"items": items, "next_cursor": None, "best": 1, "recognized": 1, "last_at": None}
     cameras = {"items": [{"name": MARKUP, "mask": None}], "next_cursor": None}
-    page.route("**/cameras", lambda route: route.fulfill(json=cameras))
-    admin.foresee("404", "422")  # there are no such pictures
-    admin.go(f"maps/{LAB}/review")
+    with opened(browser, keyed, keys["admin"]) as operator:
+        operator.page.route("**/matches?*", lambda route: route.fulfill(json=told))
+        operator.page.route("**/cameras", lambda route: route.fulfill(json=cameras))
+        operator.go(f"maps/{LAB}/places/monday-03")
+        yield operator
+
+
+@pytest.mark.parametrize("field", RECENT)
+def test_texts_of_recent_answers(recent: Operator, field: str) -> None:
+    row = recent.page.get_by_role("region", name="Answers").get_by_role("row").nth(1 + RECENT.index(field))
+    expect(row).to_contain_text(MARKUP[:8] if field == "session" else MARKUP)
+    check_plain(recent)
+
+
+@pytest.fixture(scope="module")
+def kept(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
+    """A review with a kept frame for each of its texts, in which that one is markup."""
+    items = []
+    for number, name in enumerate(KEPT):
+        answer = live_event(key=None, camera=None, session=None, request_id=None, revision=1)
+        answer["matches"] = [{"place": MARKUP if name == "match" else "p0", "score": 0.1}]
+        frame: dict[str, Any] = {"id": number, "at": AT, "sha256": "0", "bytes": 1, "answer": answer, "label": None}
+        frame |= {"labelled_at": None, "labelled_by": None}
+        if name == "label":
+            frame["label"] = {"place": MARKUP, "new": None, "stranger": False}
+        elif name == "labelled_by":
+            frame |= {"labelled_at": AT, "labelled_by": MARKUP}
+        elif name != "match":
+            answer[name] = MARKUP
+        items.append(frame)
+    told = {"items": items, "next_cursor": None, "frames": len(items), "bytes": 1}
+    with opened(browser, keyed, keys["admin"]) as operator:
+        operator.page.route("**/review?*", lambda route: route.fulfill(json=told))
+        operator.go(f"maps/{LAB}/review")
+        yield operator
+
+
+@pytest.mark.parametrize("field", KEPT)
+def test_texts_of_kept_frames(kept: Operator, field: str) -> None:
+    kept.page.get_by_role("button", name=f"Frame {KEPT.index(field)}", exact=True).click()
+    expect(kept.page.get_by_role("region", name="Frame to be labelled")).to_contain_text(MARKUP)
+    check_plain(kept)
+
+
+LINE, DETAILS = ("key", "camera", "session", "place", "best"), ("reason", "operation", "request_id")
+"""The texts of a live answer: those of its line, which its details repeat, and those of the details alone."""
+
+
+def told(page: Page, events: list[dict[str, Any]], name: str = "query") -> None:
+    """Let a page's stream of events tell these, and then nothing."""
+    text = "".join(f"event: {name}\ndata: {json.dumps(event)}\n\n" for event in events)
+    waiting: list[Route] = []
+
+    def answer(route: Route) -> None:
+        if waiting:
+            return  # as long as the test lasts
+        waiting.append(route)
+        route.fulfill(body=text, content_type="text/event-stream")
+
+    page.route("**/events?*", answer)
+
+
+def live_event(**fields: Any) -> dict[str, Any]:
+    event: dict[str, Any] = {"at": AT, "map": LAB, "verdict": "unknown", "probability": 0.1}
+    event |= {"score": 0.1, "decision": 0.1, "threshold": 0.2, "milliseconds": {"total": 1}, "pose": None, "frame": 7}
+    return event | dict.fromkeys(("place", "picture", "explanation", *LINE, *DETAILS)) | fields
+
+
+@pytest.fixture(scope="module")
+def live(browser: Browser, keyed: Server, keys: dict[str, str]) -> Iterator[Operator]:
+    """The live view with an answer for each of its texts, in which that one is markup; the last one comes first."""
+    with opened(browser, keyed, keys["admin"]) as operator:
+        told(operator.page, [live_event(**{name: MARKUP}) for name in (*LINE, *DETAILS)])
+        operator.go(f"maps/{LAB}/live")
+        yield operator
+
+
+@pytest.mark.parametrize("field", [*LINE, *DETAILS])
+def test_texts_of_live_answers(live: Operator, field: str) -> None:
+    lines = live.page.get_by_role("list", name="Answers").get_by_role("listitem")
+    line = lines.nth([*LINE, *DETAILS][::-1].index(field))
+    if field in LINE:
+        expect(line).to_contain_text(MARKUP)
+    line.get_by_role("button", name="Why").click()
+    dialog = live.page.get_by_role("dialog")
+    dialog.get_by_text("Decision value").wait_for()
+    expect(dialog).to_contain_text(MARKUP)
+    check_plain(live)
+    dialog.get_by_role("button", name="Close").click()
+    expect(dialog).to_have_count(0)
+
+
+def test_addresses_of_pictures_of_live_answers(admin: Operator) -> None:
+    admin.foresee("401", "404")
+    told(admin.page, [live_event(picture=MARKUP), live_event(explanation=f"/v1/{MARKUP}")])
+    page = admin.go(f"maps/{LAB}/live")
+    lines = page.get_by_role("list", name="Answers").get_by_role("listitem")
+    for line in (0, 1):
+        lines.nth(line).get_by_role("button", name="Why").click()
+        page.get_by_role("dialog").get_by_text("Decision value").wait_for()
+        expect(page.locator("#pwned")).to_have_count(0)
+        page.get_by_role("dialog").get_by_role("button", name="Close").click()
+    assert page.evaluate("window.pwned") is None
+
+
+def test_names_of_maps(admin: Operator, keyed: Server) -> None:
+    admin.foresee("404", "422")
+    known = keyed.client.get("/v1/maps").json()
+    known["items"] = [{**known["items"][0], "id": MARKUP}]
+    admin.page.route("**/v1/maps?*", lambda route: route.fulfill(json=known))
+    admin.go("maps")
     check_plain(admin)
-    for text in ("Camera", "Session", "Reason", "By"):
-        expect(page.get_by_role("region", name="Frame to be labelled")).to_contain_text(text + MARKUP)
-    admin.go(f"maps/{LAB}/places/monday-03")
-    row = page.get_by_role("region", name="Answers").get_by_role("row").nth(1)
-    expect(row).to_contain_text(MARKUP)
-    check_plain(admin, MARKUP[:8])
+    admin.page.goto(f"{admin.root}/console#/maps/{quote(MARKUP, safe='')}/live")
+    check_plain(admin, f"The answers of {MARKUP}")
+
+
+def test_names_of_sessions_on_the_plan(admin: Operator) -> None:
+    pose = {"x": 1, "y": 2, "heading": 0, "spread": 1}
+    told(admin.page, [live_event(verdict="recognized", session=MARKUP, pose=pose)])
+    page = admin.go(f"maps/{LAB}/plan")
+    expect(page.get_by_role("list", name="Robots")).to_contain_text(MARKUP)
+    check_plain(admin)

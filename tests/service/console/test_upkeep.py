@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.service.console import world
 from tests.service.console.conftest import OUT_OF_PANEL, Operator, Visit
@@ -42,6 +43,20 @@ def test_a_map_is_calibrated_as_a_dry_run_and_then_for_good(admin: Operator, key
     calibrate("Calibrate")
     page.get_by_text("sequence:tuesday").wait_for()
     assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "sequence:tuesday"
+
+    page.get_by_role("button", name="Calibrate", exact=True).click()  # which now replaces one of the map's own
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Dry run").uncheck()
+    replace = dialog.get_by_role("button", name="Calibrate", exact=True)
+    expect(replace).to_be_disabled()
+    dialog.get_by_label("to replace the calibration").fill(yard)
+    expect(replace).to_be_enabled()
+    dialog.get_by_role("button", name="Cancel").click()
+    page.get_by_role("button", name="Back to the encoder's").click()
+    dialog.get_by_label("to confirm").fill(yard)
+    dialog.get_by_role("button", name="Give up its own").click()
+    page.get_by_text("encoder-default").wait_for()
+    assert keyed.client.get(f"/v1/maps/{yard}").json()["calibration"]["source"] == "encoder-default"
 
 
 def test_a_threshold_says_what_it_would_change_and_is_applied_and_undone(

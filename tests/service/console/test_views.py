@@ -48,20 +48,22 @@ def test_a_role_sees_what_it_may_do_and_nothing_else(visit: Visit, role: str) ->
     operator = visit(role)
     changes = "Create|Delete|Edit|Forget|Import|Export|Calibrate|Apply"
     refused = (
-        f"^({changes}|Align|What would alignment)" if role == "query" else "^(Create|Import|Export$|Calibrate|Apply)"
+        rf"^\s*({changes}|Align|What would alignment)"
+        if role == "query"
+        else r"^\s*(Create|Import|Export\s*$|Calibrate|Apply)"
     )
     for view, (title, needed) in VIEWS.items():
         page = operator.go(view)
         expect(page.get_by_role("heading", level=1)).to_have_text(
             title if open_to(role, needed) else "Not for this key"
         )
-        names = page.locator("main").get_by_role("button").all_inner_texts()
-        assert [name for name in names if re.match(refused, name)] == [], view
+        expect(page.locator("main").get_by_role("button").filter(has_text=re.compile(refused))).to_have_count(0)
         if role == "query":
             expect(page.locator("main .danger")).to_have_count(0)
-    links = page.get_by_role("navigation", name="Views").get_by_role("link").all_inner_texts()
-    assert "Keys" not in links and ("Health" in links) == (role == "enrol")
     expect(page.locator(".identity")).to_contain_text(re.compile(f"^{role}-key"))
+    links = page.get_by_role("navigation", name="Views").get_by_role("link")
+    expect(links.filter(has_text="Keys")).to_have_count(0)
+    expect(links.filter(has_text="Health")).to_have_count(1 if role == "enrol" else 0)
 
 
 @pytest.mark.parametrize("group", ["map", "service"])

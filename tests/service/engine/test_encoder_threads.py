@@ -386,8 +386,8 @@ def test_a_batch_over_http_has_an_answer_or_a_problem_for_each_frame(server: Ser
 
 
 def test_bulk_does_not_keep_a_robot_waiting(server: Server, traverse: str, map_id: str, tmp_path: Path) -> None:
-    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(80)]
-    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(80)]
+    entries = [{"id": f"b{index}", "file": f"b{index}"} for index in range(40)]
+    files = [(f"b{index}", ("b.jpg", jpeg(index % 50, 640, 480), "image/jpeg")) for index in range(40)]
 
     def enrol() -> tuple[httpx.Response, float]:
         began = time.monotonic()

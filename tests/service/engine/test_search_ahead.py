@@ -64,7 +64,7 @@ def test_searches_that_may_take_long_are_not_done_ahead(
     search, now = search_ahead(map_, 3, None), map_.snapshot()
     assert search is not None
     with monkeypatch.context() as patched:
-        patched.setattr(map_, "snapshot", lambda: replace(now, holds=False))
+        patched.setattr(map_, "_snapshot", replace(now, holds=False))
         assert search(encoded(encoder, scene(0))) is None, "what is on the disk may take long"
     monkeypatch.setattr(searches, "MOST_AHEAD", 3)
     assert search_ahead(map_, 3, None) is None

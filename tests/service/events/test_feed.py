@@ -17,7 +17,7 @@ from service.errors.faults import TooManyListeners
 from service.events import events as module
 from service.events import feed as feeds
 from service.events.events import LINGER_SECONDS, Events
-from service.events.feed import Feed, Listener
+from service.events.feed import Feed, Kept, Listener
 from service.events.schemas import MapEvent, QueryEvent
 from tests.service.scenes import jpeg
 
@@ -29,7 +29,7 @@ def add(feed: Feed, count: int = 1, size: int = 10) -> None:
     for _ in range(count):
         text = json.dumps({"number": feed.number + 1, "filler": "x" * size})
         with feed.lock:
-            feed.add("map", None, frozenset({"lab"}), text, text, None)
+            feed.add(Kept(0, "map", None, frozenset({"lab"}), text, text, None))
 
 
 def numbers(listener: Listener, most: int = 100) -> tuple[int | None, list[int]]:

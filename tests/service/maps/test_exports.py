@@ -15,8 +15,8 @@ import pytest
 from starlette.types import Message
 
 from core.errors import StorageFull
+from core.maps.archives.writing import Advance, Expect, Exported
 from core.storage import Atlas, Map, MapSettings
-from core.storage.archives.exporter import Advance, Expect, Exported
 from service.errors.faults import RangeNotSatisfiable, TooManyExports
 from service.maps.exports import FOLDER, Export, ExportResponse, Exports
 from service.places.staging import RESERVE
@@ -166,19 +166,19 @@ def test_several_ranges_come_in_parts(run: Run) -> None:
 def test_a_map_that_has_not_changed_is_written_once(run: Run) -> None:
     async def work(place: Place) -> None:
         a = place.maps["a"]
-        assert place.exports.tag_of(a) is None
+        assert await place.exports.tag_of(a) is None
         first, second = await asyncio.gather(place.exports.create(a), place.exports.create(a))
         assert first is second and await place.exports.create(a) is first
-        assert place.files == {first.file.path} and place.exports.tag_of(a) == first.file.tag
+        assert place.files == {first.file.path} and await place.exports.tag_of(a) == first.file.tag
         a.enrol(enrolments(7, 1, "later", "monday"))
-        assert place.exports.tag_of(a) is None
+        assert await place.exports.tag_of(a) is None
         other = await place.exports.create(a)
         assert other is not first and place.exports.find("a", [first.file.tag]) is first
         # What is known of a map outlasts its file.
         for name in ("b", "c"):
             await place.exports.create(place.maps[name])
         assert place.exports.find("a", [other.file.tag]) is None
-        assert place.exports.tag_of(a) == other.file.tag
+        assert await place.exports.tag_of(a) == other.file.tag
 
     run(work)
 

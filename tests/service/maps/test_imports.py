@@ -12,7 +12,7 @@ import pytest
 
 from core.disk.files import write_at
 from core.storage import MapSettings
-from core.storage.archives import building
+from core.storage.archives import unpacking
 from core.storage.files import segment_files as descriptors
 from service.app.runtime import Runtime
 from service.errors.faults import TooManyImports
@@ -100,7 +100,7 @@ async def test_cancelled_while_the_map_is_built(
         monkeypatch.setattr(
             runtime.imports, "check_encoder", lambda _: None
         )  # the encoder of the test maps does not exist
-        monkeypatch.setattr(building, "CHUNK_BYTES", 1)
+        monkeypatch.setattr(unpacking, "CHUNK_BYTES", 1)
         gate = Gate(descriptors.append)
         with monkeypatch.context() as disk:
             disk.setattr(descriptors, "append", gate)

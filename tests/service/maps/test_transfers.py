@@ -16,8 +16,8 @@ import httpx
 import numpy as np
 import pytest
 
-from core.storage.archives.manifest import group_names
-from core.storage.archives.reading import Archive, check
+from core.maps.archives.manifest import group_names
+from core.maps.archives.reading import Archive, check
 from tests.core.storage.archives.files import Parts, changed, line_changed, named, parts_of, sealed
 from tests.service.encoders import install_coarse_encoder
 from tests.service.map_jobs import wait_until

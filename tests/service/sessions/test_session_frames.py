@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from core.errors import StorageFailure
+from core.maps import Map, MapSettings
 from core.places import PlaceFields
-from core.storage import Map, MapSettings
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.engine.queue import RequestDeadline

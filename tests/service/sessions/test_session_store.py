@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
 
 from service.sessions.store import FILE, SessionStore, StoredSession
+from tests.service.sessions.contract import STEPS, check_records
 
 ONE = StoredSession("s-1", "lab", "2026", "{}", 1.0, 2.0, 7, 3.5, "robot", 0, None, b"state", "{}")
 
@@ -33,6 +35,14 @@ def test_sessions_are_read_as_they_were_written(tmp_path: Path) -> None:
     other.close()
     with pytest.raises(sqlite3.Error):
         store.write(ONE)
+
+
+@settings(max_examples=20, deadline=None)
+@given(STEPS)
+def test_contract(tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, str, int, bytes]]) -> None:
+    store = SessionStore(tmp_path_factory.mktemp("store"))
+    check_records(store, steps)
+    store.close()
 
 
 @pytest.mark.parametrize("damage", ["bytes", "version", "table"])

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from core.maps import Enrolment, Map, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage import Enrolment, Map, MapSettings
 from core.storage.counterparts import Counterparts
 from service.app.runtime import Runtime
 from service.jobs.context import JobCancelled, JobInterrupted
@@ -107,7 +107,7 @@ def test_frames_of_two_traverses_become_the_same_places(runtime: Runtime, lab: M
     assert one["poses"] == {"received": 35, "given": 0} and found["poses_handed_over"] == 35
     assert lab.place("b3").pose == Pose(x=80, y=0) and lab.place("b3").pose_of == "a8"
     assert lab.place("a8").pose_of is None
-    assert lab.verify().ok
+    assert runtime.engine.atlas.verify("lab").ok
 
 
 def test_what_was_stored_is_read_again(tmp_path: Path) -> None:

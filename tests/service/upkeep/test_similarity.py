@@ -123,6 +123,8 @@ def test_bad_requests_are_refused(compared: Server) -> None:
 class Plain:
     """Scores as they are; a map of random descriptors has no encoder."""
 
+    dimension = 64
+
     @staticmethod
     def scores_from_inner_products(products: NDArray[np.float32]) -> NDArray[np.float32]:
         return products

@@ -10,17 +10,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from core import maps
+from core.maps.archives.manifest import seal_of
+from core.maps.archives.reading import Archive
+from core.maps.archives.tar_layout import header, padded
 from core.storage import Map
 from core.storage.archives.building import build
-from core.storage.archives.manifest import seal_of
-from core.storage.archives.reading import Archive
-from core.storage.archives.tar_layout import header, padded
 from core.storage.atlas import Atlas
 
 Parts = dict[str, bytes]
 
 
-def exported(map_: Map, path: Path) -> bytes:
+def exported(map_: maps.Map, path: Path) -> bytes:
     """The whole file of a map, which is written to ``path`` and removed."""
     map_.exporter.write(path)
     try:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from core.errors import InvalidArchive, InvalidIdentifier, InvalidImage, MapExists, StorageFull
+from core.maps.archives.manifest import Manifest
+from core.maps.archives.reading import Archive
 from core.storage import Atlas
-from core.storage.archives import building
-from core.storage.archives.building import build, layout_of
-from core.storage.archives.manifest import Manifest
-from core.storage.archives.reading import Archive
+from core.storage.archives import unpacking
+from core.storage.archives.building import build
+from core.storage.archives.unpacking import layout_of
 from core.storage.files import segment_files as descriptors
 from tests.core.storage.archives.files import Parts, changed, imported, line_changed, parts_of
 from tests.core.storage.frames import DIMENSION, ENCODER, frame
@@ -243,7 +244,7 @@ def test_it_can_be_broken_off_among_the_sequences(
     def advance(done: int, total: int) -> None:
         raise KeyboardInterrupt(f"{done} of {total}")
 
-    monkeypatch.setattr(building, "LINES_BETWEEN", 2)
+    monkeypatch.setattr(unpacking, "LINES_BETWEEN", 2)
     path = tmp_path / "sent.tar"
     path.write_bytes(content)
     with pytest.raises(KeyboardInterrupt, match="0 of 9"), Archive(path) as archive, library.building("lab") as folder:
@@ -254,7 +255,7 @@ def test_it_can_be_broken_off_among_the_sequences(
 def test_few_long_lines_are_held_at_a_time(
     content: bytes, library: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(building, "TEXT_BYTES", 4500)
+    monkeypatch.setattr(unpacking, "TEXT_BYTES", 4500)
     path, seen = tmp_path / "sent.tar", []
     for number in (2, 5):
         content = line_changed(content, PLACES, number, metadata={"a": "x" * 4400})
@@ -287,7 +288,7 @@ def test_nothing_of_it_is_seen_before_it_is_whole(
     content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Broken off between two commits, and the process ended there: the next one finds no map, and no rest of one."""
-    monkeypatch.setattr(building, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(unpacking, "CHUNK_BYTES", 1)
     path, directory = tmp_path / "sent.tar", tmp_path / "data"
     path.write_bytes(content)
     atlas = Atlas(directory)

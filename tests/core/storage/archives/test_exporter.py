@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.maps.archives import writing
 from core.places import Neighborhood
 from core.storage import Atlas, Map, MapSettings
 from core.storage.archives import exporter
@@ -101,7 +102,7 @@ def test_segments_of_which_nothing_lives_any_more(
     full: Map, directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Their files go: one that is being exported finishes with them, later ones do without."""
-    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 1)
+    monkeypatch.setattr(writing, "PLACES_PER_GROUP", 1)
     whole = exported(full, tmp_path / "before")
 
     def forget(written: int) -> None:
@@ -123,7 +124,7 @@ def test_segments_of_which_nothing_lives_any_more(
 
 def test_groups(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = exported(full, tmp_path / "whole")
-    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 4)
+    monkeypatch.setattr(writing, "PLACES_PER_GROUP", 4)
     grouped = exported(full, tmp_path / "grouped")
     manifest, parts = parts_of(grouped)
     assert [part["rows"] for part in manifest["parts"][2:]] == [4] * 8 + [1] * 4
@@ -162,7 +163,7 @@ def test_enrolment_goes_on_while_it_is_read(full: Map, tmp_path: Path) -> None:
 def test_a_map_that_is_deleted_does_not_wait_for_its_export(
     full: Map, atlas: Atlas, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(exporter, "PLACES_PER_GROUP", 2)
+    monkeypatch.setattr(writing, "PLACES_PER_GROUP", 2)
     going = threading.Event()
 
     def delete() -> None:
@@ -202,7 +203,7 @@ def test_a_full_disk_leaves_nothing(full: Map, tmp_path: Path, monkeypatch: pyte
     def refuse(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(exporter, "_pictures", refuse)
+    monkeypatch.setattr(exporter._Source, "pictures", refuse)
     with pytest.raises(StorageFull):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []
@@ -256,7 +257,7 @@ def test_what_went_wrong_first_is_told(full: Map, tmp_path: Path, monkeypatch: p
 
 
 def test_no_file_is_written_that_could_not_be_read(full: Map, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(exporter, "MOST_MANIFEST_BYTES", 500)
+    monkeypatch.setattr(writing, "MOST_MANIFEST_BYTES", 500)
     with pytest.raises(StorageFailure, match="too many places for one file: 6 parts"):
         full.exporter.write(tmp_path / "kept.tar")
     assert list(tmp_path.glob("*.tar")) == []

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from core.errors import InvalidArchive
+from core.maps.archives.manifest import VERSION
 from core.storage import Atlas
-from core.storage.archives.manifest import VERSION
 from tests.core.storage.archives.files import exported, imported, line_changed, parts_of
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "export-version-1.tar.xz"

@@ -15,10 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from core.errors import ArchiveTooNew, InvalidArchive
-from core.storage.archives.lines import CameraLine, PlaceLine, read_line
-from core.storage.archives.manifest import MOST_MANIFEST_BYTES, VERSION, group_names, read_manifest
-from core.storage.archives.reading import Archive, check
-from core.storage.archives.tar_layout import BLOCK, header
+from core.maps.archives.lines import CameraLine, PlaceLine, read_line
+from core.maps.archives.manifest import MOST_MANIFEST_BYTES, VERSION, group_names, read_manifest
+from core.maps.archives.reading import Archive, check
+from core.maps.archives.tar_layout import BLOCK, header
 from tests.core.storage.archives.files import Parts, grown, named, parts_of, sealed, taped
 
 Made = Callable[[bytes], bytes]

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from core.maps.records import COMPACT_FROM, TierSetting
+from core.maps.status import Tier
 from core.storage import Atlas, Map
-from core.storage.search.tiers import ON_DISK_FROM, Tier, holds_for, tier_for
+from core.storage.search.tiers import ON_DISK_FROM, holds_for, tier_for
 from tests.core.storage.frames import ENCODER, frame
 
 

@@ -9,7 +9,7 @@ import tarfile
 from dataclasses import dataclass
 
 from core.errors import InvalidArchive
-from core.storage.archives.manifest import MANIFEST, MOST_MANIFEST_BYTES, SEAL, Manifest, seal_of
+from core.maps.archives.manifest import MANIFEST, MOST_MANIFEST_BYTES, SEAL, Manifest, seal_of
 
 BLOCK = 512
 END_BYTES = 2 * BLOCK

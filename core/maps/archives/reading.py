@@ -10,9 +10,9 @@ from types import TracebackType
 from typing import Self
 
 from core.errors import InvalidArchive
-from core.storage.archives.lines import MOST_LINE_BYTES
-from core.storage.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
-from core.storage.archives.tar_layout import (
+from core.maps.archives.lines import MOST_LINE_BYTES
+from core.maps.archives.manifest import MANIFEST, SEAL, Manifest, Part, read_manifest, seal_of, tag_of
+from core.maps.archives.tar_layout import (
     BLOCK,
     END_BYTES,
     Member,

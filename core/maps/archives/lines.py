@@ -1,10 +1,8 @@
-"""The lines of an export file, each for a sequence, a camera or a place: writing, reading and checking them."""
+"""The lines of an export file, each for a sequence, a camera or a place: reading and checking them."""
 
 from __future__ import annotations
 
 import json
-import sqlite3
-from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -12,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from core.errors import InvalidArchive
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.geometry.keypoints import MOST, count_of
+from core.geometry.keypoints import MOST
+from core.maps.archives.manifest import expect_names, strict_json
 from core.maps.records import validation_message
 from core.places import PLACE_ID, Camera, PlaceFields, Pose, Sequence, Timestamp
-from core.storage.archives.manifest import expect_names, strict_json
 
 MOST_METADATA_BYTES = 1 << 20
 """Of one place, as compact JSON; no service can be set to accept more."""
@@ -139,84 +137,6 @@ def _size(value: Any) -> int:
     return len(json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode())
 
 
-def _line(value: dict[str, Any]) -> bytes:
+def written_line(value: dict[str, Any]) -> bytes:
+    """A line as it is written."""
     return (json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False) + "\n").encode()
-
-
-def sequence_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
-    """The lines of sequences by name; places without a sequence come first."""
-    for name, following in connection.execute("SELECT name, next_ordinal FROM sequences ORDER BY name"):
-        yield _line({"name": name, "next_ordinal": following})
-
-
-def camera_lines(connection: sqlite3.Connection) -> Iterator[bytes]:
-    """The lines of cameras by name."""
-    query = "SELECT name, mask, intrinsics, updated_at FROM cameras ORDER BY name"
-    for name, mask, intrinsics, updated_at in connection.execute(query):
-        kept = {"mask": mask, "intrinsics": intrinsics}
-        parsed = {field: None if text is None else json.loads(text) for field, text in kept.items()}
-        yield _line({"name": name, **parsed, "updated_at": updated_at})
-
-
-_POSE = ("x", "y", "z", "latitude", "longitude", "heading")
-_PLACES = (
-    "SELECT p.id, p.x, p.y, p.z, p.latitude, p.longitude, p.heading, p.timestamp, s.name, p.ordinal, p.camera,"
-    " p.metadata, p.regions, lower(hex(p.digest)), p.picture, length(k.bytes), lower(hex(k.digest)),"
-    " p.created_at, p.updated_at, p.number, p.row, p.checksum, p.track, p.station, t.name, length(f.record),"
-    " p.pose_of"
-    " FROM places p JOIN sequences s ON s.code = p.sequence LEFT JOIN pictures k ON k.place = p.number"
-    " LEFT JOIN sequences t ON t.code = p.track LEFT JOIN keypoints f ON f.place = p.number"
-    " ORDER BY p.number"
-)
-
-
-class StoredLine:
-    """The line of a place, and where its picture, keypoints and descriptor are.
-
-    text: the line.
-    picture_bytes: size of the picture kept of its frame; 0 if none is kept.
-    keypoints_bytes: size of the record of its keypoints; 0 if none are kept.
-    number, row, checksum: of the place and its descriptor in the database.
-    """
-
-    __slots__ = ("checksum", "id", "keypoints_bytes", "number", "picture_bytes", "row", "text")
-
-    def __init__(self, values: tuple[Any, ...], lost: dict[int, int]) -> None:
-        """Of a row of the places.
-
-        Args:
-            lost: the numbers of the tracks whose sequence is gone, by their codes; it gets those that it lacks.
-        """
-        pose = {name: value for name, value in zip(_POSE, values[1:7], strict=True) if value is not None}
-        picture = None if values[15] is None else {"kind": values[14], "bytes": values[15], "sha256": values[16]}
-        self.text = _line(
-            {
-                "id": values[0],
-                "pose": pose or None,
-                "pose_of": values[26],
-                "timestamp": values[7],
-                "sequence": values[8],
-                "ordinal": values[9],
-                "track": None if values[22] is None else values[24] or lost.setdefault(values[22], len(lost)),
-                "station": values[23],
-                "camera": values[10],
-                "metadata": json.loads(values[11]),
-                "regions": values[12],
-                "digest": values[13],
-                "picture": picture,
-                "keypoints": None if values[25] is None else count_of(values[25]),
-                "created_at": values[17],
-                "updated_at": values[18],
-            }
-        )
-        self.id: str = values[0]
-        self.picture_bytes: int = values[15] or 0
-        self.keypoints_bytes: int = values[25] or 0
-        self.number, self.row, self.checksum = (int(value) for value in values[19:22])
-
-
-def place_lines(connection: sqlite3.Connection) -> Iterator[StoredLine]:
-    """The lines of all places in the order of their enrolment."""
-    lost: dict[int, int] = {}
-    for values in connection.execute(_PLACES):
-        yield StoredLine(values, lost)

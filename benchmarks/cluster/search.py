@@ -1,0 +1,122 @@
+"""One query against many places: a data directory, PostgreSQL and Milvus, and Milvus's search alone, in turns.
+
+    python -m benchmarks.cluster.search [--places 100000] [--milvus ADDRESS --postgres ADDRESS]
+
+Places and queries are those of ``benchmarks.maps.search``.  The store asks Milvus and then PostgreSQL for the places
+of the hits; *alone* is the first of these two.  What index Milvus has depends on its version (core.milvus.indexes);
+that of scripts/cluster is flat.  Recall@1 is how often the first of a ranking is the one that exact float32 products
+put first.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+from rich.progress import Progress
+
+from benchmarks.cluster.stores import MilvusAddress, PostgresAddress, Stores, both_stores
+from benchmarks.maps.references import Material, material
+from benchmarks.maps.search import Array, Best, Contender, _enrolment, measure
+from benchmarks.report import report, verdict
+from core.maps.records import MapSettings
+from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
+from core.method.encoder import Encoder
+from core.milvus.snapshot import SHORTLIST
+from core.threads import cores, share_cores
+
+LEAST_RECALL = 0.98
+BLOCK, AT_ONCE = 2000, 256
+
+
+def fill(stores: Stores, encoder: Encoder, of: Material, places: int) -> NDArray[np.int64]:
+    """Enrol the references in a map of both stores; the row of the best for each query, int64 [q]."""
+    maps = [
+        store.create("search", encoder.identity, encoder.dimension, MapSettings(keep="none"))
+        for store in (stores.embedded, stores.milvus)
+    ]
+    best = Best(np.full(len(of.queries), -np.inf, np.float32), np.zeros(len(of.queries), np.int64))
+    queries = torch.from_numpy(of.queries)
+    with Progress() as progress:
+        task = progress.add_task(f"{places:,} places", total=places)
+        for start, block in of.blocks(places, BLOCK):
+            best = best.of(queries, block, start)
+            enrolments = [_enrolment(start + offset, row) for offset, row in enumerate(block)]
+            maps[0].enrol(enrolments)
+            for first in range(0, len(block), AT_ONCE):
+                maps[1].enrol(enrolments[first : first + AT_ONCE])
+                progress.advance(task, len(enrolments[first : first + AT_ONCE]))
+    return best.rows
+
+
+def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> list[dict[str, Any]]:
+    """The figures of every contender."""
+    embedded, milvus = stores.embedded.get("search"), stores.milvus.get("search")
+    embedded.edit({"index": "compact"})
+    while (status := embedded.index_status()).state == "building" or status.tier != "compact":
+        time.sleep(0.1)
+    snapshot, scope = embedded.snapshot(), milvus.scope()
+    state = scope.snapshot.state
+
+    def alone(query: Array) -> NDArray[np.int64]:
+        expression = f"map == {state.number}"
+        ((keys, _),) = milvus.collection.search(query[np.newaxis], expression, SHORTLIST, state.inserted)
+        return keys - first_key
+
+    ((rows, _),) = scope.search(of.queries[:1])
+    ((keys, _),) = milvus.collection.search(of.queries[:1], f"map == {state.number}", 1, state.inserted)
+    first_key = int(keys[0]) - int(rows[0])  # keys and rows were given in the same order
+    asked: list[tuple[str, Callable[[Array], NDArray[np.int64]]]] = [
+        ("embedded", lambda query: snapshot.search(query)[0]),
+        (f"PostgreSQL and Milvus, {milvus.collection.index_type}", lambda query: scope.search(query[np.newaxis])[0][0]),
+        (f"Milvus alone, {milvus.collection.index_type}", alone),
+    ]
+    contenders = [Contender(len(snapshot), name, search) for name, search in asked]
+    found = []
+    for contender, times in zip(contenders, measure(contenders, of.queries, rounds), strict=True):
+        low, middle, high = statistics.quantiles(times, n=4)
+        found.append({"store": contender.name, "milliseconds": middle, "quartiles": [low, high]})
+    for row, (_, search) in zip(found, asked, strict=True):
+        first = np.array([int(search(query)[0]) for query in of.queries])
+        row["recall"] = float(np.mean(first == truth))
+    return found
+
+
+def main(
+    places: int = 100_000,
+    rounds: int = 30,
+    queries: Annotated[int, typer.Option(help="Spread evenly over all there are.")] = 200,
+    milvus: MilvusAddress = "",
+    postgres: PostgresAddress = "",
+    datasets: Annotated[Path, typer.Option(help="Folder with train/ and eval/.")] = Path("../shared/datasets"),
+    cache: Annotated[Path, typer.Option(help="Where encoded photographs are kept.")] = Path(".cache/references"),
+) -> None:
+    """Measure and report."""
+    share_cores(cores())
+    encoder = EncoderCatalogue().get(DEFAULT_ENCODER)
+    of = material(datasets, encoder, cache)
+    asked = np.unique(np.linspace(0, len(of.queries) - 1, min(queries, len(of.queries))).astype(int))
+    of = replace(of, queries=of.queries[asked], walks=of.walks[asked])
+    with both_stores(milvus, postgres) as stores:
+        began = time.monotonic()
+        truth = fill(stores, encoder, of, places)
+        filled = time.monotonic() - began
+        rows = run(stores, of, truth, rounds)
+    table = [[row["store"], row["milliseconds"], f"{row['recall']:.4f}"] for row in rows]
+    title = f"one query against {places:,} places; medians of {rounds} rounds"
+    kept = {"places": places, "rows": rows, "fill_seconds": filled, "rounds": rounds, "queries": len(of.queries)}
+    report("cluster_search", title, ["store", "ms", "recall@1"], table, kept)
+    for row in rows:
+        print(f"{row['store']:<40} {row['recall']:.4f}   {verdict(row['recall'], LEAST_RECALL, True)}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

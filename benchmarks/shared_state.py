@@ -1,0 +1,173 @@
+"""What it costs that services share their state in PostgreSQL, beside the files of a data directory.
+
+    python -m benchmarks.shared_state [--rounds 200]
+
+starts a PostgreSQL of its own (that of the system) and prints medians over the rounds, in milliseconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from service.access.gate import Buckets
+from service.jobs.jobs import Jobs
+from service.queries.recent_answers import AskedFrame
+from service.queries.schemas import QueryAnswer
+from service.queries.statistics import QueryStatistics
+from service.sessions.store import SessionStore, StoredSession
+from service.shared.database import SharedDatabase
+from service.shared.jobs import SharedJobs
+from service.shared.keys import SharedKeys
+from service.shared.rates import SharedBuckets
+from service.shared.replica import Replica
+from service.shared.sessions import SessionTable
+from service.shared.statistics import SharedStatistics
+from tests.service.shared.postgres import running_postgres
+
+BELIEF_BYTES = 8 << 10
+ANSWERS = 400
+KEY = ("lab", "2026-11-20T09:00:00+00:00")
+ANSWER = QueryAnswer(
+    verdict="unknown", place=None, probability=None, pose=None, score=None, margin=None, decision=None, threshold=0.1,
+    reason="empty-map", matches=[], revision=1, encoder="e", milliseconds={},
+)  # fmt: skip
+
+
+def median(rounds: int, work: Callable[[int], object]) -> float:
+    """The median duration of some work, in milliseconds, after three rounds that do not count."""
+    taken = []
+    for number in range(rounds + 3):
+        began = time.perf_counter()
+        work(number)
+        taken.append(1e3 * (time.perf_counter() - began))
+    return statistics.median(taken[3:])
+
+
+def of_sessions(folder: Path, database: SharedDatabase, rounds: int) -> None:
+    """A frame of a session: what is asked before it, and what is saved after it."""
+    session = StoredSession(
+        "s-1", "lab", "2026", '{"filter": "bayes", "expires_after": 900.0}', 1.0, 2.0, 7, 3.5, "robot", 0, None,
+        bytes(BELIEF_BYTES), '{"frame": 7}' + " " * 4000,
+    )  # fmt: skip
+    store, table = SessionStore(folder), SessionTable(database)
+    store.write(session)
+    table.write(session)
+    asked = median(rounds, lambda _: (table.head("s-1"), table.newer("s-1", 0)))
+    print(f"session, asked before a frame    {'':>8}  {asked:8.2f}")
+    saved = median(rounds, lambda _: store.renew(session)), median(rounds, lambda n: table.renew(session, n))
+    print(f"session, saved after a frame     {saved[0]:8.2f}  {saved[1]:8.2f}")
+    store.close()
+
+
+def of_jobs(folder: Path, database: SharedDatabase, rounds: int) -> None:
+    """A job that does nothing, from its submission to its end."""
+    replica = Replica(database, folder)
+    shared = SharedJobs(replica, shared_maps=True)
+    found = []
+    for jobs in (Jobs(folder), shared):
+        jobs.register("nothing", lambda _: {})
+        if jobs is shared:
+            replica.start()
+        jobs.start()
+
+        def done(_: int, jobs: Jobs = jobs) -> None:
+            job = jobs.submit("nothing", None, arguments={})
+            while not jobs.get(job.id).ended:
+                time.sleep(0.0002)
+
+        found.append(median(rounds // 4, done))
+        jobs.close()
+    replica.close()
+    print(f"job, submitted, taken and ended  {found[0]:8.2f}  {found[1]:8.2f}")
+
+
+def _token(buckets: Buckets, number: int) -> None:
+    buckets.take(f"k{number % 100}")
+
+
+def of_rates(database: SharedDatabase, rounds: int) -> None:
+    """A token, and an exchange for a hundred keys."""
+    alone, shared = Buckets(1e6, 1000), SharedBuckets(database, "request", 1e6, 1000)
+    taken = [median(rounds, partial(_token, buckets)) for buckets in (alone, shared)]
+    print(f"rate, a token                    {taken[0]:8.4f}  {taken[1]:8.4f}")
+
+    def exchange(_: int) -> None:
+        for number in range(100):
+            shared.take(f"k{number}")
+        shared.exchange()
+
+    print(f"rate, an exchange of 100 keys    {'':>8}  {median(rounds, exchange):8.2f}")
+
+
+def of_statistics(folder: Path, database: SharedDatabase, rounds: int) -> None:
+    """Adding the counts of some answers, and the answers themselves."""
+    sizes, present = {KEY: ANSWERS}, {f"p{n}" for n in range(ANSWERS)}
+    embedded = QueryStatistics(folder, 3600, lambda: sizes, lambda _: present)
+    shared = SharedStatistics(folder, 3600, lambda: sizes, lambda _: present)
+    shared.share(database)
+    found = []
+    for counted in (embedded, shared):
+
+        def flush(_: int, counted: QueryStatistics = counted) -> None:
+            for number in range(ANSWERS):
+                counted.observe(KEY, "recognized", f"p{number}", 0.5, 2.0)
+                counted.recent.add(KEY, ANSWER, AskedFrame())
+            counted.flush()
+
+        found.append(median(rounds // 10, flush))
+    print(f"statistics, {ANSWERS} answers         {found[0]:8.2f}  {found[1]:8.2f}")
+    embedded.close()
+
+
+def of_notices(folders: list[Path], address: str, rounds: int) -> None:
+    """From what one service says until another one hears it."""
+    databases = [SharedDatabase(address) for _ in folders]
+    one, other = (Replica(database, folder) for database, folder in zip(databases, folders, strict=True))
+    heard = threading.Event()
+    other.hear("test", lambda _: heard.set())
+    one.start()
+    other.start()
+    time.sleep(1)
+
+    def told(_: int) -> None:
+        heard.clear()
+        one.say("test")
+        assert heard.wait(5)
+
+    print(f"a notice, said and heard         {'':>8}  {median(rounds, told):8.2f}")
+    for replica, database in zip((one, other), databases, strict=True):
+        replica.close()
+        database.close()
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--rounds", type=int, default=200)
+    rounds = parser.parse_args().rounds
+    with tempfile.TemporaryDirectory() as name, running_postgres() as postgres:
+        folders = [Path(name) / each for each in "abcd"]
+        for folder in folders:
+            folder.mkdir()
+        database = SharedDatabase(postgres.address)
+        print(f"{'milliseconds':<33}{'files':>8}  {'PostgreSQL':>8}")
+        of_sessions(folders[0], database, rounds)
+        of_jobs(folders[1], database, rounds)
+        of_rates(database, rounds)
+        of_statistics(folders[0], database, rounds)
+        print(
+            f"keys, asking for their version   {'':>8}  {median(rounds, lambda _: SharedKeys(database).version()):8.2f}"
+        )
+        of_notices(folders[2:], postgres.address, rounds)
+        database.close()
+
+
+if __name__ == "__main__":
+    main()

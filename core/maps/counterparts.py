@@ -1,0 +1,111 @@
+"""The stations at which places of other traverses show the same, as alignment found them, and the poses handed over."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from core.places import NO_SEQUENCE
+
+
+@dataclass(frozen=True)
+class Correspondence:
+    """What changes in a map with what an alignment found; everything is named by its row.
+
+    stations: the new track and station of places (``Whereabouts``).
+    poses: for places that get a pose, the place whose pose it is; None for those that lose the pose that they got.
+    """
+
+    stations: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    poses: Mapping[int, int | None] = field(default_factory=dict)
+
+
+class Counterparts(Protocol):
+    """Reads and writes where the places of one map have counterparts.  Any thread may use it."""
+
+    def handed_over(self) -> dict[int, str]:
+        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+
+    def store(self, change: Correspondence) -> None:
+        """Store stations and poses, all of them or, if this raises, none.
+
+        Rows whose place is gone are left out.  Hold the map's writes (``Transfer.paused_writes``) from the decision
+        on if none may be.
+        """
+
+    def copy(self, other: Any, names: Mapping[str, str]) -> None:
+        """Bring places that were copied from another map to the stations that they have there, in one write.
+
+        A station is told by the nearest frame of its track that both maps have.  If they have none, as where the
+        sequence is gone, the places on the track come to a new one, which no sequence has.
+
+        Args:
+            other: the counterparts of the map from which they were copied, of the same store.
+            names: the ids of the copied places in this map, by their ids in the other.
+        """
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where a place is along its sequence and its track, and whose pose it has.
+
+    sequence, track: codes; NO_SEQUENCE without a sequence, no track where it is the place's own.
+    """
+
+    id: str
+    digest: bytes
+    sequence: int
+    ordinal: int
+    track: int | None
+    station: int | None
+    pose_of: str | None
+
+
+def brought_over(
+    there: Mapping[str, Standing], here: Mapping[str, Standing], names: Mapping[str, str], new_track: Callable[[], int]
+) -> Iterator[tuple[str, int | None, int | None, str | None]]:
+    """What changes for copied places so that they stand as in the map that they come from (``Counterparts.copy``).
+
+    Args:
+        there, here: the places of the other map and of this one, by id, in the order of their enrolment.
+        new_track: gives the code of a track that no sequence has or will ever get.
+
+    Yields:
+        The id of a place here, its track and station, None for its own, and whose pose it has.
+    """
+    twins = {
+        place.id: twin
+        for place in there.values()
+        if (twin := here.get(names.get(place.id, place.id))) is not None and twin.digest == place.digest
+    }
+    copied = [place for place in there.values() if place.id in names and place.id in twins]
+    frames: dict[int, list[tuple[int, Standing]]] = {p.track: [] for p in copied if p.track is not None}
+    for place in sorted((there[name] for name in twins), key=lambda place: place.ordinal):
+        if place.sequence in frames and twins[place.id].sequence != NO_SEQUENCE:
+            frames[place.sequence].append((place.ordinal, twins[place.id]))
+    lost = {track: new_track() for track, known in frames.items() if not known}
+    for place in copied:
+        track, station, pose_of = place.track, place.station, place.pose_of
+        if track is not None and station is not None:
+            track, station = (lost[track], station) if track in lost else _told_by(frames[track], station)
+        if pose_of is not None:
+            # The pose of a place that is not here is the place's own.
+            pose_of = twins[pose_of].id if pose_of in twins else None
+        twin = twins[place.id]
+        if (twin.track, twin.station, twin.pose_of) != (track, station, pose_of):
+            yield twin.id, track, station, pose_of
+
+
+def _told_by(frames: Sequence[tuple[int, Standing]], station: int) -> tuple[int, int]:
+    """Track and station here of a station in another map.
+
+    Args:
+        frames: of the track: their ordinals in the other map, ascending, and what they are here; at least one.
+    """
+    behind = bisect_left(frames, station, key=lambda frame: frame[0])
+    ordinal, twin = min(frames[max(0, behind - 1) : behind + 1], key=lambda frame: abs(frame[0] - station))
+    if ordinal == station and twin.track is not None and twin.station is not None:
+        return twin.track, twin.station
+    return twin.sequence, twin.ordinal + station - ordinal

@@ -1,0 +1,94 @@
+"""Frames that a map was told to keep because its answers were doubtful, and what people say that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Protocol
+
+from core.maps.records import ReviewSetting
+
+
+@dataclass(frozen=True)
+class ReviewFrame:
+    """A kept frame, without its picture.
+
+    number: counts the frames of the map; a later frame has a larger number.
+    at: when it was asked, UTC.
+    digest: the SHA-256 of the file, 32 bytes.
+    size: of the file, in bytes.
+    answer: how the map answered it; a JSON object.
+    label: what it shows, and who said so and when; a JSON object.  None: nobody has said it.
+    """
+
+    number: int
+    at: datetime
+    digest: bytes
+    size: int
+    answer: Mapping[str, Any]
+    label: Mapping[str, Any] | None = None
+
+
+class Review(Protocol):
+    """The kept frames of one map.  Any thread may use it; every method may raise StorageFull and StorageFailure."""
+
+    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
+        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
+
+        Returns:
+            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
+        """
+
+    def shrink(self, setting: ReviewSetting) -> None:
+        """Drop the oldest frames beyond new limits, and give back the room."""
+
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
+        """The latest frames, newest first.
+
+        Args:
+            before: only frames with a smaller number; None: all.
+            labelled: only frames with a label, or without one; None: all.
+        """
+
+    def labelled(self) -> list[ReviewFrame]:
+        """All frames with a label, oldest first."""
+
+    def size(self) -> tuple[int, int]:
+        """How many frames are kept, and their bytes."""
+
+    def find(self, number: int) -> ReviewFrame:
+        """One frame.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """
+
+    def picture(self, number: int) -> bytes:
+        """The file of a frame.
+
+        Raises:
+            UnknownFrame: it is not kept.
+            StorageFailure: it is damaged.
+        """
+
+    def held(self, number: int) -> AbstractContextManager[None]:
+        """Have a frame, if it is kept, not dropped for newer ones until the block ends; one at a time may hold it.
+
+        This waits for nothing.
+        """
+
+    def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
+        """Say what a frame shows, in place of what was said before.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """
+
+    def discard(self, number: int) -> None:
+        """Throw a frame away.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """

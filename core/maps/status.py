@@ -1,0 +1,77 @@
+"""What a map reports of itself: how it is searched, and what it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from core.maps.records import TierSetting
+
+Tier = Literal["exact", "compact"]
+
+Progress = Callable[[int, int], None]
+"""Is called with the rows done and all rows; what it raises ends the work."""
+
+
+def no_progress(done: int, total: int) -> None:
+    """Ignore the progress."""
+
+
+class Recall(BaseModel):
+    """How often the place that an exact search finds first is found first by way of the codes."""
+
+    model_config = ConfigDict(frozen=True)
+
+    at_1: float = Field(ge=0, le=1, description="Share of the queries for which it is.")
+    queries: int = Field(
+        ge=1,
+        description="Stored places looked for by descriptors of which a third is theirs and the rest another place's.",
+    )
+    shortlist: int = Field(ge=1, description="Places that the codes choose and that are then compared exactly.")
+    places: int = Field(ge=1, description="Places that the map had when this was measured.")
+
+
+class IndexStatus(BaseModel):
+    """How a map is searched now, and how it will be."""
+
+    model_config = ConfigDict(frozen=True)
+
+    setting: TierSetting = Field(description="What its owner chose.")
+    tier: Tier = Field(description="exact: every place compared; compact: codes first.")
+    wanted: Tier = Field(description="The tier that the map's settings and size ask for.")
+    state: Literal["ready", "building", "unopened"] = Field(
+        description="Searches are answered in all; unopened: not used since the start, read from disk at its next use."
+    )
+    progress: float = Field(ge=0, le=1, description="Of what is being built; 1 when ready.")
+    rows_indexed: int = Field(ge=0, description="Rows with a code; the others are compared exactly.")
+    recall: Recall | None = Field(description="Against exact search; null in the tier exact and until it is measured.")
+    bytes_in_memory: int = Field(ge=0, description="Descriptors that are held, codes, and where the places are.")
+    problem: str | None = Field(
+        default=None, description="Why the last attempt to build came to no end; it is tried again with the next write."
+    )
+
+
+class KeypointsStatus(BaseModel):
+    """The keypoints that a map keeps."""
+
+    model_config = ConfigDict(frozen=True)
+
+    places: int = Field(ge=0, description="How many places have keypoints.")
+    bytes: int = Field(ge=0, description="What they take in map.sqlite.")
+
+
+class StorageStatus(BaseModel):
+    """What a map takes on disk."""
+
+    model_config = ConfigDict(frozen=True)
+
+    precision: str = Field(description="How descriptors are kept.")
+    bytes_per_place: int = Field(ge=0, description="All files of the map, a place; 0 for an empty map.")
+    descriptors: int = Field(ge=0, description="Bytes of the segment files, rows of forgotten places included.")
+    index: int = Field(ge=0, description="Bytes of codes, which can be made again.")
+    database: int = Field(ge=0, description="Bytes of map.sqlite and its log: places, metadata, pictures, keypoints.")
+    keypoints: KeypointsStatus | None = Field(
+        description="Of how many places keypoints are kept; null until the map is first used after a start."
+    )

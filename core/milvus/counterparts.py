@@ -1,0 +1,69 @@
+"""The stations at which places of other traverses show the same, and the poses handed over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+from core.maps.counterparts import Correspondence, brought_over
+from core.milvus import ledger
+from core.milvus.cameras import Access
+
+if TYPE_CHECKING:
+    from core.milvus.map import Write
+
+
+class MilvusCounterparts:
+    """Reads and writes where the places of one map have counterparts (:class:`core.maps.counterparts.Counterparts`).
+
+    Args:
+        map_number: of the map.
+        reading, writing: begin a transaction that reads the map, and a write to it.
+    """
+
+    def __init__(self, map_number: int, reading: Access, writing: Callable[[], AbstractContextManager[Write]]) -> None:
+        self._map, self._reading, self._writing = map_number, reading, writing
+
+    def handed_over(self) -> dict[int, str]:
+        """The rows of the places whose pose was handed over, each with the id of the place that it comes from."""
+        with self._reading() as connection:
+            return ledger.handed_over(connection, self._map)
+
+    def store(self, change: Correspondence) -> None:
+        """Store stations and poses, all of them or, if this raises, none; rows whose place is gone are left out."""
+        rows = sorted({*change.stations, *change.poses})
+        if not rows:
+            return
+        with self._writing() as write:
+            givers = {giver for giver in change.poses.values() if giver is not None}
+            found = {
+                entry.row: entry for entry in ledger.entries_by(write.connection, self._map, "row", [*rows, *givers])
+            }
+            for row in rows:
+                if (stored := found.get(row)) is None:
+                    continue
+                track, station = change.stations.get(row, (stored.track, stored.station))
+                pose, pose_of = stored.place.pose, stored.place.pose_of
+                if row in change.poses:
+                    giver = change.poses[row]
+                    source = None if giver is None else found.get(giver)
+                    pose = None if source is None else source.place.pose
+                    pose_of = None if source is None else source.place.id
+                write.set_counterpart(stored, track, station, pose, pose_of)
+
+    def copy(self, other: MilvusCounterparts, names: Mapping[str, str]) -> None:
+        """Bring places that were copied from another map to the stations that they have there, in one write.
+
+        Args:
+            other: of the map from which they were copied.
+            names: the ids of the copied places in this map, by their ids in the other.
+        """
+        with other._reading() as connection:
+            there = ledger.standings(connection, other._map)
+        with self._writing() as write:
+            here = ledger.standings(write.connection, self._map)
+            changes = brought_over(there, here, names, lambda: ledger.new_code(write.connection, self._map))
+            for place_id, track, station, pose_of in changes:
+                stored = write.expect(place_id)
+                write.set_counterpart(stored, track, station, stored.place.pose, pose_of)

@@ -1,0 +1,161 @@
+"""Exporting a map: its state of one moment as one file, the same as from a data directory."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from psycopg import Connection
+
+from core.disk.files import disk_errors
+from core.geometry.keypoints import count_of
+from core.maps.archives.lines import written_line
+from core.maps.archives.manifest import ArchivedRecord
+from core.maps.archives.writing import Advance, ArchivedPlace, Expect, Exported, write_archive
+from core.maps.cameras import CameraRecord
+from core.milvus import ledger
+from core.milvus.forms import Form
+from core.milvus.ledger import MapState
+from core.places import Pose
+from core.storage.database.ledger import metadata_text, moment_text
+
+READ_AT_ONCE = 16
+"""Frames whose descriptors, pictures or keypoints are read together."""
+
+Viewing = Callable[[], AbstractContextManager[tuple[Connection[Any], MapState]]]
+
+
+class MilvusExporter:
+    """Writes export files of one map (:class:`core.maps.store.Exporter`).
+
+    Args:
+        viewing: begins a transaction that reads the map, whose state comes with it.
+        state: a value that is the same as long as nothing is written to the map.
+    """
+
+    def __init__(self, viewing: Viewing, state: Callable[[], object]) -> None:
+        self._viewing, self.state = viewing, state
+
+    def write(
+        self, path: Path, advance: Advance = lambda _written: None, expect: Expect = lambda _size: None
+    ) -> Exported:
+        """Write the present state of the map as a new file, which a crash may lose; nothing is left if this raises.
+
+        Raises:
+            UnknownMap: the map was deleted before it was read.
+            StorageFull, StorageFailure.
+        """
+        with disk_errors(f"write {path}"), self._viewing() as (connection, state):
+            source = _Source(connection, state)
+            return write_archive(source, path, advance, expect)
+
+
+class _Source:
+    """A map as one transaction sees it (:class:`core.maps.archives.writing.ArchiveSource`)."""
+
+    def __init__(self, connection: Connection[Any], state: MapState) -> None:
+        self._connection, self._map = connection, state.number
+        self.record = ArchivedRecord.model_validate(state.record.model_dump())
+        self.frame_bytes = Form(state.record).frame_bytes
+
+    def sequence_lines(self) -> Iterator[bytes]:
+        for name, following in ledger.sequence_ends(self._connection, self._map).items():
+            yield written_line({"name": name, "next_ordinal": following})
+
+    def camera_lines(self) -> Iterator[bytes]:
+        query = "SELECT record FROM cameras WHERE map = %s ORDER BY name"
+        for (text,) in self._connection.execute(query, (self._map,)):
+            camera = CameraRecord.model_validate_json(text)
+            kept = {name: json.loads(camera.model_dump_json(include={name}))[name] for name in ("mask", "intrinsics")}
+            yield written_line({"name": camera.name, **kept, "updated_at": moment_text(camera.updated_at)})
+
+    def places(self) -> Iterator[ArchivedPlace]:
+        query = (
+            "SELECT p.number, p.row, p.key, p.digest, p.sequence, p.ordinal, p.place, p.track, p.station, t.name,"
+            " f.picture, octet_length(f.keypoints) FROM places p JOIN frames f ON f.map = p.map AND f.row = p.row"
+            " LEFT JOIN sequences t ON t.map = p.map AND t.code = p.track AND t.name IS NOT NULL"
+            " WHERE p.map = %s ORDER BY p.number"
+        )
+        lost: dict[int, int] = {}
+        with self._connection.cursor(name="placerec_export") as cursor:
+            cursor.itersize = READ_AT_ONCE
+            for *columns, track, picture, keypoints in cursor.execute(query, (self._map,)):
+                yield _place(ledger.entry_of(tuple(columns)), track, picture, keypoints, lost)
+
+    def frames(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        for some in _in_pieces(group):
+            rows = [place.row for place in some]
+            descriptors, local = (
+                ledger.of_frames(self._connection, self._map, column, rows) for column in ("descriptor", "local")
+            )
+            yield b"".join(descriptors[row] + local[row] for row in rows)
+
+    def pictures(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        return self._column("picture", [place for place in group if place.picture_bytes])
+
+    def keypoints(self, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        return self._column("keypoints", [place for place in group if place.keypoints_bytes])
+
+    def _column(self, column: str, group: Sequence[ArchivedPlace]) -> Iterator[bytes]:
+        for some in _in_pieces(group):
+            rows = [place.row for place in some]
+            found = ledger.of_frames(self._connection, self._map, column, rows)
+            yield from (found[row] for row in rows)
+
+    def expect_there(self) -> None:
+        """The transaction sees the map also if it was deleted since."""
+
+
+def _in_pieces(group: Sequence[ArchivedPlace]) -> Iterator[Sequence[ArchivedPlace]]:
+    for first in range(0, len(group), READ_AT_ONCE):
+        yield group[first : first + READ_AT_ONCE]
+
+
+def _place(
+    entry: ledger.PlaceEntry, track: str | None, picture: bytes | None, keypoints: int | None, lost: dict[int, int]
+) -> ArchivedPlace:
+    """The line of a place.
+
+    Args:
+        track: the name of its track; None: it has none, or the sequence is gone.
+        keypoints: bytes of their record.
+        lost: the numbers of the tracks whose sequence is gone, by their codes; it gets those that it lacks.
+    """
+    place = entry.place
+    kept = None
+    if picture is not None:
+        kept = {"kind": place.picture, "bytes": len(picture), "sha256": hashlib.sha256(picture).hexdigest()}
+    text = written_line(
+        {
+            "id": place.id,
+            "pose": _pose(place.pose),
+            "pose_of": place.pose_of,
+            "timestamp": None if place.timestamp is None else moment_text(place.timestamp),
+            "sequence": place.sequence,
+            "ordinal": entry.ordinal,
+            "track": None if entry.track is None else track or lost.setdefault(entry.track, len(lost)),
+            "station": entry.station,
+            "camera": place.camera,
+            "metadata": json.loads(metadata_text(place.metadata)),
+            "regions": place.regions,
+            "digest": entry.digest.hex(),
+            "picture": kept,
+            "keypoints": None if keypoints is None else count_of(keypoints),
+            "created_at": moment_text(place.created_at),
+            "updated_at": moment_text(place.updated_at),
+        }
+    )
+    return ArchivedPlace(
+        place.id, text, entry.number, entry.row, 0, 0 if picture is None else len(picture), keypoints or 0
+    )
+
+
+def _pose(pose: Pose | None) -> dict[str, float] | None:
+    if pose is None:
+        return None
+    named = ("x", "y", "z", "latitude", "longitude", "heading")
+    return {name: value for name in named if (value := getattr(pose, name)) is not None}

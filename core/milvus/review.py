@@ -1,0 +1,189 @@
+"""Frames that a map keeps to be reviewed, in PostgreSQL."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+from psycopg import Connection
+
+from core.errors import StorageFailure, UnknownFrame
+from core.maps.records import ReviewSetting
+from core.maps.review import ReviewFrame
+from core.milvus import ledger
+from core.milvus.cameras import Access
+from core.milvus.database import Database
+
+_COLUMNS = "number, at, digest, size, answer, label"
+
+
+class MilvusReview:
+    """The kept frames of one map (:class:`core.maps.review.Review`).
+
+    They are not part of what a search needs, so writing them does not wait for other writes to the map.
+
+    Args:
+        map_number: of the map.
+        reading: begins a transaction that reads the map, and raises if the map is gone.
+        database: in which they are.
+    """
+
+    def __init__(self, map_number: int, reading: Access, database: Database) -> None:
+        self._map, self._reading, self._database = map_number, reading, database
+        self._held: set[int] = set()
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection[Any]]:
+        with self._reading():  # raises if the map is gone
+            pass
+        with self._database.transaction("keep a frame for review") as connection:
+            yield connection
+
+    def keep(self, data: bytes, answer: Mapping[str, Any], setting: ReviewSetting) -> bool:
+        """Keep a frame, and drop the oldest ones beyond the limits; it is durable when this returns.
+
+        Returns:
+            Whether it was kept: not if the same file is kept already, or is larger than all frames may be together.
+        """
+        if len(data) > setting.most_bytes:
+            return False
+        digest = hashlib.sha256(data).digest()
+        with self._writing() as connection:
+            number = ledger.new_key(connection)
+            query = (
+                "INSERT INTO review_frames (map, number, at, digest, size, answer) SELECT %s, %s, %s, %s, %s, %s"
+                " WHERE EXISTS (SELECT 1 FROM maps WHERE number = %s) ON CONFLICT DO NOTHING"
+            )
+            at, text = datetime.now(UTC), json.dumps(answer)
+            values = (self._map, number, at, digest, len(data), text, self._map)
+            if not connection.execute(query, values).rowcount:
+                return False
+            connection.execute("INSERT INTO review_pictures VALUES (%s, %s, %s)", (self._map, number, data))
+            self._drop_oldest(connection, setting)
+        return True
+
+    def shrink(self, setting: ReviewSetting) -> None:
+        """Drop the oldest frames beyond new limits."""
+        with self._writing() as connection:
+            self._drop_oldest(connection, setting)
+
+    def _drop_oldest(self, connection: Connection[Any], setting: ReviewSetting) -> None:
+        """Drop frames, those without a label first and the oldest of these first, until the limits are kept."""
+        query = "SELECT number, size FROM review_frames WHERE map = %s ORDER BY label IS NOT NULL, number"
+        found = connection.execute(query, (self._map,)).fetchall()
+        count, size, going = len(found), sum(bytes_ for _, bytes_ in found), list[int]()
+        for number, bytes_ in found:
+            if count <= setting.most_frames and size <= setting.most_bytes:
+                break
+            if number not in self._held:
+                going.append(number)
+                count, size = count - 1, size - bytes_
+        connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
+
+    def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
+        """The latest frames, newest first.
+
+        Args:
+            before: only frames with a smaller number; None: all.
+            labelled: only frames with a label, or without one; None: all.
+        """
+        also = "" if labelled is None else f" AND label IS {'NOT ' * labelled}NULL"
+        query = (
+            f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number < %s{also} ORDER BY number DESC LIMIT %s"
+        )
+        with self._reading() as connection:
+            found = connection.execute(query, (self._map, 2**62 if before is None else before, limit))
+            return [_frame(values) for values in found]
+
+    def labelled(self) -> list[ReviewFrame]:
+        """All frames with a label, oldest first."""
+        query = f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND label IS NOT NULL ORDER BY number"
+        with self._reading() as connection:
+            return [_frame(values) for values in connection.execute(query, (self._map,))]
+
+    def size(self) -> tuple[int, int]:
+        """How many frames are kept, and their bytes."""
+        query = "SELECT count(*), coalesce(sum(size), 0) FROM review_frames WHERE map = %s"
+        with self._reading() as connection:
+            ((count, size),) = connection.execute(query, (self._map,)).fetchall()
+        return int(count), int(size)
+
+    def find(self, number: int) -> ReviewFrame:
+        """One frame.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """
+        with self._reading() as connection:
+            return self._expect(connection, number)
+
+    def picture(self, number: int) -> bytes:
+        """The file of a frame.
+
+        Raises:
+            UnknownFrame: it is not kept.
+            StorageFailure: it is damaged.
+        """
+        with self._reading() as connection:
+            frame = self._expect(connection, number)
+            query = "SELECT bytes FROM review_pictures WHERE map = %s AND number = %s"
+            found = connection.execute(query, (self._map, number)).fetchone()
+        if found is None or hashlib.sha256(found[0]).digest() != frame.digest:
+            raise StorageFailure(f"The picture of the frame {number} is damaged; discard the frame.")
+        data: bytes = found[0]
+        return data
+
+    @contextmanager
+    def held(self, number: int) -> Iterator[None]:
+        """Have this service not drop a frame for newer ones until the block ends; another service may."""
+        self._held.add(number)
+        try:
+            yield
+        finally:
+            self._held.discard(number)
+
+    def label(self, number: int, label: Mapping[str, Any]) -> ReviewFrame:
+        """Say what a frame shows, in place of what was said before.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """
+        with self._writing() as connection:
+            frame = self._expect(connection, number)
+            query = "UPDATE review_frames SET label = %s WHERE map = %s AND number = %s"
+            if not connection.execute(query, (json.dumps(label), self._map, number)).rowcount:
+                raise _unknown(number)
+        return replace(frame, label=label)
+
+    def discard(self, number: int) -> None:
+        """Throw a frame away.
+
+        Raises:
+            UnknownFrame: it is not kept.
+        """
+        with self._writing() as connection:
+            query = "DELETE FROM review_frames WHERE map = %s AND number = %s"
+            if not connection.execute(query, (self._map, number)).rowcount:
+                raise _unknown(number)
+
+    def _expect(self, connection: Connection[Any], number: int) -> ReviewFrame:
+        query = f"SELECT {_COLUMNS} FROM review_frames WHERE map = %s AND number = %s"
+        values = connection.execute(query, (self._map, number)).fetchone()
+        if values is None:
+            raise _unknown(number)
+        return _frame(values)
+
+
+def _unknown(number: int) -> UnknownFrame:
+    return UnknownFrame(f"The map keeps no frame {number} for review.")
+
+
+def _frame(values: tuple[Any, ...]) -> ReviewFrame:
+    number, at, digest, size, answer, label = values
+    said = None if label is None else json.loads(label)
+    return ReviewFrame(number, at.astimezone(UTC), digest, size, json.loads(answer), said)

@@ -1,0 +1,230 @@
+"""Reading an export file part by part, with every value checked, for a store that makes a map of it.
+
+The file holds lines of text and never a database: every value is checked and written by our own statements.  So an
+export file can bring nothing but values.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from core.errors import InvalidArchive, InvalidImage, InvalidKeypoints
+from core.geometry.keypoints import MOST, keypoints_of, record_bytes
+from core.maps.archives.lines import MOST_PICTURE_BYTES, CameraLine, Kind, PlaceLine, SequenceLine, read_line
+from core.maps.archives.manifest import Manifest, Part
+from core.maps.archives.reading import Archive, PartReader
+from core.maps.cameras import MOST_CAMERAS
+from core.storage.files.row_formats import LARGEST_HALF
+from core.storage.files.segment_files import ROWS_PER_SEGMENT, Layout
+
+CHUNK_BYTES = 16 << 20
+"""Bytes of descriptors that are written, synced and committed together."""
+
+TEXT_BYTES = 2 << 20
+"""Bytes of lines that are committed together; parsed, they take many times as much memory."""
+
+MOST_PLACE_BYTES = 1 << 30
+"""Most bytes of one descriptor with its local descriptors, as float32."""
+
+LINES_BETWEEN = 1024
+"""After so many lines of sequences ``advance`` is called, which may end the work."""
+
+Advance = Callable[[int, int], None]
+"""Is called with the number of places done and of all; what it raises ends the work."""
+
+CheckPicture = Callable[[bytes], None]
+"""Raises InvalidImage for bytes that must not be shown as a picture."""
+
+
+def layout_of(manifest: Manifest, rows_per_segment: int = ROWS_PER_SEGMENT) -> Layout:
+    """The layout of the descriptors in an export file.
+
+    Raises:
+        InvalidArchive: it is impossible.
+    """
+    record = manifest.map
+    if 4 * record.dimension + record.local_cells * record.local_values > MOST_PLACE_BYTES:  # too large for numpy
+        raise InvalidArchive(f"The manifest is impossible: a place has more than {MOST_PLACE_BYTES} bytes.")
+    try:
+        layout = Layout(record.dimension, record.encoder, rows_per_segment, record.local_shape, record.precision)
+        _ = layout.record, layout.frame  # numpy raises ValueError for impossible types
+        return layout
+    except ValueError as error:
+        raise InvalidArchive(f"The manifest is impossible: {error}.") from None
+
+
+def check_sizes(manifest: Manifest) -> None:
+    """Check that the parts of descriptors and keypoints have a size that their places may need.
+
+    Raises:
+        InvalidArchive.
+    """
+    width = layout_of(manifest).frame.itemsize
+    for number in range(manifest.groups):
+        _, part, _, *more = manifest.group(number)
+        if part.bytes != part.rows * width:
+            raise InvalidArchive(f"{part.name} has {part.bytes} bytes, not {part.rows} times {width} bytes.")
+        for part in more:
+            if part.bytes > part.rows * record_bytes(MOST):
+                raise InvalidArchive(f"{part.name} has more bytes than the keypoints of {part.rows} places.")
+
+
+class Content(NamedTuple):
+    """What is kept of a place's frame.
+
+    picture: its bytes and their SHA-256; None: none is kept.
+    keypoints: the record of its keypoints; None: none are kept.
+    """
+
+    picture: tuple[bytes, bytes] | None
+    keypoints: bytes | None
+
+
+class Unpacking(ABC):
+    """Reads a file, and has what it holds stored; used for one file.
+
+    Args:
+        most_picture_bytes: a larger picture is refused before it is read.
+    """
+
+    def __init__(
+        self,
+        archive: Archive,
+        layout: Layout,
+        advance: Advance = lambda _done, _all: None,
+        check_picture: CheckPicture = lambda _content: None,
+        most_picture_bytes: int = MOST_PICTURE_BYTES,
+    ) -> None:
+        self.archive, self.layout, self.advance = archive, layout, advance
+        self._check_picture, self._most_picture_bytes = check_picture, most_picture_bytes
+        self.rows = 0
+        """Places that are stored."""
+
+    @abstractmethod
+    def put_sequences_and_cameras(self, sequences: Iterator[SequenceLine], cameras: Iterator[CameraLine]) -> None:
+        """Store all sequences, then all cameras; each iterator is used up."""
+
+    @abstractmethod
+    def put_places(self, lines: Sequence[PlaceLine], frames: NDArray[np.void], contents: Iterator[Content]) -> None:
+        """Store some places whole, or none of them.
+
+        Args:
+            frames: their descriptors as they are stored (:attr:`Layout.frame`), in their order.
+            contents: of their frames, in their order; each is read when it is asked for.
+        """
+
+    def unpack(self) -> None:
+        """Read the whole file.
+
+        Raises:
+            InvalidArchive: it is damaged, or holds what no map may hold.
+            Others: what storing raises.
+        """
+        manifest = self.archive.manifest
+        sequences, cameras = manifest.parts[:2]
+        self.put_sequences_and_cameras(self._sequences(sequences), self._cameras(cameras))
+        for number in range(manifest.groups):
+            self._group(*manifest.group(number))
+        self.archive.check_end()
+
+    def _sequences(self, part: Part) -> Iterator[SequenceLine]:
+        places = self.archive.manifest.places
+        if part.rows > places + 1:
+            raise InvalidArchive(f"{part.name}: {places} places are in no more than {places + 1} sequences.")
+        reader = self.archive.part(part)
+        for number, (line, _) in enumerate(_lines(reader, part, SequenceLine), start=1):
+            if number % LINES_BETWEEN == 0:
+                self.advance(0, places)
+            yield line
+        reader.finish()
+
+    def _cameras(self, part: Part) -> Iterator[CameraLine]:
+        if part.rows > MOST_CAMERAS:
+            raise InvalidArchive(f"{part.name}: a map has at most {MOST_CAMERAS} cameras.")
+        reader = self.archive.part(part)
+        for line, _ in _lines(reader, part, CameraLine):
+            yield line
+        reader.finish()
+
+    def _group(self, places: Part, frames: Part, *more: Part) -> None:
+        lines, rows, *others = (self.archive.part(part) for part in (places, frames, *more))
+        step = max(1, CHUNK_BYTES // self.layout.record.itemsize)
+        chunk: list[PlaceLine] = []
+        held = 0
+        for line, size in _lines(lines, places, PlaceLine):
+            chunk.append(line)
+            held += size
+            if len(chunk) == step or held >= TEXT_BYTES:
+                self._store(chunk, rows, *others)
+                chunk, held = [], 0
+        self._store(chunk, rows, *others)
+        for reader in (lines, rows, *others):
+            reader.finish()
+
+    def _store(
+        self, chunk: list[PlaceLine], rows: PartReader, images: PartReader, records: PartReader | None = None
+    ) -> None:
+        if not chunk:
+            return
+        frames = np.frombuffer(rows.read(len(chunk) * self.layout.frame.itemsize), self.layout.frame)
+        self._check_descriptors(frames, chunk, rows.name)
+        self.put_places(chunk, frames, (self._content(line, images, records) for line in chunk))
+        self.rows += len(chunk)
+        self.advance(self.rows, self.archive.manifest.places)
+
+    def _check_descriptors(self, frames: NDArray[np.void], chunk: list[PlaceLine], name: str) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            vectors = self.layout.descriptors_of(frames)
+            largest = np.abs(vectors).max(axis=1)
+        for line, value in zip(chunk, largest.tolist(), strict=True):
+            if not 0 < value <= LARGEST_HALF:  # this is also false for NaN
+                raise InvalidArchive(f"{name}: the descriptor of place {line.id!r} cannot be compared.")
+
+    def _content(self, line: PlaceLine, images: PartReader, records: PartReader | None) -> Content:
+        return Content(self._picture(line, images), self._keypoints(line, records))
+
+    def _picture(self, line: PlaceLine, images: PartReader) -> tuple[bytes, bytes] | None:
+        if line.picture is None:
+            return None
+        if line.picture.bytes > self._most_picture_bytes:
+            more = f"it has {line.picture.bytes} bytes of at most {self._most_picture_bytes}"
+            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {more}.")
+        content = images.read(line.picture.bytes)
+        digest = hashlib.sha256(content).digest()
+        if digest.hex() != line.picture.sha256:
+            raise InvalidArchive(f"The picture of place {line.id!r} does not match its SHA-256.")
+        try:
+            self._check_picture(content)
+        except InvalidImage as error:
+            raise InvalidArchive(f"The picture of place {line.id!r} cannot be taken: {error}") from None
+        return content, digest
+
+    def _keypoints(self, line: PlaceLine, records: PartReader | None) -> bytes | None:
+        if line.keypoints is None:
+            return None
+        if records is None:
+            raise InvalidArchive(f"The place {line.id!r} has keypoints, which files of version 1 do not hold.")
+        record = records.read(record_bytes(line.keypoints))
+        try:
+            keypoints_of(record)
+        except InvalidKeypoints as error:
+            raise InvalidArchive(f"The keypoints of place {line.id!r} cannot be taken: {error}") from None
+        return record
+
+
+def _lines(reader: PartReader, part: Part, kind: type[Kind]) -> Iterator[tuple[Kind, int]]:
+    """The lines of a part, as many as the manifest says, each with the length of its text."""
+    seen = 0
+    for text in reader.lines():
+        seen += 1
+        if seen > part.rows:
+            raise InvalidArchive(f"{part.name} has more lines, not {part.rows}.")
+        yield read_line(text, kind, f"{part.name}, line {seen}"), len(text)
+    if seen != part.rows:
+        raise InvalidArchive(f"{part.name} has {seen} lines, not {part.rows}.")

@@ -1,0 +1,51 @@
+"""Opening the store of maps that the settings name."""
+
+from __future__ import annotations
+
+from core.disk.files import FolderLock, disk_errors, make_folder
+from core.maps import Store
+from core.milvus import open_store
+from core.storage import Atlas
+from service.settings import Settings
+
+
+class OpenStore:
+    """The store of a service, and the lock on its data directory; close it at the end.
+
+    Servers are not waited for: one that cannot be reached keeps the service from being ready, not from starting.
+
+    Raises:
+        DataDirectoryLocked, DataDirectoryTooNew, StorageFull, StorageFailure: the data directory cannot be opened.
+        MissingExtra: what speaks to the servers is not installed.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.maps: Store
+        self._lock: FolderLock | None = None
+        if settings.store == "embedded":
+            self.maps = Atlas(settings.data_dir)
+            return
+        assert settings.milvus is not None and settings.postgres is not None  # the settings were checked
+        with disk_errors(f"open the data directory {settings.data_dir}"):
+            make_folder(settings.data_dir)
+            self._lock = FolderLock(settings.data_dir / "LOCK")
+        try:
+            certificate = settings.milvus_certificate
+            store = open_store(
+                settings.milvus,
+                settings.postgres.get_secret_value(),
+                settings.milvus_token.get_secret_value(),
+                settings.milvus_database,
+                None if certificate is None else str(certificate),
+            )
+        except BaseException:
+            self._lock.release()
+            raise
+        store.start_sweeping()
+        self.maps = store
+
+    def close(self) -> None:
+        """Wait for reads and writes under way, close the store, and release the data directory."""
+        self.maps.close()
+        if self._lock is not None:
+            self._lock.release()

@@ -1,0 +1,180 @@
+"""One of the services that share state: it says that it is there, hears of what the others do, and keeps up to date."""
+
+from __future__ import annotations
+
+import logging
+import math
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psycopg
+
+from core.disk.files import disk_errors, write_file
+from core.errors import StorageFailure
+from service.shared.database import SETTINGS, SharedDatabase
+
+FILE = "replica"
+
+BEAT_SECONDS = 2.0
+"""How often a service says that it is there."""
+
+LOSING_SECONDS = 7.0
+"""A service that could not say so for so long stops its jobs, by its own clock: before it counts as gone by the
+database's, and others take them over (``service.living`` in tables.sql)."""
+
+LIVING = "SELECT id FROM service.living"
+"""The ids of the services that are there."""
+
+CHANNEL = "placerec"
+RECONNECT_SECONDS = 1.0
+
+Heard = Callable[[str | None], None]
+"""Is told what was said; None: the connection was lost for a while, so anything may have been said."""
+
+log = logging.getLogger("placerec.shared")
+
+
+class Replica:
+    """This service among those that share state.  Any thread may use it.
+
+    id: of the data directory, the same after a restart.
+
+    Args:
+        database: what the services share; it is closed by its owner.
+        directory: the data directory.
+
+    Raises:
+        StorageFull, StorageFailure: the directory cannot be written to.
+    """
+
+    def __init__(self, database: SharedDatabase, directory: Path) -> None:
+        self.database = database
+        self.id, self.process = _id_of(directory), secrets.token_hex(8)
+        self.displaced = False
+        """Whether another service runs under this id, because its data directory is a copy."""
+        self._entered, self._beaten = False, -math.inf
+        self._tasks: list[Callable[[], None]] = []
+        self._heard: dict[str, Heard] = {}
+        self._stopping = threading.Event()
+        self._threads: list[threading.Thread] = []
+
+    def every(self, task: Callable[[], None]) -> None:
+        """Do something at every beat, in a thread; call it before :meth:`start`."""
+        self._tasks.append(task)
+
+    def hear(self, topic: str, heard: Heard) -> None:
+        """Be told in a thread what services say about a topic; call it before :meth:`start`."""
+        self._heard[topic] = heard
+
+    def start(self) -> None:
+        """Enter, and begin to beat and to listen; the process must hold its data directory.
+
+        If PostgreSQL cannot be reached, this service enters as soon as it can.
+        """
+        try:
+            self.beat()
+        except StorageFailure as error:
+            log.error("the service does not take part yet: %s", error)
+        for name, work in (("replica-beat", self._beat_on), ("replica-listen", self._listen_on)):
+            thread = threading.Thread(target=work, name=name, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def close(self) -> None:
+        """Leave; what this service held can be taken over at once."""
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join(5)
+        try:
+            self.database.execute(
+                "leave",
+                "UPDATE service.replicas SET seen = '-infinity' WHERE id = %s AND process = %s",
+                (self.id, self.process),
+            )
+        except Exception as error:
+            log.warning("the service cannot take its leave: %s", error)
+
+    @property
+    def living(self) -> bool:
+        """Whether the others still count this service as there."""
+        return not self.displaced and time.monotonic() - self._beaten < LOSING_SECONDS
+
+    @property
+    def state(self) -> str:
+        """Why this service is not one of those that share state, in a sentence; "ok" if it is."""
+        if self.displaced:
+            return "Another service runs under the same id: one data directory is a copy of the other."
+        return "ok" if self.living else "PostgreSQL cannot be reached."
+
+    def say(self, topic: str, text: str = "") -> None:
+        """Tell all services, this one included; what is said is not kept for those that do not hear it."""
+        self.database.execute("tell others", "SELECT pg_notify(%s, %s)", (CHANNEL, f"{topic} {text}"))
+
+    # The threads
+
+    def _beat_on(self) -> None:
+        while not self._stopping.wait(BEAT_SECONDS):
+            for work in (self.beat, *self._tasks):
+                try:
+                    work()
+                except Exception as error:
+                    log.warning("a replica is not up to date: %s", error)
+                    break  # the others would wait as long for the same server
+
+    def beat(self) -> None:
+        """Say that this service is there.
+
+        Raises:
+            StorageFailure: PostgreSQL cannot be reached, or refuses.
+        """
+        began = time.monotonic()
+        if not self._entered:
+            enter = (
+                "INSERT INTO service.replicas (id, process) VALUES (%s, %s) ON CONFLICT (id) DO UPDATE"
+                " SET process = excluded.process, seen = clock_timestamp()"
+            )
+            self.database.execute("enter", enter, (self.id, self.process))
+            self._entered, self._beaten = True, began
+            return
+        query = "UPDATE service.replicas SET seen = clock_timestamp() WHERE id = %s AND process = %s RETURNING id"
+        if self.displaced:
+            return
+        if self.database.execute("say that it is there", query, (self.id, self.process)):
+            self._beaten = began
+        else:
+            self.displaced = True
+            log.error("another service runs under the id %s of this one: one data directory is a copy", self.id)
+
+    def _listen_on(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self._listen()
+            except Exception as error:
+                log.warning("a replica does not hear the others: %s", error)
+                self._stopping.wait(RECONNECT_SECONDS)
+
+    def _listen(self) -> None:
+        with psycopg.connect(self.database.address, **SETTINGS) as connection:
+            connection.execute(f"LISTEN {CHANNEL}")
+            for heard in self._heard.values():
+                heard(None)
+            while not self._stopping.is_set():
+                for notice in connection.notifies(timeout=0.5):
+                    topic, _, text = notice.payload.partition(" ")
+                    if topic in self._heard:
+                        self._heard[topic](text)
+
+
+def _id_of(directory: Path) -> str:
+    """The id of a data directory, which it gets if it has none."""
+    path = directory / FILE
+    with disk_errors(f"read {path}"):
+        if path.exists() and (found := path.read_text().strip()):
+            return found
+        made = f"r-{secrets.token_hex(8)}"
+        directory.mkdir(parents=True, exist_ok=True)
+        write_file(path, f"{made}\n".encode())
+        return made

@@ -1,0 +1,60 @@
+"""The parts of a service that share their state with other services, in place of the embedded ones."""
+
+from __future__ import annotations
+
+from service.engine.engine import Engine
+from service.events.events import Events
+from service.jobs.jobs import Jobs
+from service.queries.statistics import QueryStatistics
+from service.sessions.sessions import Sessions
+from service.settings import Settings
+from service.shared.audit import AuditTable
+from service.shared.database import SharedDatabase
+from service.shared.events import SharedEvents
+from service.shared.jobs import SharedJobs
+from service.shared.replica import Replica
+from service.shared.sessions import SharedSessions
+from service.shared.statistics import SharedStatistics
+
+
+class SharedState:
+    """Makes the parts, and runs what keeps them up to date.
+
+    Args:
+        database: what the services share.  It is not closed with the state.
+        shared_maps: whether all services have the same maps, so that each can do the jobs of all.
+    """
+
+    def __init__(self, settings: Settings, database: SharedDatabase, shared_maps: bool) -> None:
+        self._settings, self._shared_maps = settings, shared_maps
+        self.replica = Replica(database, settings.data_dir)
+        self.audit = AuditTable(database, self.replica.id)
+        self.events = SharedEvents(self.replica, settings.event_listeners)
+
+    def statistics(self, engine: Engine) -> QueryStatistics:
+        """The statistics of all services."""
+        return SharedStatistics.of_services(engine, self.replica.database)
+
+    def jobs(self, events: Events) -> Jobs:
+        """All jobs of all services."""
+        given = self._settings
+        return SharedJobs(
+            self.replica, self._shared_maps, given.job_workers, given.job_queue, given.job_history, given.job_watchers,
+            events,
+        )  # fmt: skip
+
+    def sessions(self, events: Events) -> Sessions:
+        """All sessions of all services."""
+        return SharedSessions(self._settings, events, self.replica)
+
+    def start(self) -> None:
+        """Begin to take part; all parts must be made before."""
+        self.events.start()
+        self.replica.start()
+        self.audit.start()
+
+    def close(self) -> None:
+        """Leave the others; blocks."""
+        self.events.close()
+        self.audit.close()
+        self.replica.close()

@@ -1,0 +1,253 @@
+"""Kills of Milvus, PostgreSQL and a client under a load: nothing is lost, nothing half-written, no answer is wrong.
+
+    scripts/soak cluster --kills 100 --seed 7 [--minutes 15]
+
+Two clients, one of them in a process of its own, write pairs of places in one batch each, forget places, and query; a
+model in plain values knows what each place may show.  What is killed, and when, is drawn at random.  After each kill,
+when both clients have been served again, the map is compared with the model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import random
+import secrets
+import signal
+import statistics
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from core.errors import StorageFailure, UnknownMap, UnknownPlace
+from core.milvus import open_store
+from core.milvus.map import MilvusMap
+from tests.core.milvus.clients import Client, ProcessClient
+from tests.core.milvus.servers import Servers, running_servers
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of
+
+PARTS = ("milvus", "postgres", "client")
+MOST_SECONDS = 30.0
+"""From the start of a server until both clients are served again; a client takes as long as Python does to start."""
+IDS = 12
+SERVED = 5
+"""Writes and queries of each client after which it is served again."""
+_GIVEN_UP = 120.0
+
+May = dict[str, set[str | None]]
+"""By id, the pictures that the place may show, None for no place: one, unless a write got no answer."""
+
+
+class Load(threading.Thread):
+    """Writes, forgets and queries, and notes in ``may`` what each of its places may show."""
+
+    def __init__(self, client: Client | ProcessClient, seed: str, may: May) -> None:
+        super().__init__(daemon=True)
+        self._client, self._random, self.may = client, random.Random(seed), may
+        self._over = threading.Event()
+        self.answered = self.queries = self.refused = 0
+        self.wrong: list[str] = []
+
+    def stop(self) -> None:
+        self._over.set()
+        self.join()
+
+    def served(self, since: tuple[int, int]) -> bool:
+        """Whether it was served some more since ``done`` was so."""
+        return all(now >= then + SERVED for now, then in zip(self.done, since, strict=True))
+
+    @property
+    def done(self) -> tuple[int, int]:
+        """Writes and queries that were answered."""
+        return self.answered, self.queries
+
+    def run(self) -> None:
+        before: May = {}
+        while not self._over.is_set():
+            ids = self._random.sample(sorted(self.may), 2)
+            picture: str | None = f"picture {self._random.randrange(10**9)}"
+            try:
+                if self._random.random() < 0.3:
+                    self._query()
+                    continue
+                if self._random.random() < 0.2:
+                    ids, picture = ids[:1], None
+                before = {name: self.may[name] for name in ids}
+                if picture is None and before[ids[0]] == {None}:
+                    continue
+                for name in ids:  # until the answer comes, both may be found
+                    self.may[name] = before[name] | {picture}
+                if picture is None:
+                    self._client.forget(ids[0])
+                else:
+                    self._client.enrol(ids, picture)
+                for name in ids:
+                    self.may[name] = {picture}
+                self.answered += 1
+            except UnknownPlace:  # it was forgotten by a write that got no answer
+                if None not in before[ids[0]]:
+                    self.wrong.append(f"{ids[0]}, which shows one of {before[ids[0]]}, is lost")
+                self.may[ids[0]] = {None}
+            except StorageFailure:
+                self.refused += 1
+                time.sleep(0.05)
+
+    def _query(self) -> None:
+        """A place whose picture is known is found first by it."""
+        known = [name for name, shows in self.may.items() if len(shows) == 1 and None not in shows]
+        if known:
+            name = self._random.choice(known)
+            (picture,) = self.may[name]
+            # Both places of a batch show the same picture; another place cannot be as near.
+            first = self._client.first(str(picture))
+            if name not in first:
+                self.wrong.append(f"{name} with {picture} is not among {first}")
+            self.queries += 1
+
+
+@contextmanager
+def running(loads: Sequence[Load]) -> Iterator[None]:
+    for load in loads:
+        load.start()
+    try:
+        yield
+    finally:
+        for load in loads:
+            load.stop()
+
+
+def check(lab: MilvusMap, may: May) -> None:
+    """Every place shows what it may show, is stored whole and is found."""
+    outline, snapshot = lab.transfer.outline(), lab.snapshot()
+    found = {place.id: place for place in outline}
+    assert len(snapshot) == len(found)
+    for name, shows in may.items():
+        pictures = {digest_of(picture): picture for picture in shows if picture is not None}
+        assert name in found or None in shows, f"{name}, which shows one of {shows}, is lost"
+        if name not in found:
+            may[name] = {None}
+            continue
+        place = found[name]
+        assert place.digest in pictures, f"{name} shows none of {shows}"
+        picture = pictures[place.digest]
+        row = np.array([place.row])
+        assert np.allclose(snapshot.descriptors_at(row)[0], descriptor_of(picture), atol=1e-3)
+        assert snapshot.locals_at(row).any() and lab.picture(name) == f"thumbnail of {picture}".encode()
+        ((rows, _),) = lab.scope().search(descriptor_of(picture)[np.newaxis])
+        assert place.row in rows[:2].tolist()
+        may[name] = {picture}
+
+
+@dataclass
+class Tally:
+    """What a campaign did.  seconds: by part, from its start after each kill until both clients were served again."""
+
+    answered: int = 0
+    refused: int = 0
+    seconds: dict[str, list[float]] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        times = [
+            f"{part} {len(these)} kills, served again after {statistics.median(these):.1f} s (at most {max(these):.1f})"
+            for part, these in self.seconds.items()
+        ]
+        kills = sum(map(len, self.seconds.values()))
+        return f"{kills} kills, {self.answered} answered, {self.refused} refused; {'; '.join(times)}"
+
+
+class Campaign:
+    """A map ``lab`` in a store, its model, and two clients."""
+
+    def __init__(self, servers: Servers, seed: str) -> None:
+        self._servers, self._seed = servers, seed
+        self._store = open_store(servers.milvus_address, servers.postgres_address)
+        with suppress(UnknownMap):
+            self._store.delete("lab")
+        self._lab = self._store.create("lab", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+        self._client = ProcessClient(servers.milvus_address, servers.postgres_address)
+        self._may: list[May] = [{f"{letter}{number}": {None} for number in range(IDS)} for letter in "pq"]
+        self.tally, self._kills = Tally(), Counter[str]()
+
+    def kill(self, part: str) -> None:
+        """Kill a part under the load, start it again, wait until both are served, and compare."""
+        number = sum(self._kills.values())
+        self._kills[part] += 1
+        seed = f"{self._seed}/{number}"
+        clients: tuple[Client | ProcessClient, ...] = Client(self._store), self._client
+        loads = [
+            Load(client, f"{seed}/{n}", may) for n, (client, may) in enumerate(zip(clients, self._may, strict=True))
+        ]
+        with running(loads):
+            time.sleep(random.Random(seed).uniform(0.2, 2.0))
+            if part == "client":
+                self._client.kill()
+                began = time.monotonic()
+            else:
+                server = getattr(self._servers, part)
+                server.end(signal.SIGKILL)
+                time.sleep(1.0)
+                began = time.monotonic()
+                server.start()
+            before = [load.done for load in loads]
+            while not all(load.served(then) for load, then in zip(loads, before, strict=True)):
+                late = time.monotonic() - began
+                assert late < _GIVEN_UP and all(load.is_alive() for load in loads), (
+                    f"{late:.0f} s after {part} returned"
+                )
+                time.sleep(0.02)
+            self.tally.seconds.setdefault(part, []).append(time.monotonic() - began)
+        for load in loads:
+            assert not load.wrong, load.wrong
+            self.tally.answered += sum(load.done)
+            self.tally.refused += load.refused
+        whole = self._may[0] | self._may[1]
+        check(self._lab, whole)
+        for may in self._may:
+            may.update({name: whole[name] for name in may})
+
+    def close(self) -> None:
+        """Delete the map and end the clients."""
+        self._client.close()
+        with suppress(UnknownMap):
+            self._store.delete("lab")
+        self._store.close()
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Kill until there were enough kills, or the time is over."""
+    parser = argparse.ArgumentParser(prog="scripts/soak cluster", description=__doc__)
+    parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seed", default=None)
+    parser.add_argument("--minutes", type=float, default=None, help="begin no further kill after so long")
+    chosen = parser.parse_args(arguments)
+    seed = chosen.seed or secrets.token_hex(4)
+    print(f"seed {seed}", flush=True)
+    logging.getLogger("psycopg.pool").setLevel(logging.CRITICAL)  # a PostgreSQL that is away is no news here
+    draw, began = random.Random(seed), time.monotonic()
+    with running_servers() as servers:
+        campaign = Campaign(servers, seed)
+        try:
+            for number in range(1, chosen.kills + 1):
+                campaign.kill(draw.choice(PARTS))
+                if number % 5 == 0:
+                    print(campaign.tally, flush=True)
+                if chosen.minutes is not None and time.monotonic() - began > 60 * chosen.minutes:
+                    break
+        finally:
+            campaign.close()
+    slowest = max(second for these in campaign.tally.seconds.values() for second in these)
+    print(f"{campaign.tally}: nothing lost, nothing half-written, no wrong answer")
+    print(
+        f"served again within {MOST_SECONDS:g} s of a part's return: {'kept' if slowest <= MOST_SECONDS else 'MISSED'}"
+    )
+    return 0 if slowest <= MOST_SECONDS else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

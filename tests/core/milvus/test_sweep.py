@@ -1,0 +1,96 @@
+"""What Milvus has and no place names is deleted, and what it lacks is noticed and given to it again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from core.errors import StorageFailure
+from core.milvus import ledger, open_store
+from core.milvus.map import MilvusMap
+from core.milvus.store import MilvusStore
+from tests.core.milvus.servers import Servers
+from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
+
+pytestmark = [pytest.mark.cluster, pytest.mark.timeout(600)]
+
+
+@pytest.fixture
+def store(servers: Servers) -> Iterator[MilvusStore]:
+    store = open_store(servers.milvus_address, servers.postgres_address)
+    yield store
+    store.delete("swept")
+    store.close()
+
+
+@pytest.fixture
+def lab(store: MilvusStore) -> MilvusMap:
+    return store.create("swept", ENCODER, DIMENSION, local_shape=LOCAL_SHAPE)
+
+
+def keys_in_milvus(store: MilvusStore, lab: MilvusMap) -> set[int]:
+    """Those of the last keys that Milvus has."""
+    with lab.viewing() as (connection, _):
+        last = ledger.last_key(connection)
+    return set(lab.collection.keys_between(max(0, last - 1000), last + 1))
+
+
+def test_what_a_dead_write_left_is_deleted(store: MilvusStore, lab: MilvusMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.enrol([frame("a")])
+    store.sweep()
+    before = keys_in_milvus(store, lab)
+
+    def die(*_: Any) -> None:
+        raise StorageFailure("between the insertion and the COMMIT")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ledger, "update", die)
+        with pytest.raises(StorageFailure):
+            lab.enrol([frame("b"), frame("c")])
+    assert len(keys_in_milvus(store, lab) - before) == 2
+    assert store.sweep() == 2
+    assert keys_in_milvus(store, lab) == before and [place.id for place in lab.places(None, 10)[0]] == ["a"]
+
+
+def test_what_is_being_written_stays(store: MilvusStore, lab: MilvusMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    update, inserted, go_on = ledger.update, threading.Event(), threading.Event()
+
+    def slow(*args: Any) -> None:
+        inserted.set()
+        assert go_on.wait(60)
+        update(*args)
+
+    swept: list[int] = []
+    with monkeypatch.context() as patched:
+        patched.setattr(ledger, "update", slow)
+        writer = threading.Thread(target=lambda: lab.enrol([frame("a")]))
+        writer.start()
+        assert inserted.wait(60)
+        sweeper = threading.Thread(target=lambda: swept.append(store.sweep()))
+        sweeper.start()
+        sweeper.join(0.3)  # whether it has come to the lock by then or not
+        go_on.set()
+        writer.join(60)
+        sweeper.join(60)
+    assert swept == [0]
+    ((rows, _),) = lab.scope().search(descriptor_of("a")[np.newaxis])
+    assert [place.id for place in lab.places_at(rows.tolist()) if place] == ["a"]
+
+
+def test_what_milvus_lost_is_noticed_and_restored(store: MilvusStore, lab: MilvusMap) -> None:
+    lab.enrol([frame(f"p{number}") for number in range(3)])
+    assert store.verify("swept").ok
+    with lab.viewing() as (connection, _):
+        entry = ledger.find(connection, lab.number, "p1")
+    assert entry is not None
+    lab.collection.delete([entry.key])
+    report = store.verify("swept")
+    assert not report.ok and "'p1' is missing" in report.problems[0]
+    lab.rebuild_index()
+    assert store.verify("swept").ok
+    ((rows, _),) = lab.scope().search(descriptor_of("p1")[np.newaxis])
+    assert [place.id for place in lab.places_at(rows[:1].tolist()) if place] == ["p1"]

@@ -1,0 +1,251 @@
+"""The files of a cluster: compose and Kubernetes by their schemas, and nginx's configuration in a real nginx."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from functools import cache
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import httpx
+import kubernetes_validate
+import pytest
+import yaml
+from compose_spec import PyCompose
+
+from service.settings import Settings
+from tests.project.test_container import seconds, service
+from tests.project.test_proxy import NGINX
+from tests.service.server import free_port
+
+ROOT = Path(__file__).parents[2]
+DOCKER = ROOT / "docker"
+COMPOSE = DOCKER / "compose.cluster.yaml"
+MANIFESTS = sorted((DOCKER / "kubernetes").glob("*.yaml"))
+VERSION = "1.31"
+"""Of Kubernetes, the oldest that the manifests are meant for."""
+
+
+@cache
+def compose() -> dict[str, Any]:
+    found: dict[str, Any] = yaml.safe_load(COMPOSE.read_text())
+    return found
+
+
+@cache
+def objects(kind: str) -> dict[str, dict[str, Any]]:
+    """All objects of a kind by name."""
+    found = [one for path in MANIFESTS for one in yaml.safe_load_all(path.read_text())]
+    return {one["metadata"]["name"]: one for one in found if one["kind"] == kind}
+
+
+def settings_in(variables: dict[str, Any]) -> set[str]:
+    return {name.removeprefix("PLACEREC_").lower() for name in variables if name.startswith("PLACEREC_")}
+
+
+def test_compose_files_are_valid() -> None:
+    for path in (COMPOSE, DOCKER / "compose.yaml"):
+        found = PyCompose.from_yaml(yaml.safe_dump(yaml.safe_load(path.read_text())))
+        found.validate_networks()
+        found.validate_volumes()
+
+
+@pytest.mark.parametrize("path", MANIFESTS, ids=lambda path: path.stem)
+def test_manifests_are_valid(path: Path) -> None:
+    for one in yaml.safe_load_all(path.read_text()):
+        kubernetes_validate.validate(one, VERSION, strict=True)
+        assert one["kind"] == "Namespace" or one["metadata"]["namespace"] == "placerec"
+
+
+def test_only_nginx_is_published_and_on_this_machine_alone() -> None:
+    published = {name: found["ports"] for name, found in compose()["services"].items() if "ports" in found}
+    assert list(published) == ["nginx"]
+    assert all(port.startswith("127.0.0.1:") for port in published["nginx"])
+
+
+def test_every_container_is_confined_and_returns() -> None:
+    for name, found in compose()["services"].items():
+        assert found["restart"] == "unless-stopped" and found["cap_drop"] == ["ALL"], name
+        assert found["security_opt"] == ["no-new-privileges:true"] and "mem_limit" in found, name
+    for kind in ("Deployment", "StatefulSet"):
+        for name, found in objects(kind).items():
+            pod = found["spec"]["template"]["spec"]
+            assert pod["securityContext"]["runAsNonRoot"] and not pod["automountServiceAccountToken"], name
+            for container in pod["containers"]:
+                assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
+                assert "memory" in container["resources"]["limits"], name
+
+
+def test_no_password_stands_in_a_file() -> None:
+    for name, found in compose()["services"].items():
+        for variable, value in found.get("environment", {}).items():
+            if "PASSWORD" in variable or "SECRET" in variable:
+                assert re.search(r"\$\{\w+:\?", value), (name, variable)
+    for name, found in objects("Secret").items():
+        assert {value for value in found["stringData"].values() if "change-me" not in value} <= {""}, name
+
+
+def test_both_say_the_same_of_the_service_and_of_milvus() -> None:
+    replica, told = compose()["services"]["placerec-1"], objects("ConfigMap")["placerec"]["data"]
+    given = replica["environment"]
+    for name in ("PLACEREC_STORE", "PLACEREC_MILVUS", "PLACEREC_RAY", "PLACEREC_RAY_ADDRESS"):
+        assert given[name] == told[name]
+    own = yaml.safe_load((DOCKER / "milvus.yaml").read_text())
+    assert own == yaml.safe_load(objects("ConfigMap")["milvus"]["data"]["user.yaml"])
+    assert compose()["services"]["milvus"]["image"] == container_of("StatefulSet", "milvus")["image"]
+
+
+def container_of(kind: str, name: str) -> dict[str, Any]:
+    (found,) = objects(kind)[name]["spec"]["template"]["spec"]["containers"]
+    container: dict[str, Any] = found
+    return container
+
+
+def test_a_replica_has_time_to_stop() -> None:
+    default = {name: field.default for name, field in Settings.model_fields.items()}
+    told = objects("ConfigMap")["placerec"]["data"]
+    needed = float(told["PLACEREC_DRAIN_SECONDS"]) + 2 * default["shutdown_timeout"] + 5
+    assert objects("Deployment")["placerec"]["spec"]["template"]["spec"]["terminationGracePeriodSeconds"] >= needed
+    replica = compose()["services"]["placerec-1"]
+    needed = float(replica["environment"]["PLACEREC_DRAIN_SECONDS"]) + 2 * default["shutdown_timeout"]
+    assert seconds(replica["stop_grace_period"]) >= needed
+
+
+def test_probes_ask_what_the_service_answers() -> None:
+    paths = json.loads((ROOT / "openapi.json").read_text())["paths"]
+    container = container_of("Deployment", "placerec")
+    asked = {name: container[f"{name}Probe"]["httpGet"]["path"] for name in ("startup", "liveness", "readiness")}
+    assert asked == {"startup": "/livez", "liveness": "/livez", "readiness": "/readyz"} and set(asked.values()) <= {
+        *paths
+    }
+
+
+def test_what_names_a_deployment_finds_it() -> None:
+    deployments = objects("Deployment")
+    for found in objects("HorizontalPodAutoscaler").values():
+        assert found["spec"]["scaleTargetRef"]["name"] in deployments
+    for found in objects("PodDisruptionBudget").values():
+        labels = found["spec"]["selector"]["matchLabels"]
+        assert labels in [one["spec"]["template"]["metadata"]["labels"] for one in deployments.values()]
+    pods = deployments | objects("StatefulSet")
+    for name, found in objects("Service").items():
+        assert found["spec"]["selector"] == {"app": name} and name in pods
+    named = {
+        (key["name"], key["key"])
+        for kind in ("Deployment", "StatefulSet")
+        for name in objects(kind)
+        for variable in container_of(kind, name).get("env", [])
+        if (key := variable.get("valueFrom", {}).get("secretKeyRef"))
+    }
+    assert named == {(name, key) for name, found in objects("Secret").items() for key in found["stringData"]}
+
+
+def test_limits_of_nginx_are_those_of_the_tls_proxy() -> None:
+    ours, theirs = (
+        dict(re.findall(r"^\s*(\w+) ([^;{]+);", re.sub(r"#.*", "", (DOCKER / name).read_text()), re.MULTILINE))
+        for name in ("cluster.conf", "tls.conf")
+    )
+    for name in ("large_client_header_buffers", "client_header_timeout", "client_body_timeout", "send_timeout"):
+        assert ours[name] == theirs[name]
+    address = compose()["services"]["nginx"]["networks"]["inside"]["ipv4_address"]
+    assert compose()["services"]["placerec-1"]["environment"]["FORWARDED_ALLOW_IPS"] == address
+
+
+def test_the_image_of_a_cluster_has_its_packages() -> None:
+    arguments = compose()["services"]["placerec-1"]["build"]["args"]
+    locked = (ROOT / f"requirements/{arguments['PROFILE']}.lock").read_text()
+    assert re.search(r"^pymilvus==", locked, re.MULTILINE) and re.search(r"^psycopg-binary==", locked, re.MULTILINE)
+    assert set(service()["build"]["args"]) < set(arguments)
+
+
+class Replica(BaseHTTPRequestHandler):
+    """Answers; or, if it is told to, goes away when it has read a request."""
+
+    def do_POST(self) -> None:
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        self.server.asked.append(self.path)  # type: ignore[attr-defined]
+        if self.server.dies:  # type: ignore[attr-defined]
+            self.connection.close()
+            return
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *arguments: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def replicas() -> Iterator[list[ThreadingHTTPServer]]:
+    servers = [ThreadingHTTPServer(("127.0.0.1", 0), Replica) for _ in range(2)]
+    for server in servers:
+        server.asked, server.dies = [], False  # type: ignore[attr-defined]
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield servers
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture
+def balanced(replicas: list[ThreadingHTTPServer], tmp_path: Path) -> Iterator[httpx.Client]:
+    """nginx with cluster.conf in front of both."""
+    tmp_path.chmod(0o755)
+    port, text = free_port(), (DOCKER / "cluster.conf").read_text()
+    places = [(f"placerec-{n}:8000", f"127.0.0.1:{one.server_port}") for n, one in enumerate(replicas, 1)]
+    for old, new in (
+        *places,
+        ("listen 8000", f"listen 127.0.0.1:{port}"),
+        ("/dev/stdout", f"{tmp_path}/access.log"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "tls.conf").write_text(text)
+    (tmp_path / "nginx.conf").write_text(NGINX.format(folder=tmp_path))
+    words = ["nginx", "-c", str(tmp_path / "nginx.conf"), "-p", str(tmp_path)]
+    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    nginx = subprocess.Popen(words)
+    try:
+        until = time.monotonic() + 60
+        while not (tmp_path / "nginx.pid").exists() and time.monotonic() < until:
+            time.sleep(0.02)
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+            yield client
+    finally:
+        nginx.terminate()
+        nginx.wait(10)
+
+
+@pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed")
+def test_a_query_outlives_a_replica_and_a_write_is_not_sent_twice(
+    balanced: httpx.Client, replicas: list[ThreadingHTTPServer]
+) -> None:
+    frame = bytes(range(256)) * 4000
+    for _ in range(4):
+        assert balanced.post("/v1/maps/lab/query", content=frame).content == frame
+    assert all(server.asked for server in replicas), "one of two replicas is never asked"  # type: ignore[attr-defined]
+
+    one, other = replicas
+    for server in replicas:
+        server.asked.clear()  # type: ignore[attr-defined]
+    one.dies = True  # type: ignore[attr-defined]
+    answers = [balanced.post("/v1/maps/lab/query?k=3", content=frame) for _ in range(4)]
+    assert [answer.content for answer in answers] == [frame] * 4
+    assert one.asked and len(other.asked) == 4  # type: ignore[attr-defined]
+
+    other.dies = True  # type: ignore[attr-defined]
+    for server in replicas:
+        server.asked.clear()  # type: ignore[attr-defined]
+    time.sleep(5.1)  # until nginx tries again the one that failed
+    refused = balanced.post("/v1/maps/lab/merge", content=frame)
+    assert refused.status_code == 502
+    assert len(one.asked + other.asked) == 1  # type: ignore[attr-defined]

@@ -1,0 +1,60 @@
+"""A real PostgreSQL of its own for the tests of what services share."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psycopg
+
+from service.shared.database import SharedDatabase
+from tests.core.milvus.servers import Server, free_port, postgres_programs
+
+
+class Postgres:
+    """PostgreSQL in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        programs, port = postgres_programs(), free_port()
+        user = "nobody" if os.getuid() == 0 else None  # PostgreSQL refuses to run as root
+        self.address = f"postgresql://placerec@127.0.0.1:{port}/postgres"
+        folder.chmod(0o755)
+        if user is not None:
+            shutil.chown(folder, user)
+        files = folder / "data"
+        make = [programs / "initdb", "-D", files, "-U", "placerec", "-E", "UTF8", "--locale=C", "--auth=trust", "-N"]
+        subprocess.run([str(word) for word in make], cwd=folder, user=user, check=True, stdout=subprocess.DEVNULL)
+        serve: list[str | Path] = [programs / "postgres", "-D", files, "-p", str(port), "-k", folder]
+        self.server = Server(serve, folder, self._ask, user)
+
+    def _ask(self) -> None:
+        psycopg.connect(self.address, connect_timeout=5).close()
+
+    def empty(self) -> None:
+        """Forget everything."""
+        with psycopg.connect(self.address) as connection:
+            connection.execute("DROP SCHEMA IF EXISTS service CASCADE")
+        database = SharedDatabase(self.address)
+        database.execute("make its tables", "SELECT 1")
+        database.close()
+
+
+@contextmanager
+def running_postgres() -> Iterator[Postgres]:
+    """PostgreSQL, as long as the block runs."""
+    folder = Path(tempfile.mkdtemp(prefix="placerec-postgres-"))
+    postgres = None
+    try:
+        postgres = Postgres(folder)
+        postgres.server.start()
+        yield postgres
+    finally:
+        if postgres is not None:
+            postgres.server.end(signal.SIGINT)
+        shutil.rmtree(folder, ignore_errors=True)
