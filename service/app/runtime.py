@@ -27,6 +27,7 @@ from service.places.plans import Plans
 from service.places.staging import Staging
 from service.queries.pictures import ExplanationPictures
 from service.queries.statistics import QueryStatistics
+from service.ray_serve import encoders_for
 from service.sessions.sessions import Sessions
 from service.settings import Settings, unknown_variables
 from service.telemetry.metrics import Metrics
@@ -59,7 +60,8 @@ class Runtime:
         self.started_at, self.started = datetime.now(UTC), time.monotonic()
         with ExitStack() as opened:
             self.shared = None if database is None else _shared_state(settings, database)
-            self.engine = Engine(settings, metrics, None if self.shared is None else self.shared.events)
+            events = None if self.shared is None else self.shared.events
+            self.engine = Engine(settings, metrics, events, encoders_for(settings))
             opened.callback(self.engine.close)
             self.jobs = _jobs(settings, self.engine) if self.shared is None else self.shared.jobs(self.engine.events)
             opened.callback(self.jobs.close, 0.0)
@@ -157,7 +159,9 @@ class Runtime:
         if now - self._disk_checked > DISK_CHECK_SECONDS:
             self._disk_checked = now
             self._maps_state, self._disk_state = await in_thread(self._check_store)
-        checks = {"encoder": self.engine.encoder_state, "maps": self._maps_state, "disk": self._disk_state}
+        encoder, encoders = self.engine.encoder_state, self.engine.queue.encoders.state
+        checks = {"encoder": encoder if encoder != "ok" else encoders, "maps": self._maps_state}
+        checks["disk"] = self._disk_state
         if self.shared is not None:
             checks["replica"] = self.shared.replica.state
         if self.stopping:

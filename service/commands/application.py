@@ -16,6 +16,7 @@ from service.commands.maps.backup import backup
 from service.commands.maps.maps import maps
 from service.commands.model import model
 from service.commands.query import query
+from service.commands.ray import ray
 from service.commands.serve import serve
 from service.commands.settings import settings
 
@@ -34,3 +35,4 @@ application.add_typer(jobs, name="jobs")
 application.add_typer(keys, name="keys")
 application.add_typer(vocabulary, name="vocabulary")
 application.add_typer(model, name="model")
+application.add_typer(ray, name="ray")

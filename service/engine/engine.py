@@ -21,7 +21,7 @@ from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.recognition.verification import Verify
-from service.engine.encoders import AfterEncoding, Encoded
+from service.engine.encoders import AfterEncoding, Encoded, MakeEncoders
 from service.engine.queue import EncoderQueue, Outcomes, RequestDeadline
 from service.engine.review_keeper import ReviewKeeper
 from service.engine.searches import Recognized, Searches, search_ahead
@@ -82,18 +82,31 @@ class Engine:
 
     Jobs, sessions, imports and all other capabilities are built on an engine, which imports none of them.
 
+    Args:
+        make_encoders: makes what encodes frames; None: threads of this process do.
+
     Raises:
         DataDirectoryLocked, DataDirectoryTooNew, StorageFailure: the data directory cannot be opened.
         MissingExtra: the store of the settings needs a package that is not installed.
     """
 
-    def __init__(self, settings: Settings, metrics: Metrics, events: Events | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        metrics: Metrics,
+        events: Events | None = None,
+        make_encoders: MakeEncoders | None = None,
+    ) -> None:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
         self.atlas: Store = self._store.maps
         self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
+        if make_encoders is not None:  # then an encoder compares descriptors here, and makes none
+            self.catalogue = EncoderCatalogue(settings.models_directory, "float32")
         limits = Limits(max_bytes=settings.max_image_bytes, max_pixels=settings.max_image_pixels)
-        self.queue = EncoderQueue(self.catalogue, limits, settings.queue_length, settings.threads, metrics)
+        self.queue = EncoderQueue(
+            self.catalogue, limits, settings.queue_length, settings.threads, metrics, make_encoders
+        )
         self.searches = Searches()
         self.events = Events(settings.event_listeners) if events is None else events
         self.review_keeper = ReviewKeeper()

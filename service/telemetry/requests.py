@@ -118,7 +118,7 @@ class JsonLines(logging.Formatter):
             if request.trace_id is not None:
                 line["trace_id"] = request.trace_id
         for name, value in record.__dict__.items():
-            if name not in FIELDS:
+            if name not in FIELDS and not name.startswith("_"):  # which libraries add for themselves
                 line[name] = cut(value, LONGEST_TEXT) if isinstance(value, str) else value
         if record.exc_info:
             line["exception"] = cut(self.formatException(record.exc_info), LONGEST_TRACEBACK)

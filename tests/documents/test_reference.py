@@ -6,7 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 
+from service.ray_serve.metrics import CallMetrics
 from tests.documents.reference import FOLDER, PAGES
 from tests.service.server import Server
 
@@ -19,7 +21,10 @@ def test_a_generated_page_is_up_to_date(name: str) -> None:
 def test_every_metric_is_on_the_page(tmp_path: Path) -> None:
     service = Server(tmp_path / "service").wait()
     try:
-        series = re.findall(r"^# TYPE (placerec_\w+)", service.client.get("/metrics").text, re.MULTILINE)
+        with_ray = CollectorRegistry()
+        CallMetrics(with_ray)
+        text = service.client.get("/metrics").text + generate_latest(with_ray).decode()
+        series = re.findall(r"^# TYPE (placerec_\w+)", text, re.MULTILINE)
     finally:
         assert service.stop() == 0
     described = set(re.findall(r"`(placerec_\w+)`", (FOLDER / "metrics-and-logs.md").read_text()))

@@ -109,6 +109,7 @@ EXTRAS = {
     "core/milvus": {"milvus"},
     "core/recordings": {"bags"},
     "examples": {"bags"},
+    "service/ray_serve": {"ray"},
     "training": {"report"},
 }
 """Folders that may import what an extra brings; tests and benchmarks may import all."""
