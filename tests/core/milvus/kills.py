@@ -241,11 +241,11 @@ def main(arguments: Sequence[str]) -> int:
                     break
         finally:
             campaign.close()
-    slowest = max(second for these in campaign.tally.seconds.values() for second in these)
+    of_servers = [these for part, these in campaign.tally.seconds.items() if part != "client"]
+    slowest = max((second for these in of_servers for second in these), default=0.0)
+    kept = "kept" if slowest <= MOST_SECONDS else "MISSED"
     print(f"{campaign.tally}: nothing lost, nothing half-written, no wrong answer")
-    print(
-        f"served again within {MOST_SECONDS:g} s of a part's return: {'kept' if slowest <= MOST_SECONDS else 'MISSED'}"
-    )
+    print(f"served again within {MOST_SECONDS:g} s of a server's start: {kept}")
     return 0 if slowest <= MOST_SECONDS else 1
 
 
