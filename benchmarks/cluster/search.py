@@ -5,7 +5,7 @@
 Places and queries are those of ``benchmarks.maps.search``.  The store asks Milvus and then PostgreSQL for the places
 of the hits; *alone* is the first of these two.  What index Milvus has depends on its version (core.milvus.indexes);
 that of scripts/cluster is flat.  Recall@1 is how often the first of a ranking is the one that exact float32 products
-put first.
+put first.  *Core ms* is processor time of a server for one search, which other load does not change.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import typer
 from numpy.typing import NDArray
 from rich.progress import Progress
 
-from benchmarks.cluster.stores import MilvusAddress, PostgresAddress, Stores, both_stores
+from benchmarks.cluster.stores import MilvusAddress, PostgresAddress, Stores, both_stores, processor_seconds
 from benchmarks.maps.references import Material, material
 from benchmarks.maps.search import Array, Best, Contender, _enrolment, measure
 from benchmarks.report import report, verdict
@@ -35,6 +35,7 @@ from core.threads import cores, share_cores
 
 LEAST_RECALL = 0.98
 BLOCK, AT_ONCE = 2000, 256
+IDLE_SECONDS = 5.0
 
 
 def fill(stores: Stores, encoder: Encoder, of: Material, places: int) -> NDArray[np.int64]:
@@ -67,13 +68,9 @@ def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> 
     state = scope.snapshot.state
 
     def alone(query: Array) -> NDArray[np.int64]:
-        expression = f"map == {state.number}"
-        ((keys, _),) = milvus.collection.search(query[np.newaxis], expression, SHORTLIST, state.inserted)
-        return keys - first_key
+        ((keys, _),) = milvus.collection.search(query[np.newaxis], f"map == {state.number}", SHORTLIST, state.inserted)
+        return keys
 
-    ((rows, _),) = scope.search(of.queries[:1])
-    ((keys, _),) = milvus.collection.search(of.queries[:1], f"map == {state.number}", 1, state.inserted)
-    first_key = int(keys[0]) - int(rows[0])  # keys and rows were given in the same order
     asked: list[tuple[str, Callable[[Array], NDArray[np.int64]]]] = [
         ("embedded", lambda query: snapshot.search(query)[0]),
         (f"PostgreSQL and Milvus, {milvus.collection.index_type}", lambda query: scope.search(query[np.newaxis])[0][0]),
@@ -84,10 +81,24 @@ def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> 
     for contender, times in zip(contenders, measure(contenders, of.queries, rounds), strict=True):
         low, middle, high = statistics.quantiles(times, n=4)
         found.append({"store": contender.name, "milliseconds": middle, "quartiles": [low, high]})
-    for row, (_, search) in zip(found, asked, strict=True):
+    for row, (_, search) in zip(found[:2], asked, strict=False):
         first = np.array([int(search(query)[0]) for query in of.queries])
         row["recall"] = float(np.mean(first == truth))
+    for part, process in stores.processes.items():
+        found[1][f"{part}_milliseconds"] = processor_milliseconds(process, asked[1][1], of.queries)
     return found
+
+
+def processor_milliseconds(process: int, search: Callable[[Array], object], queries: Array) -> float:
+    """Of a server for one search, without what it takes when it is asked nothing."""
+    before, began = processor_seconds(process), time.monotonic()
+    time.sleep(IDLE_SECONDS)
+    idle = (processor_seconds(process) - before) / (time.monotonic() - began)
+    before, began = processor_seconds(process), time.monotonic()
+    for query in queries:
+        search(query)
+    taken = processor_seconds(process) - before - idle * (time.monotonic() - began)
+    return 1e3 * taken / len(queries)
 
 
 def main(
@@ -110,11 +121,16 @@ def main(
         truth = fill(stores, encoder, of, places)
         filled = time.monotonic() - began
         rows = run(stores, of, truth, rounds)
-    table = [[row["store"], row["milliseconds"], f"{row['recall']:.4f}"] for row in rows]
+    parts = [f"{part}_milliseconds" for part in ("milvus", "postgres")]
+    table = [
+        [row["store"], row["milliseconds"], *(f"{row[name]:.4f}" if name in row else "" for name in ("recall", *parts))]
+        for row in rows
+    ]
+    columns = ["store", "ms", "recall@1", "core ms of Milvus", "of PostgreSQL"]
     title = f"one query against {places:,} places; medians of {rounds} rounds"
     kept = {"places": places, "rows": rows, "fill_seconds": filled, "rounds": rounds, "queries": len(of.queries)}
-    report("cluster_search", title, ["store", "ms", "recall@1"], table, kept)
-    for row in rows:
+    report("cluster_search", title, columns, table, kept)
+    for row in rows[:2]:
         print(f"{row['store']:<40} {row['recall']:.4f}   {verdict(row['recall'], LEAST_RECALL, True)}")
 
 

@@ -4,13 +4,14 @@
 
 Robots ask at random moments, each ``--rate`` times a second.  A query passes the front (HTTP and everything but what
 follows), an encoder, Milvus and PostgreSQL; each of these is a queue with several servers (M/M/c), and has as many
-servers as keep its mean wait under ``--wait`` of its own service time.  A robot asks one map, whose places are in one
-partition, so that Milvus's time grows with the places of a map and its memory with those of all maps.
+servers as keep its mean wait under ``--wait`` of its own service time.  A robot asks one map, so that Milvus's time
+grows with the places of a map and its memory with those of all maps; that it passes over the other maps of a partition
+is not counted.
 
-Service times come from ``measured.json`` beside this file, or from what ``benchmarks.service`` and
-``benchmarks.cluster.search`` have left in ``benchmarks/results``; prices are assumptions, options of this command.
-Milvus's time is that of exact search on two cores of the machine measured, per place and core.  Before it is used, the
-model foretells what was measured: the embedded service with robots that each ask again when they have their answer.
+Service times come from ``measured.json`` beside this file, those of Milvus and PostgreSQL from what
+``benchmarks.cluster.search`` has left in ``benchmarks/results``, if it has; prices are assumptions, options of this
+command.  Milvus's is the processor time of exact search, by place.  Before it is used, the model foretells what was
+measured: the embedded service with robots that each ask again when they have their answer.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ class Index:
 
 
 INDEXES = (
-    Index("FLAT, float32 (2.3)", SINGLE, 1.0),
-    Index("IVF_RABITQ, halves on disk (2.6, not tried)", CODES, 1 / 16),
+    Index("exact", SINGLE, 1.0),
+    Index("codes", CODES, 1 / 16),
 )
-"""The second by its documentation: codes of a bit a value are searched, which are a sixteenth of halves."""
+"""FLAT of float32, as measured; IVF_RABITQ with halves on disk, not tried: its time is foretold by the bytes read."""
 
 
 def load_measured() -> dict[str, Any]:
@@ -77,21 +78,21 @@ def load_measured() -> dict[str, Any]:
     search = RESULTS / "cluster_search.json"
     if search.exists():
         kept = json.loads(search.read_text())
-        times = [row["milliseconds"] for row in kept["rows"]]
-        found["stores"] |= dict(zip(("embedded", "milvus", "milvus_alone"), times, strict=True))
-        found["stores"] |= {"places": kept["places"], "cores": kept["machine"]["cores"]}
+        row = kept["rows"][1]
+        if "milvus_milliseconds" in row:
+            found["stores"] = {"places": kept["places"], "milvus": row["milvus_milliseconds"]}
+            found["stores"] |= {"postgres": row["postgres_milliseconds"], "source": "benchmarks/results"}
     return found
 
 
 def times_of(measured: dict[str, Any]) -> Times:
     """Seconds by part."""
     core, stores = measured["core_milliseconds"], measured["stores"]
-    beyond = max(0.0, stores["milvus"] - stores["milvus_alone"])
     return Times(
         front=(core["query"] - core["encode"]) / 1e3,
         encoder=core["encode"] / 1e3,
-        postgres=beyond / 1e3,
-        per_place=stores["milvus_alone"] * stores["cores"] / stores["places"] / 1e3,
+        postgres=stores["postgres"] / 1e3,
+        per_place=stores["milvus"] / stores["places"] / 1e3,
     )
 
 

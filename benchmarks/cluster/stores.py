@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -21,30 +22,36 @@ PostgresAddress = Annotated[str, typer.Option("--postgres", help="Of its Postgre
 
 
 @dataclass(frozen=True)
-class Addresses:
-    """Of a Milvus and a PostgreSQL."""
-
-    milvus_address: str
-    postgres_address: str
-
-
-@dataclass(frozen=True)
 class Stores:
-    """Both, and the folder of the first."""
+    """Both.  processes: the numbers of Milvus's and PostgreSQL's first processes, if they were started here."""
 
     embedded: Atlas
     milvus: MilvusStore
-    folder: Path
+    processes: dict[str, int]
+
+
+def processor_seconds(process: int) -> float:
+    """That a process and its children have taken since they were started; Linux."""
+    found = 0
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            words = (folder / "stat").read_text().rpartition(")")[2].split()
+            if process in (int(folder.name), int(words[1])):
+                found += int(words[11]) + int(words[12])
+    return found / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager
 def both_stores(milvus: str, postgres: str) -> Iterator[Stores]:
     """An empty data directory and the store of two servers, which are started here if no addresses are given."""
-    servers = nullcontext(Addresses(milvus, postgres)) if milvus else running_servers()
-    with tempfile.TemporaryDirectory() as folder, servers as at:
-        embedded, there = Atlas(Path(folder)), open_store(at.milvus_address, at.postgres_address)
-        try:
-            yield Stores(embedded, there, Path(folder))
-        finally:
-            there.close()
-            embedded.close()
+    with ExitStack() as stack:
+        processes: dict[str, int] = {}
+        if not milvus:
+            servers = stack.enter_context(running_servers())
+            milvus, postgres = servers.milvus_address, servers.postgres_address
+            processes = {"milvus": servers.milvus.process_id, "postgres": servers.postgres.process_id}
+        embedded = Atlas(Path(stack.enter_context(tempfile.TemporaryDirectory())))
+        stack.callback(embedded.close)
+        there = open_store(milvus, postgres)
+        stack.callback(there.close)
+        yield Stores(embedded, there, processes)

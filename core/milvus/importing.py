@@ -19,7 +19,8 @@ from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.forms import Form
 from core.milvus.ledger import Frame, PlaceEntry
-from core.milvus.map import MilvusMap, Write
+from core.milvus.map import MilvusMap
+from core.milvus.writing import Write
 from core.places import NO_SEQUENCE, Place
 from core.storage.archives.unpacking import Content, Unpacking
 from core.storage.database.ledger import metadata_text

@@ -276,16 +276,21 @@ def entry_of(values: tuple[Any, ...]) -> PlaceEntry:
     return PlaceEntry(number, row, key, digest, sequence, ordinal, place, track, station)
 
 
+def is_storable(value: object) -> bool:
+    """Whether PostgreSQL could have a value; it has no text with a zero character or half a surrogate pair."""
+    return not isinstance(value, str) or not any(letter == "\0" or "\ud800" <= letter <= "\udfff" for letter in value)
+
+
 def find(connection: Connection[Any], map_number: int, place_id: str) -> PlaceEntry | None:
     """The place of this id; None if there is none."""
-    values = connection.execute(f"{_ENTRY} AND id = %s", (map_number, place_id)).fetchone()
-    return None if values is None else entry_of(values)
+    found = entries_by(connection, map_number, "id", [place_id])
+    return found[0] if found else None
 
 
 def entries_by(connection: Connection[Any], map_number: int, column: str, values: Sequence[Any]) -> list[PlaceEntry]:
     """The places with one of some values in a column, ``id``, ``row`` or ``key``, in any order."""
-    query = f"{_ENTRY} AND {column} = ANY(%s)"
-    return [entry_of(found) for found in connection.execute(query, (map_number, list(values)))]
+    query, wanted = f"{_ENTRY} AND {column} = ANY(%s)", [one for one in values if is_storable(one)]
+    return [entry_of(found) for found in connection.execute(query, (map_number, wanted))]
 
 
 def entries_after(
@@ -303,6 +308,8 @@ def entries_after(
         "tokens @> %s::text[]": tokens_of(wanted.metadata) if wanted.metadata else None,
     }
     conditions = {condition: value for condition, value in given.items() if value is not None}
+    if not all(map(is_storable, [wanted.sequence or "", wanted.camera or "", *(wanted.ids or ())])):
+        return []
     also = "".join(f" AND {condition}" for condition in conditions)
     query = f"{_ENTRY}{also} ORDER BY number LIMIT %s"
     return [entry_of(found) for found in connection.execute(query, (map_number, *conditions.values(), limit))]
@@ -342,7 +349,7 @@ def new_key(connection: Connection[Any]) -> int:
 def sequence_codes(connection: Connection[Any], map_number: int, names: Sequence[str]) -> dict[str, int]:
     """The codes of sequences by name; names that do not exist are left out."""
     query = "SELECT name, code FROM sequences WHERE map = %s AND name = ANY(%s)"
-    return dict(connection.execute(query, (map_number, list(names))).fetchall())
+    return dict(connection.execute(query, (map_number, [name for name in names if is_storable(name)])).fetchall())
 
 
 def new_sequence(connection: Connection[Any], map_number: int, name: str) -> int:

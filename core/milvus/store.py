@@ -287,7 +287,7 @@ class MilvusStore:
         """
         wanted = one_more(limit)
         listing: Listing = ["maps"]
-        after = decode_name(listing, cursor)
+        after = decode_name(listing, cursor).partition("\0")[0]  # which no name has
         self._expect_open()
         with self._database.reading() as connection:
             found = ledger.records_after(connection, after, wanted)

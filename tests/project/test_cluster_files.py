@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -22,8 +21,7 @@ from compose_spec import PyCompose
 
 from service.settings import Settings
 from tests.project.test_container import seconds, service
-from tests.project.test_proxy import NGINX
-from tests.service.server import free_port
+from tests.service.balancer import balanced
 
 ROOT = Path(__file__).parents[2]
 DOCKER = ROOT / "docker"
@@ -81,6 +79,14 @@ def test_every_container_is_confined_and_returns() -> None:
             for container in pod["containers"]:
                 assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}, name
                 assert "memory" in container["resources"]["limits"], name
+
+
+def test_variables_are_settings_of_the_service() -> None:
+    replica = compose()["services"]["placerec-1"]["environment"]
+    given = settings_in(replica) | settings_in(objects("ConfigMap")["placerec"]["data"])
+    given |= settings_in({one["name"]: one for one in container_of("Deployment", "placerec")["env"]})
+    of_ray = {"ray", "ray_address"}  # not there yet
+    assert given - set(Settings.model_fields) <= of_ray - set(Settings.model_fields)
 
 
 def test_no_password_stands_in_a_file() -> None:
@@ -196,49 +202,27 @@ def replicas() -> Iterator[list[ThreadingHTTPServer]]:
 
 
 @pytest.fixture
-def balanced(replicas: list[ThreadingHTTPServer], tmp_path: Path) -> Iterator[httpx.Client]:
-    """nginx with cluster.conf in front of both."""
-    tmp_path.chmod(0o755)
-    port, text = free_port(), (DOCKER / "cluster.conf").read_text()
-    places = [(f"placerec-{n}:8000", f"127.0.0.1:{one.server_port}") for n, one in enumerate(replicas, 1)]
-    for old, new in (
-        *places,
-        ("listen 8000", f"listen 127.0.0.1:{port}"),
-        ("/dev/stdout", f"{tmp_path}/access.log"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "tls.conf").write_text(text)
-    (tmp_path / "nginx.conf").write_text(NGINX.format(folder=tmp_path))
-    words = ["nginx", "-c", str(tmp_path / "nginx.conf"), "-p", str(tmp_path)]
-    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stderr
-    nginx = subprocess.Popen(words)
-    try:
-        until = time.monotonic() + 60
-        while not (tmp_path / "nginx.pid").exists() and time.monotonic() < until:
-            time.sleep(0.02)
-        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
-            yield client
-    finally:
-        nginx.terminate()
-        nginx.wait(10)
+def robot(replicas: list[ThreadingHTTPServer], tmp_path: Path) -> Iterator[httpx.Client]:
+    """Asks an nginx in front of both."""
+    ports = [replica.server_port for replica in replicas]
+    with balanced(ports, tmp_path) as url, httpx.Client(base_url=url, timeout=30) as client:
+        yield client
 
 
 @pytest.mark.skipif(shutil.which("nginx") is None, reason="nginx is not installed")
 def test_a_query_outlives_a_replica_and_a_write_is_not_sent_twice(
-    balanced: httpx.Client, replicas: list[ThreadingHTTPServer]
+    robot: httpx.Client, replicas: list[ThreadingHTTPServer]
 ) -> None:
     frame = bytes(range(256)) * 4000
     for _ in range(4):
-        assert balanced.post("/v1/maps/lab/query", content=frame).content == frame
+        assert robot.post("/v1/maps/lab/query", content=frame).content == frame
     assert all(server.asked for server in replicas), "one of two replicas is never asked"  # type: ignore[attr-defined]
 
     one, other = replicas
     for server in replicas:
         server.asked.clear()  # type: ignore[attr-defined]
     one.dies = True  # type: ignore[attr-defined]
-    answers = [balanced.post("/v1/maps/lab/query?k=3", content=frame) for _ in range(4)]
+    answers = [robot.post("/v1/maps/lab/query?k=3", content=frame) for _ in range(4)]
     assert [answer.content for answer in answers] == [frame] * 4
     assert one.asked and len(other.asked) == 4  # type: ignore[attr-defined]
 
@@ -246,6 +230,6 @@ def test_a_query_outlives_a_replica_and_a_write_is_not_sent_twice(
     for server in replicas:
         server.asked.clear()  # type: ignore[attr-defined]
     time.sleep(5.1)  # until nginx tries again the one that failed
-    refused = balanced.post("/v1/maps/lab/merge", content=frame)
+    refused = robot.post("/v1/maps/lab/merge", content=frame)
     assert refused.status_code == 502
     assert len(one.asked + other.asked) == 1  # type: ignore[attr-defined]

@@ -115,6 +115,12 @@ class Server:
         self._variables = {**os.environ, **(variables or {})}
         self._process: subprocess.Popen[bytes] | None = None
 
+    @property
+    def process_id(self) -> int:
+        """Of its first process, while it runs."""
+        assert self._process is not None, "it does not run"
+        return self._process.pid
+
     def start(self) -> None:
         """Start it and wait until it answers.
 

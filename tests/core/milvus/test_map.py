@@ -7,9 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
+import psycopg
 import pytest
 
-from core.errors import RevisionMismatch, StoreUnavailable
+from core.errors import RevisionMismatch, StoreOfAnotherVersion, StoreUnavailable
 from core.frames.images import encode_png
 from core.judgement.priors import Disc, Facing
 from core.maps import Map, MapSettings, PlaceFilter, Selection
@@ -147,6 +148,25 @@ def test_what_was_left_over_is_deleted(store: MilvusStore, monkeypatch: pytest.M
     lab.enrol([frame("c")])
     assert lab.snapshot().leavings == ()
     assert len(lab.snapshot()) == 2
+
+
+def test_tables_of_another_version(servers: Servers, store: MilvusStore) -> None:
+    made(store)
+
+    def call_it(version: int) -> None:
+        with psycopg.connect(servers.postgres_address) as connection:
+            connection.execute("UPDATE placerec SET version = %s", (version,))
+
+    call_it(2)
+    later = connected(servers)
+    try:
+        for ask in (lambda: later.get("lab"), later.check_writable):
+            with pytest.raises(StoreOfAnotherVersion, match="version 2, which this placerec does not read"):
+                ask()
+    finally:
+        call_it(1)
+    assert later.get("lab").record.id == "lab"
+    later.close()
 
 
 def test_a_server_that_is_gone(servers: Servers, store: MilvusStore) -> None:

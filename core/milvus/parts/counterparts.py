@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING
 
 from core.maps.counterparts import Correspondence, brought_over
 from core.milvus import ledger
-from core.milvus.cameras import Access
-
-if TYPE_CHECKING:
-    from core.milvus.map import Write
+from core.milvus.parts.cameras import Access
+from core.milvus.writing import Write
 
 
 class MilvusCounterparts:

@@ -13,6 +13,7 @@ from core.errors import InvalidField, UnknownCamera
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
 from core.maps.cameras import MOST_CAMERAS, CameraRecord, Cameras
+from core.milvus.ledger import is_storable
 
 Access = Callable[[], AbstractContextManager[Connection[Any]]]
 
@@ -36,6 +37,8 @@ class MilvusCameras(Cameras):
 
     def known(self, name: str) -> CameraRecord | None:
         """One camera; None if the map has none of this name."""
+        if not is_storable(name):
+            return None
         with self._reading() as connection:
             query = "SELECT record FROM cameras WHERE map = %s AND name = %s"
             found = connection.execute(query, (self._map, name)).fetchone()

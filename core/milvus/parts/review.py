@@ -16,8 +16,8 @@ from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
 from core.maps.review import ReviewFrame
 from core.milvus import ledger
-from core.milvus.cameras import Access
 from core.milvus.database import Database
+from core.milvus.parts.cameras import Access
 
 _COLUMNS = "number, at, digest, size, answer, label"
 

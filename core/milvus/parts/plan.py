@@ -9,7 +9,7 @@ from typing import Any
 from core.maps.place_filter import EVERY_PLACE
 from core.maps.store import HANDED_OVER, HAS_PICTURE
 from core.milvus import ledger
-from core.milvus.cameras import Access
+from core.milvus.parts.cameras import Access
 from core.places import Pose
 
 _DIGITS = {"x": 3, "y": 3, "z": 3, "latitude": 7, "longitude": 7, "heading": 2}

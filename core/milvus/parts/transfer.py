@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING
 
 from core.maps.place_filter import EVERY_PLACE, PlaceFilter
 from core.maps.records import Enrolment, History, Outline
 from core.milvus import ledger
-from core.milvus.cameras import Access
+from core.milvus.parts.cameras import Access
+from core.milvus.writing import Write
 from core.places import Place
-
-if TYPE_CHECKING:
-    from core.milvus.map import Write
 
 
 class MilvusTransfer:

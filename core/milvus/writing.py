@@ -1,0 +1,215 @@
+"""One write to a map: what a transaction of PostgreSQL changes, and the entities that Milvus gets before its COMMIT."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import Any
+
+from psycopg import Connection
+
+from core.errors import UnknownPlace
+from core.geometry.keypoints import Keypoints
+from core.maps.place_filter import PlaceFilter
+from core.maps.records import Change, Enrolment, History, Keep, KeptFrame, MapRecord, SameFrame
+from core.milvus import ledger
+from core.milvus.collection import Collection, Entity
+from core.milvus.forms import Form
+from core.milvus.ledger import Frame, MapState, PlaceEntry
+from core.milvus.tokens import tokens_of
+from core.places import Place, PlaceFields, Pose
+from core.storage.database.ledger import metadata_text, picture_of, same_fields
+
+
+class Write:
+    """Collects what one transaction changes of a map, whose row it has locked."""
+
+    def __init__(self, connection: Connection[Any], collection: Collection, state: MapState) -> None:
+        self.state = state
+        self.connection, self._collection = connection, collection
+        self._before, self._form = state, Form(state.record)
+        self._entities: dict[int, Callable[[], Entity]] = {}  # by the number of the place
+        self._changed = False
+        self._now = datetime.now(UTC)
+
+    def expect(self, place_id: str) -> PlaceEntry:
+        """A place.
+
+        Raises:
+            UnknownPlace.
+        """
+        return expect_place(self.connection, self.state.number, place_id)
+
+    def all_of(self, wanted: PlaceFilter, limit: int | None, after: int = -1) -> list[PlaceEntry]:
+        """Places that fulfil some conditions, in the order of their enrolment, behind the number ``after``."""
+        return ledger.entries_after(self.connection, self.state.number, after, limit, wanted)
+
+    def enrol(self, item: Enrolment, keep: Keep | None = None) -> tuple[Place, Change]:
+        """Create a place, replace its frame, or change its fields if the frame is the same.
+
+        Args:
+            keep: what to keep of the frame; by default what the map's settings say.
+        """
+        stored = ledger.find(self.connection, self.state.number, item.id)
+        keypoints = None if item.keypoints is None or not self.state.record.verification else item.keypoints.record()
+        if stored is not None and stored.digest == item.digest:
+            if keypoints is not None:
+                ledger.put_keypoints(self.connection, self.state.number, stored.row, keypoints)
+            return self.set_fields(stored, item.fields)
+        metadata_text(item.fields.metadata)  # raises InvalidField
+        row, kept = self.state.rows, picture_of(item, self.state.record.keep if keep is None else keep)
+        descriptor, local = self._form.packed(item.descriptor, item.local)
+        frame = Frame(descriptor, local, keypoints, kept[1])
+        ledger.put_frame(self.connection, self.state.number, row, frame)
+        self.state = replace(self.state, rows=row + 1)
+        place = Place(
+            **dict(item.fields), id=item.id, regions=item.regions, picture=kept[0],
+            created_at=self._now if stored is None else stored.place.created_at, updated_at=self._now,
+        )  # fmt: skip
+        if stored is None:
+            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
+            entry = PlaceEntry(self.new_key(), row, self.new_key(), item.digest, code, ordinal, place)
+            self.state = replace(self.state, places=self.state.places + 1)
+            self._put(entry, descriptor)
+            return place, "created"
+        shown = replace(self._placed(stored, place), row=row, digest=item.digest, track=None, station=None)
+        self._put(shown, descriptor)
+        self._let_go(stored, stored.row)
+        return place, "replaced"
+
+    def renew(self, item: SameFrame) -> tuple[Place, Change] | None:
+        """Change the fields of a place that shows this frame; None if it shows another frame or is gone."""
+        stored = ledger.find(self.connection, self.state.number, item.id)
+        return None if stored is None or stored.digest != item.digest else self.set_fields(stored, item.fields)
+
+    def set_fields(self, stored: PlaceEntry, fields: PlaceFields) -> tuple[Place, Change]:
+        """Change the fields of a place; its frame stays."""
+        if same_fields(stored.place, fields):
+            return stored.place, "unchanged"
+        changed = {name: getattr(fields, name) for name in PlaceFields.model_fields}
+        if fields.pose != stored.place.pose:
+            changed["pose_of"] = None
+        place = stored.place.model_copy(update={**changed, "updated_at": self._now})
+        self._put(self._placed(stored, place), self._kept_descriptor(stored))
+        self._let_go(stored, None)
+        return place, "updated"
+
+    def _kept_descriptor(self, stored: PlaceEntry) -> bytes:
+        kept: bytes = ledger.of_frames(self.connection, self.state.number, "descriptor", [stored.row])[stored.row]
+        return kept
+
+    def renew_entity(self, stored: PlaceEntry) -> None:
+        """Give Milvus the entity of a place again."""
+        if stored.number not in self._entities:
+            self._put(replace(stored, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+
+    def adopt(self, item: Enrolment, history: History) -> None:
+        """Store a place of another map with its history."""
+        self.enrol(item, history.picture)
+        stored = self.expect(item.id)
+        moments = {"created_at": history.created_at, "updated_at": history.updated_at}
+        ordinal = stored.ordinal if history.ordinal is None else history.ordinal
+        changed = replace(stored, place=stored.place.model_copy(update=moments), ordinal=ordinal)
+        if stored.number in self._entities:  # Milvus does not have it yet
+            self._put(changed, self._kept_descriptor(stored))
+        elif ordinal == stored.ordinal:
+            ledger.put(self.connection, self.state.number, changed)
+            self._changed = True
+        else:
+            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+        ledger.put_ordinal(self.connection, self.state.number, stored.sequence, ordinal)
+
+    def set_counterpart(
+        self, stored: PlaceEntry, track: int | None, station: int | None, pose: Pose | None, pose_of: str | None
+    ) -> None:
+        """Set the station of a place, None for its own, its pose and the place from which it got the pose."""
+        if (track, station) == (stored.sequence, stored.ordinal):
+            track = station = None
+        fields: dict[str, Any] = {"pose_of": pose_of}
+        if pose != stored.place.pose:
+            fields |= {"pose": pose, "updated_at": self._now}
+        place = stored.place.model_copy(update=fields)
+        changed = replace(stored, track=track, station=station, place=place)
+        if pose == stored.place.pose:  # Milvus knows nothing of stations
+            ledger.put(self.connection, self.state.number, changed)
+            self._changed = True
+        else:
+            self._put(replace(changed, key=self.new_key()), self._kept_descriptor(stored))
+            self._let_go(stored, None)
+
+    def add_keypoints(self, frame: KeptFrame, found: Keypoints) -> bool:
+        """Store the keypoints of a place that has none, if it still shows the frame; returns whether it does."""
+        stored = ledger.find(self.connection, self.state.number, frame.id)
+        if stored is None or stored.digest != frame.digest or not self.state.record.verification:
+            return False
+        self._changed = True
+        return ledger.put_keypoints(self.connection, self.state.number, stored.row, found.record())
+
+    def _placed(self, stored: PlaceEntry, place: Place) -> PlaceEntry:
+        """A place with other fields, under a new key; its position in its sequence changes only with the sequence."""
+        code, ordinal = stored.sequence, stored.ordinal
+        if place.sequence != stored.place.sequence:
+            code, ordinal = ledger.next_in_sequence(self.connection, self.state.number, place.sequence)
+        return replace(stored, key=self.new_key(), sequence=code, ordinal=ordinal, place=place)
+
+    def forget(self, stored: PlaceEntry) -> None:
+        """Delete a place."""
+        ledger.remove(self.connection, self.state.number, stored)
+        self._entities.pop(stored.number, None)
+        self.state = replace(self.state, places=self.state.places - 1)
+        self._let_go(stored, stored.row)
+
+    def edit(self, record: MapRecord) -> None:
+        """Replace the map's record, with the next revision."""
+        changed = {"revision": self.state.record.revision + 1, "updated_at": self._now}
+        self.state = replace(self.state, record=record.model_copy(update=changed))
+
+    def new_key(self) -> int:
+        """A number that was never used before."""
+        return ledger.new_key(self.connection)
+
+    def _put(self, entry: PlaceEntry, descriptor: bytes) -> None:
+        ledger.put(self.connection, self.state.number, entry)
+        camera, tokens = entry.place.camera, tokens_of(entry.place.metadata)
+        self._entities[entry.number] = lambda: Entity(
+            entry.key, entry.row, self._form.descriptors([descriptor])[0], entry.whereabouts(), camera, tokens
+        )
+
+    def put_new(self, entry: PlaceEntry, frame: Frame) -> None:
+        """Store a place that is not there yet, and its frame in the next row."""
+        ledger.put_frame(self.connection, self.state.number, entry.row, frame)
+        self.state = replace(self.state, rows=entry.row + 1, places=self.state.places + 1)
+        self._put(entry, frame.descriptor)
+
+    def _let_go(self, stored: PlaceEntry, row: int | None) -> None:
+        """Note that a place's former entity, and its former frame, are not used any more."""
+        ledger.leave(self.connection, self.state.number, stored.key, row)
+        ledger.drop_if_empty(self.connection, self.state.number, stored.sequence)
+
+    def finish(self) -> None:
+        """Give Milvus what is new, before the COMMIT that makes it count.
+
+        Raises:
+            StorageFailure: Milvus refuses; nothing counts of what it may have taken.
+        """
+        if self._entities:
+            inserted = self._collection.insert(self.state.number, [made() for made in self._entities.values()])
+            self.state = replace(self.state, inserted=max(self.state.inserted, inserted))
+        if self.state != self._before or self._entities or self._changed:
+            self.state = replace(self.state, writes=self.state.writes + 1)
+            ledger.update(self.connection, self.state)
+
+
+def expect_place(connection: Connection[Any], map_number: int, place_id: str) -> PlaceEntry:
+    """The place of this id.
+
+    Raises:
+        UnknownPlace: there is none.
+    """
+    entry = ledger.find(connection, map_number, place_id)
+    if entry is None:
+        raise UnknownPlace(f"The map has no place {place_id[:140]!r}.")
+    return entry

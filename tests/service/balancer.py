@@ -1,0 +1,58 @@
+"""A real nginx with docker/cluster.conf in front of two services."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from tests.service.server import ROOT, free_port
+
+NGINX = """
+daemon off;
+pid {folder}/nginx.pid;
+error_log {folder}/error.log;
+events {{}}
+http {{
+    client_body_temp_path {folder}/body;
+    proxy_temp_path {folder}/proxy;
+    fastcgi_temp_path {folder}/fastcgi;
+    uwsgi_temp_path {folder}/uwsgi;
+    scgi_temp_path {folder}/scgi;
+    include {folder}/cluster.conf;
+}}
+"""
+
+
+@contextmanager
+def balanced(ports: Sequence[int], folder: Path) -> Iterator[str]:
+    """The address of an nginx in front of two services at these ports of this machine, as long as the block runs.
+
+    Raises:
+        AssertionError: nginx refuses the configuration.
+    """
+    folder.chmod(0o755)
+    port, text = free_port(), (ROOT / "docker/cluster.conf").read_text()
+    for old, new in (
+        *((f"placerec-{number}:8000", f"127.0.0.1:{one}") for number, one in enumerate(ports, 1)),
+        ("listen 8000", f"listen 127.0.0.1:{port}"),
+        ("/dev/stdout", f"{folder}/access.log"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "cluster.conf").write_text(text)
+    (folder / "nginx.conf").write_text(NGINX.format(folder=folder))
+    words = ["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)]
+    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    nginx = subprocess.Popen(words)
+    try:
+        until = time.monotonic() + 60
+        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
+            time.sleep(0.02)
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        nginx.terminate()
+        nginx.wait(10)
