@@ -10,19 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from core.baselines import (
-    attentive_attention,
     calc,
     compact,
-    context_flexible_attention,
     convnets,
     cross_region,
     fabmap,
-    fix_context,
     hog,
     netvlad,
     pooling,
     seqslam,
 )
+from core.baselines.attention import attentive_attention, context_flexible_attention, fix_context
 from core.baselines.encoders import EncoderSystem, about_encoder
 from core.baselines.stages import (
     FIRST_STAGE,

@@ -51,12 +51,14 @@ class Database:
             if self._pool is None:
                 with self._connecting() as connection:
                     connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
-                    if (found := version_of(connection)) not in (None, VERSION):
+                    found = version_of(connection)
+                    if found is None:
+                        connection.execute(TABLES)
+                    elif found != VERSION:
                         raise StoreOfAnotherVersion(
                             f"The tables in PostgreSQL are those of version {found}, which this placerec does not "
                             f"read; it reads version {VERSION}."
                         )
-                    connection.execute(TABLES)
                 self._pool = ConnectionPool(
                     self._address, min_size=1, max_size=MOST_CONNECTIONS, timeout=_PATIENCE_SECONDS,
                     kwargs=_CONNECTING, check=ConnectionPool.check_connection, open=True,

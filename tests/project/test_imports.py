@@ -110,6 +110,7 @@ EXTRAS = {
     "core/recordings": {"bags"},
     "examples": {"bags"},
     "service/ray_serve": {"ray"},
+    "service/shared": {"milvus"},
     "training": {"report"},
 }
 """Folders that may import what an extra brings; tests and benchmarks may import all."""

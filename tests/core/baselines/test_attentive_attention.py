@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from core.baselines import registry
-from core.baselines.attentive_attention import Attention
+from core.baselines.attention.attentive_attention import Attention
 from core.baselines.system import System
 from core.errors import InvalidModel
 from core.method.catalogue import EncoderCatalogue

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors.torch import save_file
 
 from core.baselines import registry
-from core.baselines.context_flexible_attention import FlexibleContext
+from core.baselines.attention.context_flexible_attention import FlexibleContext
 from core.baselines.system import System
 from core.errors import InvalidModel
 from core.method.catalogue import EncoderCatalogue

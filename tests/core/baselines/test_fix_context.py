@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from core.baselines import registry
-from core.baselines.fix_context import FixedContext
+from core.baselines.attention.fix_context import FixedContext
 from core.baselines.system import System
 from core.errors import InvalidModel
 from core.method.catalogue import EncoderCatalogue

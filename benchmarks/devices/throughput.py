@@ -4,7 +4,7 @@ Frames are decoded; they are encoded together, each in a thread.  The latency is
 threads in its forward pass.  The last column is the least cosine of the descriptors to those of one core: an encoder
 identity promises 0.999.
 
-python -m benchmarks.processors [--images FOLDER]
+python -m benchmarks.devices.throughput [--images FOLDER]
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def main(
             )
     columns = ["device, threads", "frames/s", "ms of one", "least cosine"]
     title = f"{encoder} on {', '.join(sorted({row['name'] for row in figures}))}"
-    report("processors", title, columns, rows, {"encoder": chosen.identity, "rows": figures})
+    report("throughput", title, columns, rows, {"encoder": chosen.identity, "rows": figures})
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Cosines of descriptors whose forward pass has a lower precision to those of float32; one identity promises 0.999.
 
-python -m benchmarks.forward_precision FOLDER [FOLDER …]
+python -m benchmarks.devices.precision FOLDER [FOLDER …]
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, softplus
 
-from core.baselines.attentive_attention import read_pair
+from core.baselines.attention.attentive_attention import read_pair
 from core.baselines.netvlad import unit_rows
 from core.baselines.system import About, Array, Resources, VectorSystem
 from core.errors import InvalidModel
@@ -47,8 +47,8 @@ ABOUT = About(
     "IEEE RA-L 3(4), 2018",
     {"network": "VGG-16", "layers": CONTEXT_LAYERS, "input": (SIDE, SIDE), "values": "conv5_3 under the mask"},
     weights=(
-        "a safetensors file in the layout that core/baselines/context_flexible_attention.py describes; no weights of "
-        "it are published, so they must come from a training of one's own."
+        "a safetensors file in the layout that core/baselines/attention/context_flexible_attention.py describes; no "
+        "weights of it are published, so they must come from a training of one's own."
     ),
 )
 

@@ -1,0 +1,1 @@
+"""What processors and GPUs make of the encoder."""

@@ -1,0 +1,1 @@
+"""Systems that reweight the features of a frame by learned attention before they aggregate them."""
