@@ -163,17 +163,18 @@ async def robots(queue: EncoderQueue, stop: asyncio.Event) -> int:
     return sum(await asyncio.gather(*(robot(number) for number in range(6))))
 
 
-async def test_frames_of_a_killed_replica_are_encoded_by_another(queue: EncoderQueue, metrics: Metrics) -> None:
+async def test_frames_of_a_killed_replica_are_encoded_by_another(queue: EncoderQueue) -> None:
     victim = min(await asyncio.to_thread(pids, 2))
     stop = asyncio.Event()
     load = asyncio.ensure_future(robots(queue, stop))
     await asyncio.sleep(1)
+    os.kill(victim, signal.SIGSTOP)  # it still has frames, or gets some, when it is killed
+    await asyncio.sleep(0.5)
     os.kill(victim, signal.SIGKILL)
     await asyncio.sleep(3)
     await asyncio.to_thread(wait_for_replicas, queue, 2)
     stop.set()
     assert await load > 12  # an error of any would have been raised
-    assert value(metrics, "placerec_encoder_calls_lost_total") >= 1
     assert victim not in await asyncio.to_thread(pids, 2)
 
 
