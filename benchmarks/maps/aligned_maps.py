@@ -94,7 +94,7 @@ def _seasons(folder: Path, start: int, stop: int) -> Sequence[list[Pixels]]:
 def create(runtime: Runtime, map_id: str, encoder: Encoder) -> Map:
     """An empty map."""
     settings = MapSettings(keep="none")
-    return runtime.engine.atlas.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape)
+    return runtime.engine.maps.create(map_id, encoder.identity, encoder.dimension, settings, encoder.local_shape)
 
 
 def _alike(wide: Truth, truth: Truth) -> Truth:

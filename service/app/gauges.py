@@ -71,7 +71,7 @@ class RuntimeCollector(Collector):
             records = self._runtime.engine.all_records()
         for record in records:
             with suppress(PlacerecError):  # it was deleted or found to be damaged since it was listed
-                map_ = self._runtime.engine.atlas.find(record.id)
+                map_ = self._runtime.engine.maps.find(record.id)
                 if map_.is_open:
                     status = map_.index_status()
                     open_ += 1

@@ -40,7 +40,7 @@ async def check_readiness(runtime: RuntimeDep, principal: PrincipalDep) -> Readi
     A damaged map does not make the service unready; it is listed here if the key may use it.
     """
     checks = await runtime.check_readiness()
-    damaged = runtime.engine.atlas.quarantined().items()
+    damaged = runtime.engine.maps.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return Readiness(checks=checks, encoder=runtime.settings.encoder, quarantined=quarantined)
 

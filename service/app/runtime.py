@@ -132,10 +132,10 @@ class Runtime:
         unended = [job.arguments for job in self.jobs.all() if not job.ended]
         unfinished = {arguments.get("to") for arguments in unended}
         self.staging.clean({arguments["form"] for arguments in unended if "form" in arguments})
-        for map_id in self.engine.atlas.abandoned():
+        for map_id in self.engine.maps.abandoned():
             if map_id not in unfinished:
                 with suppress(PlacerecError):  # the next start tries again
-                    self.engine.atlas.abandon(map_id)
+                    self.engine.maps.abandon(map_id)
 
     async def close(self) -> None:
         """Stop the jobs, save what is in memory, and release the data directory."""
@@ -174,8 +174,8 @@ class Runtime:
     def _check_store(self) -> tuple[str, str]:
         """The states of the servers that have the maps, if there are such, and of the disk."""
         if self.settings.store == "embedded":
-            return "ok", _outcome(self.engine.atlas.check_writable)
-        return _outcome(self.engine.atlas.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
+            return "ok", _outcome(self.engine.maps.check_writable)
+        return _outcome(self.engine.maps.check_writable), _outcome(partial(check_writable, self.settings.data_dir))
 
 
 def _outcome(check: Callable[[], None]) -> str:

@@ -99,7 +99,7 @@ class Engine:
     ) -> None:
         self.settings, self.metrics = settings, metrics
         self._store = OpenStore(settings)
-        self.atlas: Store = self._store.maps
+        self.maps: Store = self._store.maps
         self.catalogue = EncoderCatalogue(settings.models_directory, settings.precision, settings.device)
         if make_encoders is not None:  # then an encoder compares descriptors here, and makes none
             self.catalogue = EncoderCatalogue(settings.models_directory, "float32")
@@ -114,7 +114,7 @@ class Engine:
         """The state of the default encoder: "loading", "ok", or a sentence that says why it cannot be used."""
         self._locks = MapLocks()
         self._loading: asyncio.Task[None] | None = None
-        self._map_collector = MapCollector(self._count_places, lambda: len(self.atlas.quarantined()))
+        self._map_collector = MapCollector(self._count_places, lambda: len(self.maps.quarantined()))
         metrics.registry.register(self._map_collector)
 
     def start(self) -> None:
@@ -161,15 +161,15 @@ class Engine:
         with suppress(StoreUnavailable):  # the metrics of everything else are wanted most then
             for record in self.all_records():
                 with suppress(UnknownMap, MapQuarantined):  # it was deleted or quarantined since it was listed
-                    counts[record.id] = self.atlas.find(record.id).count_places()
+                    counts[record.id] = self.maps.find(record.id).count_places()
         return counts
 
     def all_records(self) -> list[MapRecord]:
         """The records of all maps that are in service (not quarantined)."""
-        found, cursor = self.atlas.records(None, 1000)
+        found, cursor = self.maps.records(None, 1000)
         records = list(found)
         while cursor is not None:
-            found, cursor = self.atlas.records(cursor, 1000)
+            found, cursor = self.maps.records(cursor, 1000)
             records += found
         return records
 
@@ -217,8 +217,8 @@ class Engine:
             MapQuarantined: the map is damaged.
         """
         # The map is nearly always open, and then no thread is needed.
-        found = self.atlas.opened(map_id)
-        return found if found is not None else await in_thread(self.atlas.get, map_id)
+        found = self.maps.opened(map_id)
+        return found if found is not None else await in_thread(self.maps.get, map_id)
 
     async def encode_for(
         self,

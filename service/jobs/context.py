@@ -66,7 +66,7 @@ class JobContext:
         self.notes = job.notes
         self.maps = job.maps
 
-    def map(self, atlas: Store, map_id: str | None = None) -> Map:
+    def map(self, store: Store, map_id: str | None = None) -> Map:
         """One of the job's maps: the one with id ``map_id``, or by default the map that the job works on.
 
         Raises:
@@ -75,7 +75,7 @@ class JobContext:
             StorageFailure: the map cannot be read.
         """
         name = str(self.map_id) if map_id is None else map_id
-        found = atlas.get(name)
+        found = store.get(name)
         if name in self.maps and self.maps[name] != creation_time(found):
             raise UnknownMap(
                 f"The map {name!r} was deleted after the job was submitted; the map of that id is now another one."

@@ -354,7 +354,7 @@ def run_job(engine: Engine, statistics: QueryStatistics, context: JobContext) ->
             StorageFull, StorageFailure: the map keeps its calibration.
         JobCancelled, JobInterrupted.
     """
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     arguments = dict(context.arguments)
     expected, replaces = arguments.pop("revision"), arguments.pop("replaces")
     order = CalibrationOrder.model_validate(arguments)

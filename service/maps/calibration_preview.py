@@ -68,7 +68,7 @@ def read_calibration(
     The frames are those of the latest calibrate, which are not asked again. To apply a threshold, send it by PATCH to
     the map with this answer's ETag as `If-Match`.
     """
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     record = map_.record
     in_force = record.calibration or engine.default_calibration(record.encoder)
     response.headers["ETag"] = entity_tag(record.revision)

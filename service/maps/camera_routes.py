@@ -44,7 +44,7 @@ def put_camera(
     until their frames are sent again. Intrinsics hold for all frames of the camera, enrolled ones included. What is
     left out is removed.
     """
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     made, is_new = map_.cameras.put(name, definition.mask, definition.intrinsics)
     tell_map(engine, map_, "cameras")
     response.status_code = 201 if is_new else 200
@@ -54,18 +54,18 @@ def put_camera(
 @router.get("")
 def list_cameras(map_id: MapId, engine: EngineDep) -> CameraList:
     """List the cameras of a map."""
-    return CameraList(items=[CameraView(**camera.__dict__) for camera in engine.atlas.get(map_id).cameras.all()])
+    return CameraList(items=[CameraView(**camera.__dict__) for camera in engine.maps.get(map_id).cameras.all()])
 
 
 @router.get("/{camera}", responses=problem_documentation(errors.UnknownCamera))
 def read_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> CameraView:
     """Read one camera."""
-    return CameraView(**engine.atlas.get(map_id).cameras.find(name).__dict__)
+    return CameraView(**engine.maps.get(map_id).cameras.find(name).__dict__)
 
 
 @router.delete("/{camera}", status_code=204, responses=problem_documentation(errors.UnknownCamera, errors.StorageFull))
 def forget_camera(map_id: MapId, name: CameraName, engine: EngineDep) -> None:
     """Forget a camera. Frames that name it are refused from then on; places that were enrolled with it stay."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     map_.cameras.forget(name)
     tell_map(engine, map_, "cameras")

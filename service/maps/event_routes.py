@@ -179,7 +179,7 @@ class MapStream:
     def _is_gone(self) -> bool:
         """Whether the map was deleted, replaced or found to be damaged."""
         try:
-            return self._engine.atlas.find(self._map.record.id).record.created_at != self._map.record.created_at
+            return self._engine.maps.find(self._map.record.id).record.created_at != self._map.record.created_at
         except errors.StoreUnavailable:
             return False
         except errors.PlacerecError:

@@ -238,7 +238,7 @@ class Imports:
         with archive:
             self.check_encoder(archive.manifest)
             limits = self._picture_limits()
-            self._engine.atlas.import_map(
+            self._engine.maps.import_map(
                 archive,
                 map_id,
                 advance,
@@ -256,7 +256,7 @@ class Imports:
 
     def _is_listed(self, made: Mapping[str, Any]) -> bool:
         try:
-            return self._engine.atlas.find(made["map"]).record.created_at.isoformat() == made["created_at"]
+            return self._engine.maps.find(made["map"]).record.created_at.isoformat() == made["created_at"]
         except UnknownMap:
             return False
 

@@ -15,7 +15,7 @@ def check_map_count(engine: Engine) -> None:
         TooManyMaps: there are as many maps as the settings allow.
     """
     most = engine.settings.max_maps
-    count = len(engine.all_records()) + len(engine.atlas.quarantined()) + len(engine.atlas.unlisted())
+    count = len(engine.all_records()) + len(engine.maps.quarantined()) + len(engine.maps.unlisted())
     if count >= most:
         raise TooManyMaps(f"There are {count} maps, and at most {most} are allowed; delete one that is not needed.")
 
@@ -29,10 +29,10 @@ def check_new_map(engine: Engine, jobs: Jobs, map_id: str) -> None:
     """
     check_map_count(engine)
     pending = {job.arguments.get("to") for job in jobs.all() if not job.ended}
-    if map_id in pending or map_id in engine.atlas.unlisted():
+    if map_id in pending or map_id in engine.maps.unlisted():
         raise MapExists(f"A map {map_id!r} is being made.")
     try:
-        engine.atlas.find(map_id)
+        engine.maps.find(map_id)
     except UnknownMap:
         return
     except MapQuarantined:

@@ -113,7 +113,7 @@ def create_map(
     settings = MapSettings(**new.model_dump(exclude={"id", "encoder", "precision"}))
     with engine.writing(ALL_MAPS):
         check_map_count(engine)
-        map_ = engine.atlas.create(
+        map_ = engine.maps.create(
             new.id, identity, encoder.dimension, settings, encoder.local_shape, precision=new.precision
         )
     map_.open()
@@ -126,16 +126,16 @@ def create_map(
 def list_maps(page: Page, engine: EngineDep, statistics: StatisticsDep, principal: PrincipalDep) -> MapPage:
     """List the maps in the order of their ids, and the damaged maps; a key limited to some maps sees only those."""
     if principal.maps is None:
-        records, next_cursor = engine.atlas.records(page.cursor, page.limit)
+        records, next_cursor = engine.maps.records(page.cursor, page.limit)
     else:
         records, next_cursor = _records_among(engine, principal.maps, page)
     items, last_day = [], _last_day(statistics)
     for record in records:
         try:
-            items.append(show_map(engine, engine.atlas.find(record.id), last_day))
+            items.append(show_map(engine, engine.maps.find(record.id), last_day))
         except (errors.UnknownMap, errors.MapQuarantined):
             continue  # it was deleted or found to be damaged since it was listed
-    damaged = engine.atlas.quarantined().items()
+    damaged = engine.maps.quarantined().items()
     quarantined = [QuarantinedMap(id=name, reason=reason) for name, reason in damaged if principal.may_use(name)]
     return MapPage(items=items, next_cursor=next_cursor, quarantined=quarantined)
 
@@ -146,14 +146,14 @@ def _records_among(engine: Engine, map_ids: frozenset[str], page: PageParameters
     found = []
     for map_id in sorted(map_ids):
         with suppress(errors.UnknownMap, errors.MapQuarantined):
-            found += [engine.atlas.find(map_id).record] if map_id > decode_name(listing, page.cursor) else []
+            found += [engine.maps.find(map_id).record] if map_id > decode_name(listing, page.cursor) else []
     return page_of(listing, found, page.limit, lambda record: record.id)
 
 
 @router.get("/{map}", responses=problem_documentation(errors.UnknownMap))
 def read_map(map_id: MapId, engine: EngineDep, statistics: StatisticsDep, response: Response) -> MapView:
     """Read a map's settings, calibration and size; send its ETag as `If-Match` when you edit the map."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     response.headers["ETag"] = entity_tag(map_.record.revision)
     return show_map(engine, map_, _last_day(statistics, map_))
 
@@ -179,7 +179,7 @@ def edit_map(
     A calibration that is set here becomes the map's own (`"source": "manual"`); values that are left out are those
     of the calibration in force. `null` restores the encoder's default.
     """
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     expected = expected_revision(if_match, map_.record.revision)
     settings = _settings_changes(engine, map_, changes)
     edited = map_.edit(settings, expected)
@@ -236,8 +236,8 @@ def _own_calibration(engine: Engine, map_: Map, changes: CalibrationChanges | No
 def delete_map(map_id: MapId, engine: EngineDep, if_match: IfMatch = None) -> None:
     """Delete a map with everything that it contains. A damaged map can be deleted, too."""
     if if_match is not None:
-        expected_revision(if_match, engine.atlas.find(map_id).record.revision)
-    engine.atlas.delete(map_id)
+        expected_revision(if_match, engine.maps.find(map_id).record.revision)
+    engine.maps.delete(map_id)
     engine.metrics.forget_map(map_id)
     tell_end(engine, map_id)
 
@@ -260,6 +260,6 @@ def verify_map(
 ) -> VerifyReport | Response:
     """Read all files of a map, which may be damaged, and compare them with their checksums."""
     if not background:
-        return engine.atlas.verify(map_id)
+        return engine.maps.verify(map_id)
     job = jobs.submit(storage_jobs.VERIFY, map_id, arguments={}, maps=storage_jobs.creation_times(engine, map_id))
     return accepted(job, engine.settings)

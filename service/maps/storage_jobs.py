@@ -20,7 +20,7 @@ def rebuild(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         UnknownMap, MapQuarantined, StorageFailure: the map keeps the index that it had.
         JobCancelled, JobInterrupted.
     """
-    status = context.map(engine.atlas).rebuild_index(_progress_callback(engine, context))
+    status = context.map(engine.maps).rebuild_index(_progress_callback(engine, context))
     return {"index": status.model_dump(mode="json")}
 
 
@@ -32,8 +32,8 @@ def verify(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         JobCancelled, JobInterrupted.
     """
     with suppress(MapQuarantined):  # a damaged map can be verified, too
-        context.map(engine.atlas)
-    return engine.atlas.verify(str(context.map_id), _progress_callback(engine, context)).model_dump(mode="json")
+        context.map(engine.maps)
+    return engine.maps.verify(str(context.map_id), _progress_callback(engine, context)).model_dump(mode="json")
 
 
 def creation_times(engine: Engine, map_id: str) -> dict[str, str]:
@@ -43,7 +43,7 @@ def creation_times(engine: Engine, map_id: str) -> dict[str, str]:
         UnknownMap, StorageFailure.
     """
     try:
-        return {map_id: creation_time(engine.atlas.find(map_id))}
+        return {map_id: creation_time(engine.maps.find(map_id))}
     except MapQuarantined:
         return {}
 

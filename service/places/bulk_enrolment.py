@@ -154,7 +154,7 @@ class _BulkEnrolment:
 
     def __init__(self, engine: Engine, staging: Staging, context: JobContext) -> None:
         self.engine, self.context = engine, context
-        self.map = context.map(engine.atlas)
+        self.map = context.map(engine.maps)
         self.form = staging.open(context.arguments["form"])
         self.entries, self.files = _read_form(engine, self.form)
         self.first: dict[str, int] = {}

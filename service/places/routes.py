@@ -245,7 +245,7 @@ async def _enrol_later(
 @router.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_places(map_id: MapId, page: PlacePageQuery, engine: EngineDep) -> PlacePage:
     """List places in the order of their enrolment: all, or those of a traverse, a camera, a time, or some metadata."""
-    places, next_cursor = engine.atlas.get(map_id).places(page.cursor, page.limit, page.wanted())
+    places, next_cursor = engine.maps.get(map_id).places(page.cursor, page.limit, page.wanted())
     return PlacePage(items=[PlaceView.of(place) for place in places], next_cursor=next_cursor)
 
 
@@ -261,7 +261,7 @@ def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: En
 
     To delete exactly the places that a dry run named, send their ids. At most 10 000 places are deleted at once.
     """
-    map_, wanted = engine.atlas.get(map_id), order.wanted()
+    map_, wanted = engine.maps.get(map_id), order.wanted()
     choose = map_.ids_of if order.dry_run else map_.forget_all
     found = choose(wanted, MOST_FORGOTTEN)
     changed = {} if found and not order.dry_run else {"change": None}
@@ -276,7 +276,7 @@ def forget_places(map_id: MapId, order: Forgetting, request: Request, engine: En
 @router.get("/{place}", responses=problem_documentation(errors.UnknownPlace))
 def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView:
     """Read one place."""
-    return PlaceView.of(engine.atlas.get(map_id).place(place_id))
+    return PlaceView.of(engine.maps.get(map_id).place(place_id))
 
 
 @router.patch(
@@ -287,7 +287,7 @@ def read_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> PlaceView
 )
 def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: EngineDep) -> PlaceView:
     """Edit the fields of a place by a merge patch: `null` clears a field, and fields that are left out stay."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     with engine.writing(map_id):
         if changes.metadata is not None:
             check_metadata(merge_patch(map_.place(place_id).metadata, changes.metadata), engine.settings)
@@ -299,7 +299,7 @@ def edit_place(map_id: MapId, place_id: PlaceId, changes: PlaceChanges, engine: 
 @router.delete("/{place}", status_code=204, responses=problem_documentation(errors.UnknownPlace, errors.StorageFull))
 def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
     """Delete a place: no later query finds it."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     map_.forget(place_id)
     tell_deletion(engine, map_, place_id)
 
@@ -314,21 +314,21 @@ def forget_place(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> None:
 )
 def see_thumbnail(map_id: MapId, place_id: PlaceId, engine: EngineDep) -> Response:
     """The thumbnail of a place, or a thumbnail of the image that the map keeps."""
-    picture = engine.atlas.get(map_id).thumbnail(place_id)
+    picture = engine.maps.get(map_id).thumbnail(place_id)
     return Response(picture, media_type="image/jpeg", headers={"Cache-Control": "no-cache"})
 
 
 @traverses.get("", responses=problem_documentation(errors.InvalidCursor))
 def list_sequences(map_id: MapId, page: Page, engine: EngineDep) -> SequencePage:
     """List the traverses of a map in the order of their names."""
-    summaries, next_cursor = engine.atlas.get(map_id).sequences(page.cursor, page.limit)
+    summaries, next_cursor = engine.maps.get(map_id).sequences(page.cursor, page.limit)
     return SequencePage(items=summaries, next_cursor=next_cursor)
 
 
 @traverses.delete("/{sequence}", responses=problem_documentation(errors.UnknownSequence))
 def delete_sequence(map_id: MapId, sequence: SequenceName, request: Request, engine: EngineDep) -> ForgottenSequence:
     """Delete all places of a traverse at once."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     count = map_.forget_sequence(sequence)
     tell_change(engine, map_, "deleted", count, sequence)
     request.state.noted = {"places": count}

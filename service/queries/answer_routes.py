@@ -166,7 +166,7 @@ def list_answers(
     The answers are kept in memory, so a restart forgets them; the counts are kept on disk. Who asked is shown to
     admins.
     """
-    key = map_key(engine.atlas.get(map_id))
+    key = map_key(engine.maps.get(map_id))
     kept = statistics.recent.of_map(key)
     wanted = [one for one in kept if options.wants(one)][: options.limit]
     return RecentAnswerList(
@@ -186,7 +186,7 @@ def list_place_matches(
     principal: PrincipalDep,
 ) -> PlaceMatchList:
     """List the latest answers that have a place among their five best matches, and how often it was the best."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     map_.place(place_id)
     key = map_key(map_)
     kept = [one for one in statistics.recent.of_map(key) if options.wants(one)]

@@ -52,7 +52,7 @@ def count_for_map(
 ) -> None:
     """Count an answer in the statistics of its map, and keep it for a while, if the map still exists."""
     with suppress(PlacerecError):  # the map was deleted in the meantime
-        key = map_key(engine.atlas.find(map_id))
+        key = map_key(engine.maps.find(map_id))
         best = answer.matches[0].place.id if answer.matches else None
         statistics.observe(key, answer.verdict, best, answer.score, answer.decision)
         statistics.recent.add(key, answer, frame)

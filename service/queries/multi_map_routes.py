@@ -112,7 +112,7 @@ async def query_maps(
 
 
 def _all_maps(engine: Engine) -> list[str]:
-    return sorted({record.id for record in engine.all_records()} | set(engine.atlas.quarantined()))
+    return sorted({record.id for record in engine.all_records()} | set(engine.maps.quarantined()))
 
 
 async def _frames(

@@ -171,5 +171,5 @@ def see_explanation(
 
     `picture` in the explanation of a query is the path; the latest pictures can be fetched for some minutes.
     """
-    picture = pictures.fetch(map_key(engine.atlas.find(map_id)), name)
+    picture = pictures.fetch(map_key(engine.maps.find(map_id)), name)
     return Response(picture, media_type="image/png", headers={"Cache-Control": "private, max-age=600"})

@@ -195,7 +195,7 @@ class QueryStatistics:
         """The statistics of all maps of an engine."""
 
         def sizes() -> dict[MapKey, int] | None:
-            if engine.atlas.quarantined():
+            if engine.maps.quarantined():
                 return None  # a map that is quarantined may come back
             found = {}
             try:
@@ -204,7 +204,7 @@ class QueryStatistics:
                 return None
             for record in records:
                 try:
-                    map_ = engine.atlas.find(record.id)
+                    map_ = engine.maps.find(record.id)
                 except UnknownMap:
                     continue  # the map was deleted since it was listed
                 except PlacerecError:
@@ -213,7 +213,7 @@ class QueryStatistics:
             return found
 
         def present(map_id: str) -> set[str]:
-            return {place.id for place in engine.atlas.get(map_id).transfer.outline()}
+            return {place.id for place in engine.maps.get(map_id).transfer.outline()}
 
         return cls(engine.settings.data_dir, engine.settings.statistics_seconds, sizes, present)
 

@@ -50,7 +50,7 @@ def list_review(map_id: MapId, page: Annotated[ReviewPageParameters, Query()], e
     A map keeps frames whose answers have the verdicts that its setting `review` names, from a moment after the answer
     on; by default it keeps none.
     """
-    review = engine.atlas.get(map_id).review
+    review = engine.maps.get(map_id).review
     listing: Listing = ["review-of", map_id, str(page.labelled)]
     before = decode_number(listing, page.cursor)
     found = review.page(None if before < 0 else before, page.limit + 1, page.labelled)
@@ -75,7 +75,7 @@ def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
                 labelled_at=view.labelled_at,
                 labelled_by=view.labelled_by,
             )
-            for view in map(ReviewFrameView.of, engine.atlas.get(map_id).review.labelled())
+            for view in map(ReviewFrameView.of, engine.maps.get(map_id).review.labelled())
             if view.label is not None and view.labelled_at is not None
         ]
     )
@@ -91,7 +91,7 @@ def export_labels(map_id: MapId, engine: EngineDep) -> LabelList:
 )
 def see_review_picture(map_id: MapId, number: FrameNumber, engine: EngineDep) -> Response:
     """See a kept frame."""
-    data = engine.atlas.get(map_id).review.picture(number)
+    data = engine.maps.get(map_id).review.picture(number)
     kinds = {found: kind for kind, found in FORMATS.items()}
     return Response(data, media_type=kinds[read_header(data).format], headers={"Cache-Control": "private, no-cache"})
 

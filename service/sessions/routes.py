@@ -65,7 +65,7 @@ def create_session(
     map_id: MapId, new: NewSession, engine: EngineDep, sessions: SessionsDep, response: Response
 ) -> SessionView:
     """Begin a session. It ends when it is deleted, or when no frame has come for `expires_after` seconds."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     if new.camera is not None:
         map_.cameras.mask(new.camera)
     session = sessions.create(map_, new)

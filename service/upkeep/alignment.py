@@ -63,7 +63,7 @@ def align_sequence(
     Raises:
         As :func:`align`.
     """
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     traverses = Traverses(map_)
     first = traverses.rows(sequence)
     names = traverses.others(sequence) if others is None else list(dict.fromkeys(others))

@@ -40,7 +40,7 @@ def fill_keypoints(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         UnknownMap, MapQuarantined, StorageFull, StorageFailure: what was committed before stays.
         JobCancelled, JobInterrupted, JobGivesWay: the job has to stop.
     """
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     told: dict[str, Any] = context.notes.get("told", {"after": 0, "found": 0, "unreadable": 0, "named": []})
     total = map_.count_places()
     while places := map_.without_keypoints(told["after"], PLACES_PER_COMMIT):

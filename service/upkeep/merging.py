@@ -181,9 +181,9 @@ def merge(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         JobCancelled: likewise.
         JobInterrupted: the next attempt continues.
     """
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     try:
-        other = context.map(engine.atlas, context.arguments["from"])
+        other = context.map(engine.maps, context.arguments["from"])
         check_same_encoder(map_, other)
     except PlacerecError as error:
         if "after" in context.notes:

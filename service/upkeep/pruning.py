@@ -44,7 +44,7 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
             what it was before.
         JobCancelled, JobInterrupted.
     """
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     if (report := context.notes.get("report")) is None:
         report, going = _plan(engine, context)
         if context.arguments["dry_run"]:
@@ -64,7 +64,7 @@ def prune(engine: Engine, context: JobContext) -> Mapping[str, Any]:
 def _plan(engine: Engine, context: JobContext) -> tuple[dict[str, Any], dict[str, str]]:
     """The report, and the SHA-256 of the images of the places to remove, by id."""
     options = context.arguments
-    map_ = context.map(engine.atlas)
+    map_ = context.map(engine.maps)
     own = SelfQueries(map_, engine.load_encoder(map_))
     names = np.array([place.sequence or "" for place in own.places], np.str_)
     if options["queries"] is not None:

@@ -62,7 +62,7 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
     if (published := context.notes.get("result")) is not None and _is_published(engine, target, context.notes["made"]):
         return dict(published)  # the process was killed after the rename
     if not context.notes:
-        if target in engine.atlas.unlisted():
+        if target in engine.maps.unlisted():
             raise MapExists(f"A map {target!r} is being made.")
         context.remember(began=True)
     try:
@@ -71,13 +71,13 @@ def reencode(engine: Engine, context: JobContext) -> Mapping[str, Any]:
         raise
     except BaseException:
         with suppress(PlacerecError):  # the next start removes it
-            engine.atlas.abandon(target)
+            engine.maps.abandon(target)
         raise
 
 
 def _is_published(engine: Engine, target: str, made: str) -> bool:
     try:
-        return creation_time(engine.atlas.find(target)) == made
+        return creation_time(engine.maps.find(target)) == made
     except UnknownMap:
         return False
 
@@ -87,15 +87,15 @@ class _Reencoding:
 
     def __init__(self, engine: Engine, context: JobContext, target: str, identity: str) -> None:
         self.engine, self.context, self.target, self.identity = engine, context, target, identity
-        self.source = context.map(engine.atlas)
-        self.made = engine.atlas.unlisted().get(target) or self._create()
+        self.source = context.map(engine.maps)
+        self.made = engine.maps.unlisted().get(target) or self._create()
         self.left_out: dict[str, tuple[Outline, str]] = {}
         """By id, the places whose frames the new encoder cannot encode, and why."""
 
     def _create(self) -> Map:
         encoder = next(one for one in self.engine.catalogue.describe() if one.identity == self.identity)
         record = self.source.record
-        return self.engine.atlas.create(
+        return self.engine.maps.create(
             self.target,
             self.identity,
             encoder.dimension,
@@ -216,7 +216,7 @@ class _Reencoding:
             "left_out": {"count": len(self.left_out), "places": named},
         }
         self.context.remember(result=result, made=creation_time(self.made))
-        self.engine.atlas.publish(self.target)
+        self.engine.maps.publish(self.target)
         return result
 
 

@@ -93,7 +93,7 @@ def reencode_map(
     """
     check_map_id(options.to)
     principal.require(options.to)
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     identity = engine.resolve(options.encoder)
     reencoding.check_images(map_)
     check_new_map(engine, jobs, options.to)
@@ -107,7 +107,7 @@ def rebuild_map(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Respo
     Searches use the old index until the new one replaces it. This is useful if the index is in doubt. A map that is
     searched exactly has no index to rebuild.
     """
-    return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.atlas.get(map_id))
+    return submit(engine, jobs, response, storage_jobs.REBUILD, {}, engine.maps.get(map_id))
 
 
 @router.post("/keypoints", status_code=202, responses=problem_documentation(JobQueueFull, errors.StorageFull))
@@ -117,7 +117,7 @@ def fill_keypoints(map_id: MapId, engine: EngineDep, jobs: JobsDep, response: Re
     They are found in the pictures that the map keeps; of a place without a picture they cannot be found. Queries of
     places that have theirs are verified meanwhile. If the map's setting `verification` is false, this finds nothing.
     """
-    return submit(engine, jobs, response, keypoints.KIND, {}, engine.atlas.get(map_id))
+    return submit(engine, jobs, response, keypoints.KIND, {}, engine.maps.get(map_id))
 
 
 @router.get("/health", responses=problem_documentation(EncoderNotInstalled))
@@ -159,7 +159,7 @@ def align_map(map_id: MapId, options: Aligning, engine: EngineDep, jobs: JobsDep
     that are shared, and the poses handed over. Traverses that share nothing are reported, and nothing is stored.
     Everything is stored in one commit. With `"dry_run": true` nothing is stored.
     """
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     alignment.check_request(map_, options.sequence, options.others)
     return submit(engine, jobs, response, alignment.KIND, options.model_dump(by_alias=True), map_)
 
@@ -176,7 +176,7 @@ def prune_map(map_id: MapId, options: Pruning, engine: EngineDep, jobs: JobsDep,
     A place is removed only if a place that stays is the same place by the map's settings and looks alike. With
     `"dry_run": false` the places are removed for good, all in one commit.
     """
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     sequences = map_.transfer.sequence_ends()
     for name in (options.sequence, options.queries):
         if name is not None and name not in sequences:
@@ -206,7 +206,7 @@ def merge_map(
     if options.source == map_id:
         raise InvalidRequest("from: a map cannot be merged with itself.")
     principal.require(options.source)
-    map_, other = engine.atlas.get(map_id), engine.atlas.get(options.source)
+    map_, other = engine.maps.get(map_id), engine.maps.get(options.source)
     merging.check_same_encoder(map_, other)
     arguments = options.model_dump(by_alias=True) | {"prefix": options.prefix or f"{options.source}-"}
     if not options.dry_run:

@@ -52,7 +52,7 @@ def enrolments(first: int, count: int, name: str, sequence: str, dimension: int 
 
 def state_of(engine: Engine, map_id: str) -> list[tuple[Any, ...]]:
     """Everything that a map stores: places, their order, pictures, keypoints and descriptors."""
-    map_ = engine.atlas.get(map_id)
+    map_ = engine.maps.get(map_id)
     outline, snapshot = map_.transfer.outline(), map_.snapshot()
     rows = np.array([place.row for place in outline], np.int64)
     descriptors, keypoints = snapshot.descriptors_at(rows), map_.keypoints_at(rows.tolist())

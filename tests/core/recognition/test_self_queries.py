@@ -15,7 +15,7 @@ from tests.service.engines import ENCODER, enrolments, runtime_at
 def test_a_place_listed_before_its_row_is_readable_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     no_encoder: Any = None  # no score is asked for
     with runtime_at(tmp_path) as runtime:
-        map_ = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
+        map_ = runtime.engine.maps.create("lab", ENCODER, 8, MapSettings(keep="none"))
         map_.enrol(enrolments(0, 5, "l", "monday"))
         before = map_.snapshot()
         map_.enrol(enrolments(5, 3, "l", "monday"))

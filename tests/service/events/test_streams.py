@@ -20,7 +20,7 @@ pytestmark = pytest.mark.anyio
 async def test_a_listener_that_does_not_read_delays_nobody_and_learns_what_it_missed(tmp_path: Path) -> None:
     with runtime_at(tmp_path) as runtime:
         engine = runtime.engine
-        map_ = engine.atlas.create("lab", ENCODER, 8, MapSettings())
+        map_ = engine.maps.create("lab", ENCODER, 8, MapSettings())
         texts = MapStream(engine, map_, EventParameters(), lambda: OWNER).texts(None)
         heard = list(events_of((await anext(texts)).splitlines()))
         for number in range(MOST_KEPT + 500):
@@ -39,7 +39,7 @@ async def test_a_listener_that_does_not_read_delays_nobody_and_learns_what_it_mi
 async def test_every_event_is_one_line_of_json_whatever_it_says(tmp_path: Path) -> None:
     strange = "one\ntwo\r\n\r\ndata: three\u2028four\x85 </script> \u0000"
     with runtime_at(tmp_path) as runtime:
-        map_ = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings())
+        map_ = runtime.engine.maps.create("lab", ENCODER, 8, MapSettings())
         texts = MapStream(runtime.engine, map_, EventParameters(), lambda: OWNER).texts(None)
         await anext(texts)
         runtime.engine.events.publish(MapEvent.now("lab", change="edited", fields=[strange], revision=1))

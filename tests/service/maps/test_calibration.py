@@ -229,7 +229,7 @@ def test_an_edit_in_between_is_noticed(client: httpx.Client, walked: str) -> Non
 def test_what_an_operator_sets_meanwhile_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A job that finds another calibration, and one that finds other edits; without HTTP."""
     with runtime_at(tmp_path) as runtime:
-        lab = runtime.engine.atlas.create("lab", ENCODER, 8)
+        lab = runtime.engine.maps.create("lab", ENCODER, 8)
         manual = Calibration(source="manual", threshold=0.5, margin=0.1, background_mean=0.3, background_deviation=0.1)
         found = manual.model_copy(update={"source": "map", "threshold": 0.25})
 

@@ -25,7 +25,7 @@ from tests.service.engines import ENCODER, enrolments, runtime_at
 @pytest.fixture
 def content(tmp_path: Path) -> bytes:
     with runtime_at(tmp_path / "source") as runtime:
-        lab = runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none"))
+        lab = runtime.engine.maps.create("lab", ENCODER, 8, MapSettings(keep="none"))
         lab.enrol(enrolments(1, 3, "p", "monday"))
         return exported(lab, tmp_path / "kept")
 
@@ -111,4 +111,4 @@ async def test_cancelled_while_the_map_is_built(
         assert list((tmp_path / "data" / "maps").iterdir()) == [], "it stopped after the first of three commits"
         arrived = await received(runtime, content)
         await runtime.imports.build(arrived)
-        assert runtime.engine.atlas.get("lab").count_places() == 3
+        assert runtime.engine.maps.get("lab").count_places() == 3

@@ -47,7 +47,7 @@ async def walked(engine: Engine) -> Map:
     """A map of four places."""
     identity = engine.resolve(None)
     encoder = await engine.queue.load(identity)
-    made = engine.atlas.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
+    made = engine.maps.create("lab", identity, encoder.dimension, MapSettings(keep="none"), encoder.local_shape)
     await enrol(engine, made, [FrameToEnrol(f"p{n}", PlaceFields(sequence="a"), jpeg(n)) for n in range(4)], deadline())
     return made
 

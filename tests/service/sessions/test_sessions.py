@@ -323,7 +323,7 @@ def small(tmp_path: Path) -> Iterator[Server]:
 
 def test_the_graphs_of_deleted_sessions_are_dropped(tmp_path: Path) -> None:
     with runtime_at(tmp_path) as runtime:
-        map_ = runtime.engine.atlas.create("lab", ENCODER, 8)
+        map_ = runtime.engine.maps.create("lab", ENCODER, 8)
         map_.open()
         for number in range(4):
             map_.enrol(enrolments(10 * number, 3, "p", f"s{number}"))

@@ -61,7 +61,7 @@ def runtime(tmp_path: Path) -> Iterator[Runtime]:
 
 def two_traverses(runtime: Runtime) -> Map:
     """A map of two traverses of one way, of which the second begins at the sixth place."""
-    lab = runtime.engine.atlas.create("lab", ENCODER, DIMENSION, MapSettings(keep="none"))
+    lab = runtime.engine.maps.create("lab", ENCODER, DIMENSION, MapSettings(keep="none"))
     visit(lab, "a", walk(), posed=True)
     visit(lab, "b", walk()[5:], seed=2)
     return lab
@@ -92,7 +92,7 @@ def at(map_: Map) -> dict[str, tuple[int, int]]:
 
 def state(runtime: Runtime) -> Any:
     """Everything that the map stores."""
-    return at(runtime.engine.atlas.get("lab")), state_of(runtime.engine, "lab")
+    return at(runtime.engine.maps.get("lab")), state_of(runtime.engine, "lab")
 
 
 def test_frames_of_two_traverses_become_the_same_places(runtime: Runtime, lab: Map) -> None:
@@ -107,7 +107,7 @@ def test_frames_of_two_traverses_become_the_same_places(runtime: Runtime, lab: M
     assert one["poses"] == {"received": 35, "given": 0} and found["poses_handed_over"] == 35
     assert lab.place("b3").pose == Pose(x=80, y=0) and lab.place("b3").pose_of == "a8"
     assert lab.place("a8").pose_of is None
-    assert runtime.engine.atlas.verify("lab").ok
+    assert runtime.engine.maps.verify("lab").ok
 
 
 def test_what_was_stored_is_read_again(tmp_path: Path) -> None:
@@ -270,7 +270,7 @@ def test_a_kill_around_the_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with runtime_at(tmp_path) as runtime:
         done = end_of(runtime, job)
         assert (done.state, done.attempt) == ("succeeded", 2)
-        lab = runtime.engine.atlas.get("lab")
+        lab = runtime.engine.maps.get("lab")
         assert at(lab) != before[0] and lab.place("b0").pose_of == "a5"
         stored = state(runtime)
         result(runtime)

@@ -118,5 +118,5 @@ def test_counts_survive_a_restart(tmp_path: Path) -> None:
     server.query("lab", jpeg(1))
     assert server.stop() == 0
     with runtime_at(tmp_path) as runtime:
-        counted = runtime.statistics.read(map_key(runtime.engine.atlas.get("lab")))
+        counted = runtime.statistics.read(map_key(runtime.engine.maps.get("lab")))
         assert sum(week.queries for week in counted.weeks) == 2

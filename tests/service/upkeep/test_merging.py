@@ -140,7 +140,7 @@ def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
         encoder = next(one for one in runtime.engine.catalogue.describe() if one.identity == identity)
         settings = MapSettings(keep="thumbnail")
         for name, first, count, sequence in (("lab", 1, 64, "monday"), ("hall", 1001, MANY, "tuesday")):
-            map_ = runtime.engine.atlas.create(name, identity, encoder.dimension, settings, encoder.local_shape)
+            map_ = runtime.engine.maps.create(name, identity, encoder.dimension, settings, encoder.local_shape)
             map_.enrol(enrolments(first, count, name[0], sequence, encoder.dimension))
     server = Server(tmp_path).wait()
     answered = 0
@@ -186,11 +186,11 @@ def folder(tmp_path: Path) -> Path:
     """Two maps that share the name of a sequence and the id of a place."""
     with runtime_at(tmp_path) as runtime:
         for name, first, count in (("lab", 1, 70), ("hall", 1001, COUNT)):
-            map_ = runtime.engine.atlas.create(name, ENCODER, 8, MapSettings(keep="thumbnail"))
+            map_ = runtime.engine.maps.create(name, ENCODER, 8, MapSettings(keep="thumbnail"))
             map_.enrol(enrolments(first, count, name[0], "monday"))
-        runtime.engine.atlas.get("hall").enrol(enrolments(5000, 1, "l", "monday"))
+        runtime.engine.maps.get("hall").enrol(enrolments(5000, 1, "l", "monday"))
         one = Enrolment("l5000", PlaceFields(), np.ones(8, np.float32), 1, b"\x01" * 32)
-        runtime.engine.atlas.get("lab").enrol([one])
+        runtime.engine.maps.get("lab").enrol([one])
     return tmp_path
 
 
@@ -222,7 +222,7 @@ def check_merged(engine: Engine, before: list[tuple[Any, ...]], theirs: list[tup
         name = "h.l5000" if other.id == "l5000" else other.id
         assert place == other.model_copy(update={"id": name, "sequence": "h.monday"})
         assert content == its_content
-    assert engine.atlas.verify("lab").ok
+    assert engine.maps.verify("lab").ok
 
 
 def test_all_places_are_copied(folder: Path) -> None:
@@ -254,7 +254,7 @@ def test_cancelled_in_the_middle_it_leaves_what_others_enrolled(folder: Path, mo
         own = enrolments(9000, 2, "robot", "tuesday")
 
         def cancel(context: Any) -> None:
-            runtime.engine.atlas.get("lab").enrol(own)
+            runtime.engine.maps.get("lab").enrol(own)
             runtime.jobs.cancel(context.id)
 
         after_two_commits(monkeypatch, cancel)
@@ -263,7 +263,7 @@ def test_cancelled_in_the_middle_it_leaves_what_others_enrolled(folder: Path, mo
         here = state_of(runtime.engine, "lab")
         assert here[: len(before)] == before
         assert [entry[0].id for entry in here[len(before) :]] == ["robot9000", "robot9001"]
-        assert runtime.engine.atlas.verify("lab").ok
+        assert runtime.engine.maps.verify("lab").ok
 
 
 def test_a_full_disk_in_the_middle_leaves_the_map_as_it_was(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -302,7 +302,7 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
 
         def vanish(_: Any) -> None:
             if when == "meanwhile":
-                runtime.engine.atlas.delete("hall")
+                runtime.engine.maps.delete("hall")
             else:
                 runtime.jobs.stop_soon()
 
@@ -320,7 +320,7 @@ def test_the_other_map_is_deleted_in_the_middle(folder: Path, monkeypatch: pytes
 
 def test_the_map_itself_is_deleted_in_the_middle(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
-        after_two_commits(monkeypatch, lambda _: runtime.engine.atlas.delete("lab"))
+        after_two_commits(monkeypatch, lambda _: runtime.engine.maps.delete("lab"))
         failed = merged(runtime)
         assert failed.state == "failed" and failed.problem is not None
         assert failed.problem["type"] == "urn:placerec:problem:unknown-map", "no copied place remains"
@@ -330,7 +330,7 @@ def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with runtime_at(folder) as runtime:
-        hall = runtime.engine.atlas.get("hall")
+        hall = runtime.engine.maps.get("hall")
         (newer,) = enrolments(7000, 1, "h", "monday")
         last = f"h{1000 + COUNT}"
 
@@ -341,9 +341,9 @@ def test_a_place_that_changes_in_the_other_map_meanwhile_is_copied_as_it_is_then
         after_two_commits(monkeypatch, change)
         done = merged(runtime)
         assert done.state == "succeeded"
-        lab = runtime.engine.atlas.get("lab")
+        lab = runtime.engine.maps.get("lab")
         assert lab.digest(last) == newer.digest and lab.picture(last) == b"newer"
-        assert runtime.engine.atlas.verify("lab").ok
+        assert runtime.engine.maps.verify("lab").ok
         assert lab.place(last).created_at <= datetime.now(UTC) + timedelta(seconds=1)
 
 
@@ -352,7 +352,7 @@ def test_a_place_that_somebody_enrols_meanwhile_is_never_replaced(
     folder: Path, monkeypatch: pytest.MonkeyPatch, rule: str
 ) -> None:
     with runtime_at(folder) as runtime:
-        lab, last = runtime.engine.atlas.get("lab"), f"h{1000 + COUNT}"
+        lab, last = runtime.engine.maps.get("lab"), f"h{1000 + COUNT}"
         before = state_of(runtime.engine, "lab")
         (own,) = enrolments(7000, 1, "h", "tuesday")
 
@@ -368,7 +368,7 @@ def test_a_place_that_somebody_enrols_meanwhile_is_never_replaced(
             assert done.problem is not None and done.problem["type"] == "urn:placerec:problem:merge-conflict"
             here = state_of(runtime.engine, "lab")
             assert here[:-1] == before and here[-1][0].id == last
-        assert runtime.engine.atlas.verify("lab").ok
+        assert runtime.engine.maps.verify("lab").ok
 
 
 @pytest.mark.parametrize("which", ["lab", "hall"])
@@ -377,7 +377,7 @@ def test_it_does_not_go_on_into_another_map_of_the_same_id(
 ) -> None:
     with runtime_at(folder) as runtime:
         before = state_of(runtime.engine, "lab")
-        maps = {name: creation_time(runtime.engine.atlas.get(name)) for name in ("lab", "hall")}
+        maps = {name: creation_time(runtime.engine.maps.get(name)) for name in ("lab", "hall")}
         after_two_commits(monkeypatch, lambda _: runtime.jobs.stop_soon())
         job = runtime.jobs.submit(merging.KIND, "lab", arguments=WANTED, maps=maps)
         wait_until(lambda: runtime.jobs.stopping)

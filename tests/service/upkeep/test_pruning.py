@@ -88,14 +88,14 @@ GOING = ("l1", "l3", "l5")
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A map of eight places and a made-up plan to remove three, since nothing can be encoded here."""
     with runtime_at(tmp_path) as runtime:
-        runtime.engine.atlas.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
+        runtime.engine.maps.create("lab", ENCODER, 8, MapSettings(keep="none")).enrol(enrolments(0, 8, "l", "monday"))
     planned = 0
 
     def plan(engine: Engine, _: Any) -> tuple[dict[str, Any], dict[str, str]]:
         nonlocal planned
         planned += 1
         assert planned == 1, "a second plan would prune the pruned map again"
-        there = engine.atlas.get("lab").transfer.outline()
+        there = engine.maps.get("lab").transfer.outline()
         return {"removed": 3}, {place.id: place.digest.hex() for place in there if place.id in GOING}
 
     monkeypatch.setattr(pruning, "_plan", plan)
@@ -119,13 +119,13 @@ def test_a_kill_around_the_commit(folder: Path, monkeypatch: pytest.MonkeyPatch,
     with runtime_at(folder) as runtime:
         done = end_of(runtime, job)
         assert (done.state, done.attempt, done.result) == ("succeeded", 2, {"removed": 3, "places_after": 5})
-        left = [place.id for place in runtime.engine.atlas.get("lab").transfer.outline()]
+        left = [place.id for place in runtime.engine.maps.get("lab").transfer.outline()]
         assert left == ["l0", "l2", "l4", "l6", "l7"]
 
 
 def test_a_place_that_has_another_frame_by_now_stays(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with runtime_at(folder) as runtime:
-        lab = runtime.engine.atlas.get("lab")
+        lab = runtime.engine.maps.get("lab")
         plan = pruning._plan
 
         def and_then(*arguments: Any) -> Any:

@@ -133,7 +133,7 @@ class Plain:
 def test_the_latest_matrices_are_kept_and_follow_the_traverses(tmp_path: Path) -> None:
     plain = cast(Encoder, Plain())
     with runtime_at(tmp_path) as runtime:
-        map_ = runtime.engine.atlas.create("lab", ENCODER, DIMENSION)
+        map_ = runtime.engine.maps.create("lab", ENCODER, DIMENSION)
         ways = walk(count=700)
         visit(map_, "a", ways)
         visit(map_, "b", ways[::2], seed=2)
