@@ -413,6 +413,14 @@ class Stopping(Problem):
     """503 ``stopping``: The service is stopping."""
 
 
+class StoreOfAnotherVersion(Problem):
+    """503 ``store-of-another-version``: The maps were stored by another version."""
+
+
+class StoreUnavailable(Problem):
+    """503 ``store-unavailable``: The maps cannot be reached."""
+
+
 class TooManyConnections(Problem):
     """503 ``too-many-connections``: Too many connections are open."""
 
@@ -543,6 +551,8 @@ BY_SLUG: dict[str, type[Problem]] = {
     "queue-full": QueueFull,
     "staging-full": StagingFull,
     "stopping": Stopping,
+    "store-of-another-version": StoreOfAnotherVersion,
+    "store-unavailable": StoreUnavailable,
     "too-many-connections": TooManyConnections,
     "too-many-exports": TooManyExports,
     "too-many-imports": TooManyImports,
