@@ -16,27 +16,13 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
+from tests.service.balancer import nginx_with
 from tests.service.scenes import jpeg
 from tests.service.server import ROOT, Server, free_port
 
 pytestmark = pytest.mark.skipif(
     shutil.which("nginx") is None or shutil.which("openssl") is None, reason="nginx or openssl is not installed"
 )
-
-NGINX = """
-daemon off;
-pid {folder}/nginx.pid;
-error_log {folder}/error.log;
-events {{}}
-http {{
-    client_body_temp_path {folder}/body;
-    proxy_temp_path {folder}/proxy;
-    fastcgi_temp_path {folder}/fastcgi;
-    uwsgi_temp_path {folder}/uwsgi;
-    scgi_temp_path {folder}/scgi;
-    include {folder}/tls.conf;
-}}
-"""
 
 
 @dataclass
@@ -68,38 +54,23 @@ def certify(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
     folder = tmp_path_factory.mktemp("proxy")
-    folder.chmod(0o755)
     certify(folder)
     command = [sys.executable, "-m", "service.commands", "keys", "create", "op", "--role", "admin"]
     made = subprocess.run(
         [*command, "--data-dir", folder / "data"], cwd=ROOT, capture_output=True, text=True, check=True
     )
     server, port = Server(folder), free_port()
-    text = (ROOT / "docker/tls.conf").read_text()
-    for old, new in (
-        ("placerec:8000", f"127.0.0.1:{server.port}"),
-        ("/etc/nginx/certificates", str(folder)),
-        ("listen 443", f"listen 127.0.0.1:{port}"),
-        ("/dev/stdout", f"{folder}/access.log"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "tls.conf").write_text(text)
-    (folder / "nginx.conf").write_text(NGINX.format(folder=folder))
-    words = ["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)]
-    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stderr
-    nginx = subprocess.Popen(words)
+    changes = {
+        "placerec:8000": f"127.0.0.1:{server.port}",
+        "/etc/nginx/certificates": str(folder),
+        "listen 443": f"listen 127.0.0.1:{port}",
+    }
     try:
-        server.wait()
-        until = time.monotonic() + 60
-        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
-            time.sleep(0.02)
-        trust = ssl.create_default_context(cafile=str(folder / "authority.pem"))
-        yield Proxied(port, server, trust, folder / "access.log", made.stdout.strip())
+        with nginx_with("tls.conf", changes, folder) as log:
+            server.wait()
+            trust = ssl.create_default_context(cafile=str(folder / "authority.pem"))
+            yield Proxied(port, server, trust, log, made.stdout.strip())
     finally:
-        nginx.terminate()
-        nginx.wait(10)
         server.stop()
 
 

@@ -1,10 +1,10 @@
-"""A real nginx with docker/cluster.conf in front of two services."""
+"""A real nginx with the configurations of docker/ in front of services."""
 
 from __future__ import annotations
 
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,9 +21,37 @@ http {{
     fastcgi_temp_path {folder}/fastcgi;
     uwsgi_temp_path {folder}/uwsgi;
     scgi_temp_path {folder}/scgi;
-    include {folder}/cluster.conf;
+    include {folder}/{name};
 }}
 """
+
+
+@contextmanager
+def nginx_with(name: str, changes: Mapping[str, str], folder: Path) -> Iterator[Path]:
+    """An nginx with a file of docker/, in which texts are replaced, as long as the block runs; the path of its log.
+
+    Raises:
+        AssertionError: a text is not in the file, or nginx refuses it.
+    """
+    folder.chmod(0o755)
+    log, text = folder / "access.log", (ROOT / "docker" / name).read_text()
+    for old, new in {**changes, "/dev/stdout": str(log)}.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / name).write_text(text)
+    (folder / "nginx.conf").write_text(NGINX.format(folder=folder, name=name))
+    words = ["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)]
+    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    nginx = subprocess.Popen(words)
+    try:
+        until = time.monotonic() + 60
+        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
+            time.sleep(0.02)
+        yield log
+    finally:
+        nginx.terminate()
+        nginx.wait(10)
 
 
 @contextmanager
@@ -33,26 +61,7 @@ def balanced(ports: Sequence[int], folder: Path) -> Iterator[str]:
     Raises:
         AssertionError: nginx refuses the configuration.
     """
-    folder.chmod(0o755)
-    port, text = free_port(), (ROOT / "docker/cluster.conf").read_text()
-    for old, new in (
-        *((f"placerec-{number}:8000", f"127.0.0.1:{one}") for number, one in enumerate(ports, 1)),
-        ("listen 8000", f"listen 127.0.0.1:{port}"),
-        ("/dev/stdout", f"{folder}/access.log"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (folder / "cluster.conf").write_text(text)
-    (folder / "nginx.conf").write_text(NGINX.format(folder=folder))
-    words = ["nginx", "-c", str(folder / "nginx.conf"), "-p", str(folder)]
-    checked = subprocess.run([*words, "-t"], capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stderr
-    nginx = subprocess.Popen(words)
-    try:
-        until = time.monotonic() + 60
-        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
-            time.sleep(0.02)
+    port = free_port()
+    services = {f"placerec-{number}:8000": f"127.0.0.1:{one}" for number, one in enumerate(ports, 1)}
+    with nginx_with("cluster.conf", {**services, "listen 8000": f"listen 127.0.0.1:{port}"}, folder):
         yield f"http://127.0.0.1:{port}"
-    finally:
-        nginx.terminate()
-        nginx.wait(10)
