@@ -5,9 +5,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
-from core.places import NO_SEQUENCE
+from core.places import NO_SEQUENCE, Place, Pose
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,56 @@ class Correspondence:
 
     stations: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     poses: Mapping[int, int | None] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> list[int]:
+        """The rows of the places that change, ascending."""
+        return sorted({*self.stations, *self.poses})
+
+    @property
+    def givers(self) -> set[int]:
+        """The rows of the places whose poses are handed over."""
+        return {giver for giver in self.poses.values() if giver is not None}
+
+
+class Stored(Protocol):
+    """A place as a store has it; its track and station are None where they are its own."""
+
+    @property
+    def track(self) -> int | None: ...
+
+    @property
+    def station(self) -> int | None: ...
+
+    @property
+    def place(self) -> Place: ...
+
+
+StoredT = TypeVar("StoredT", bound=Stored)
+
+
+def changes_by(
+    change: Correspondence, found: Mapping[int, StoredT]
+) -> Iterator[tuple[StoredT, int | None, int | None, Pose | None, str | None]]:
+    """What an alignment changes of stored places; rows whose place is gone are left out.
+
+    Args:
+        found: the places of ``change.rows`` and ``change.givers`` by row.
+
+    Yields:
+        A place, its track and station, its pose and the id of the place that the pose comes from.
+    """
+    for row in change.rows:
+        if (stored := found.get(row)) is None:
+            continue
+        track, station = change.stations.get(row, (stored.track, stored.station))
+        pose, pose_of = stored.place.pose, stored.place.pose_of
+        if row in change.poses:
+            giver = change.poses[row]
+            source = None if giver is None else found.get(giver)
+            pose = None if source is None else source.place.pose
+            pose_of = None if source is None else source.place.id
+        yield stored, track, station, pose, pose_of
 
 
 class Counterparts(Protocol):

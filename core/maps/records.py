@@ -44,6 +44,10 @@ class ReviewSetting(BaseModel):
         description="Most bytes of their files together; the oldest go first.",
     )
 
+    def allows(self, count: int, size: int) -> bool:
+        """Whether so many frames of so many bytes together may be kept."""
+        return count <= self.most_frames and size <= self.most_bytes
+
 
 class MapSettings(BaseModel):
     """What the owner of a map may choose, when it is made and later."""

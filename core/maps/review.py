@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import datetime
@@ -92,3 +92,22 @@ class Review(Protocol):
         Raises:
             UnknownFrame: it is not kept.
         """
+
+
+def frames_to_drop(
+    frames: Iterable[tuple[int, int]], count: int, size: int, setting: ReviewSetting, held: Container[int]
+) -> list[int]:
+    """The numbers of the frames that go until the limits are kept; those that are held stay.
+
+    Args:
+        frames: number and size of each, in the order in which they go: without a label first, then the oldest.
+        count, size: how many there are, and their bytes.
+    """
+    going = []
+    for number, bytes_ in frames:
+        if setting.allows(count, size):
+            break
+        if number not in held:
+            going.append(number)
+            count, size = count - 1, size - bytes_
+    return going

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Mapping
 
-from core.maps.counterparts import Correspondence, Standing, brought_over
+from core.maps.counterparts import Correspondence, Standing, brought_over, changes_by
 from core.storage.cameras import Access
 from core.storage.database import ledger
 from core.storage.writing import Write
@@ -34,22 +34,11 @@ class Counterparts:
         Rows whose place is gone are left out.  Hold the map's writes (``Transfer.paused_writes``) from the decision
         on if none may be.
         """
-        rows = sorted({*change.stations, *change.poses})
-        if not rows:
+        if not change.rows:
             return
         with self._writing() as write:
-            givers = {giver for giver in change.poses.values() if giver is not None}
-            found = ledger.stored_at(write.connection, [*rows, *givers])
-            for row in rows:
-                if (stored := found.get(row)) is None:
-                    continue
-                track, station = change.stations.get(row, (stored.track, stored.station))
-                pose, pose_of = stored.place.pose, stored.place.pose_of
-                if row in change.poses:
-                    giver = change.poses[row]
-                    source = None if giver is None else found.get(giver)
-                    pose = None if source is None else source.place.pose
-                    pose_of = None if source is None else source.place.id
+            found = ledger.stored_at(write.connection, [*change.rows, *change.givers])
+            for stored, track, station, pose, pose_of in changes_by(change, found):
                 write.set_counterpart(stored, track, station, pose, pose_of)
 
     def copy(self, other: Counterparts, names: Mapping[str, str]) -> None:

@@ -25,7 +25,7 @@ from core.disk.files import Damage, disk_errors
 from core.disk.sqlite_file import DURABLE, Schema, SqliteFile, transaction
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame
+from core.maps.review import ReviewFrame, frames_to_drop
 from core.storage.database.ledger import moment_text
 
 FILE = "review.sqlite"
@@ -251,16 +251,11 @@ def _drop_oldest(connection: sqlite3.Connection, setting: ReviewSetting, held: C
     Those that are held stay.
     """
     count, size = connection.execute("SELECT count(*), coalesce(sum(size), 0) FROM frames").fetchone()
-    if count <= setting.most_frames and size <= setting.most_bytes:
+    if setting.allows(count, size):
         return
-    going = []
-    for number, bytes_ in connection.execute("SELECT number, size FROM frames ORDER BY label IS NOT NULL, number"):
-        if count <= setting.most_frames and size <= setting.most_bytes:
-            break
-        if number not in held:
-            going.append((number,))
-            count, size = count - 1, size - bytes_
-    connection.executemany("DELETE FROM frames WHERE number = ?", going)
+    frames = connection.execute("SELECT number, size FROM frames ORDER BY label IS NOT NULL, number")
+    going = frames_to_drop(frames, count, size, setting, held)
+    connection.executemany("DELETE FROM frames WHERE number = ?", [(number,) for number in going])
 
 
 def _expect(connection: sqlite3.Connection, number: int) -> tuple[Any, ...]:

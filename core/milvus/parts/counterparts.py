@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 
-from core.maps.counterparts import Correspondence, brought_over
+from core.maps.counterparts import Correspondence, brought_over, changes_by
 from core.milvus import ledger
 from core.milvus.parts.cameras import Access
 from core.milvus.writing import Write
@@ -29,24 +29,12 @@ class MilvusCounterparts:
 
     def store(self, change: Correspondence) -> None:
         """Store stations and poses, all of them or, if this raises, none; rows whose place is gone are left out."""
-        rows = sorted({*change.stations, *change.poses})
-        if not rows:
+        if not change.rows:
             return
         with self._writing() as write:
-            givers = {giver for giver in change.poses.values() if giver is not None}
-            found = {
-                entry.row: entry for entry in ledger.entries_by(write.connection, self._map, "row", [*rows, *givers])
-            }
-            for row in rows:
-                if (stored := found.get(row)) is None:
-                    continue
-                track, station = change.stations.get(row, (stored.track, stored.station))
-                pose, pose_of = stored.place.pose, stored.place.pose_of
-                if row in change.poses:
-                    giver = change.poses[row]
-                    source = None if giver is None else found.get(giver)
-                    pose = None if source is None else source.place.pose
-                    pose_of = None if source is None else source.place.id
+            named = [*change.rows, *change.givers]
+            found = {entry.row: entry for entry in ledger.entries_by(write.connection, self._map, "row", named)}
+            for stored, track, station, pose, pose_of in changes_by(change, found):
                 write.set_counterpart(stored, track, station, pose, pose_of)
 
     def copy(self, other: MilvusCounterparts, names: Mapping[str, str]) -> None:

@@ -14,7 +14,7 @@ from psycopg import Connection
 
 from core.errors import StorageFailure, UnknownFrame
 from core.maps.records import ReviewSetting
-from core.maps.review import ReviewFrame
+from core.maps.review import ReviewFrame, frames_to_drop
 from core.milvus import ledger
 from core.milvus.database import Database
 from core.milvus.parts.cameras import Access
@@ -74,15 +74,11 @@ class MilvusReview:
 
     def _drop_oldest(self, connection: Connection[Any], setting: ReviewSetting) -> None:
         """Drop frames, those without a label first and the oldest of these first, until the limits are kept."""
+        count, size = self._size(connection)
+        if setting.allows(count, size):
+            return
         query = "SELECT number, size FROM review_frames WHERE map = %s ORDER BY label IS NOT NULL, number"
-        found = connection.execute(query, (self._map,)).fetchall()
-        count, size, going = len(found), sum(bytes_ for _, bytes_ in found), list[int]()
-        for number, bytes_ in found:
-            if count <= setting.most_frames and size <= setting.most_bytes:
-                break
-            if number not in self._held:
-                going.append(number)
-                count, size = count - 1, size - bytes_
+        going = frames_to_drop(connection.execute(query, (self._map,)), count, size, setting, self._held)
         connection.execute("DELETE FROM review_frames WHERE map = %s AND number = ANY(%s)", (self._map, going))
 
     def page(self, before: int | None, limit: int, labelled: bool | None = None) -> list[ReviewFrame]:
@@ -108,9 +104,12 @@ class MilvusReview:
 
     def size(self) -> tuple[int, int]:
         """How many frames are kept, and their bytes."""
-        query = "SELECT count(*), coalesce(sum(size), 0) FROM review_frames WHERE map = %s"
         with self._reading() as connection:
-            ((count, size),) = connection.execute(query, (self._map,)).fetchall()
+            return self._size(connection)
+
+    def _size(self, connection: Connection[Any]) -> tuple[int, int]:
+        query = "SELECT count(*), coalesce(sum(size), 0) FROM review_frames WHERE map = %s"
+        ((count, size),) = connection.execute(query, (self._map,)).fetchall()
         return int(count), int(size)
 
     def find(self, number: int) -> ReviewFrame:
