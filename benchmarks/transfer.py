@@ -22,9 +22,10 @@ import typer
 
 from benchmarks.process import peak_memory
 from benchmarks.report import report
+from core.maps import Enrolment, MapSettings
 from core.maps.archives.reading import Archive, check
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.storage import Atlas, Map
 from core.storage.archives.building import build
 
 ENCODER, DIMENSION, LOCAL = "made-up@" + "0" * 64, 16_384, (169, 192)

@@ -24,8 +24,9 @@ import typer
 
 from benchmarks.process import Process, service
 from benchmarks.report import report, verdict
+from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, MapSettings
+from core.storage import Atlas
 
 ENCODER, DIMENSION, BATCH = "made-up@" + "0" * 64, 8, 5000
 BEGAN = datetime(2026, 11, 20, tzinfo=UTC)

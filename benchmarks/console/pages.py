@@ -27,9 +27,10 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from benchmarks.console.endpoints import fill
 from benchmarks.process import Process, descendants, processor_time, service
 from benchmarks.report import report, verdict
+from core.maps import Enrolment, MapSettings
 from core.method.catalogue import EncoderCatalogue
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, MapSettings
+from core.storage import Atlas
 
 STEPS = 120
 DRAWN = """selector => {

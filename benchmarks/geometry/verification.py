@@ -31,11 +31,11 @@ from core.geometry.keypoints import Keypoints
 from core.geometry.verification import verify
 from core.judgement.curves import auc_pr, auc_roc, pr_curve
 from core.judgement.reliability import reliability
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import load_xfeat
 from core.recognition.stages import score_matrix
-from core.storage import MapSettings
 from core.threads import cores, each, share_cores
 from training.augmentation import augment
 from training.photographs import DAY_NIGHT, MIXED_CAMERAS, find_photographs, read, split_photographs

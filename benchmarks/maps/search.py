@@ -35,10 +35,11 @@ from rich.progress import Progress
 from benchmarks.maps.references import Material, material
 from benchmarks.report import report, verdict
 from core.errors import UnknownMap
+from core.maps import Enrolment, MapSettings, Precision
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, Map, MapSettings, Precision
+from core.storage import Atlas, Map
 from core.storage.files.segment_files import Layout
 from core.storage.search.snapshot import Snapshot
 from core.threads import cores, share_cores

@@ -24,11 +24,11 @@ from core.belief import Evidence, Odometry, PlaceGraph, Run, RunOptions, Step, e
 from core.evaluation.samples import jpeg, sample_frame
 from core.evaluation.timing import medians
 from core.frames.images import decode
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import METRIC, Neighborhood, Whereabouts
 from core.recognition.stages import examine
-from core.storage import MapSettings
 from training.ground_truth import corrected_truth
 from training.photographs import find_photographs, read
 from training.validation import Encodings, describe

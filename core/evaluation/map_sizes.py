@@ -27,10 +27,10 @@ from core.geometry.pairs import Pairs
 from core.judgement.geometry import Geometry, final_order
 from core.judgement.reliability import BINS
 from core.judgement.verdict import Judgement, judge
+from core.maps import MapSettings
 from core.networks.xfeat import load_xfeat
 from core.places import Neighborhood, Whereabouts
 from core.recognition.stages import examine
-from core.storage import MapSettings
 
 if TYPE_CHECKING:
     from core.method.encoder import Encoder

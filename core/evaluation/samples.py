@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.frames.preprocessing import Pixels
+from core.maps import Enrolment, MapSettings, Precision
 from core.method.encoder import Encoder
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, MapSettings, Precision
+from core.storage import Atlas
 
 BATCH = 64
 """Places that are written together."""

@@ -18,9 +18,9 @@ from typing import Any
 
 from core.errors import PlacerecError
 from core.frames.masks import Mask
-from core.maps import Correspondence
+from core.maps import Correspondence, MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map
 from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame, keypoints_of
 from tests.faults.model import State, all_told, best_of, place

@@ -20,7 +20,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, StorageFailure
-from core.storage import Atlas, Map, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas, Map
 from core.storage.search import index_files
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.faults.damage import DAMAGES, Damage, flip, flip_anywhere, flip_used

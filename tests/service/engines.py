@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from core.maps import Enrolment
 from core.places import PlaceFields, Pose
-from core.storage import Enrolment
 from service.app.runtime import Runtime
 from service.engine.engine import Engine
 from service.jobs.records import Job

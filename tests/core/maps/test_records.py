@@ -7,9 +7,9 @@ import pytest
 
 from core.errors import InvalidField
 from core.judgement.verdict import Calibration
+from core.maps import MapRecord
 from core.maps.records import merge_patch, patched_fields, patched_record
 from core.places import PlaceFields, Pose
-from core.storage import MapRecord
 
 # The examples of RFC 7396, appendix A: target, patch, result.
 RFC_7396 = [

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from core.judgement.trials import Trials
+from core.maps import Enrolment, MapSettings
 from core.method.catalogue import EncoderCatalogue
 from core.method.encoder import Encoder
 from core.places import PlaceFields, Pose
 from core.recognition.calibration import queries_from_map, run_trials
-from core.storage import Atlas, Enrolment, MapSettings
+from core.storage import Atlas
 from tests.service.encoders import TWO_STAGES, install_two_stage_encoder
 
 PLACES, QUERIES = 400, 30

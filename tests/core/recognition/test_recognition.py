@@ -14,12 +14,13 @@ import pytest
 from core.errors import NoRegions, UnknownCamera, UnknownPlace
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import TOP_PLACES
+from core.maps import Enrolment, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields, Pose
 from core.recognition.recognition import ATTEMPTS, enrol, locate, recognize
 from core.recognition.stages import likeness, rank_places
-from core.storage import Atlas, Enrolment, Map, MapSettings, Snapshot
+from core.storage import Atlas, Map, Snapshot
 from tests.service.encoders import SECOND_STAGE, TWO_STAGES, install_two_stage_encoder
 from tests.service.scenes import jpeg, scene, seen_again
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from core.maps import MapSettings
 from core.recognition.self_queries import SelfQueries
-from core.storage import MapSettings
 from tests.service.engines import ENCODER, enrolments, runtime_at
 
 

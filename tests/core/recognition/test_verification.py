@@ -13,13 +13,14 @@ from core.frames.images import decode
 from core.geometry.detection import find_keypoints
 from core.geometry.keypoints import Keypoints
 from core.judgement.geometry import WEIGHT
+from core.maps import MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.networks.xfeat import packaged_xfeat
 from core.places import PlaceFields
 from core.recognition.recognition import Answer, describe, enrol, locate, recognize
 from core.recognition.verification import CANDIDATES, Verifier, Verify
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map
 from tests.service.scenes import jpeg, scene, seen_again
 
 PLACES = 12

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from core.storage import Atlas, Map, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE
 
 ROWS = 4

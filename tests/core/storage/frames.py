@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from core.geometry.keypoints import LENGTH, SHARES, Keypoints
+from core.maps import Enrolment
 from core.places import PlaceFields, Pose
-from core.storage import Enrolment
 from core.storage.files.segment_files import Layout
 
 ENCODER = "made-up@" + "0" * 64

@@ -20,7 +20,8 @@ from core.errors import (
     StorageFailure,
     UnknownMap,
 )
-from core.storage import Atlas, Map, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 
 REPOSITORY = Path(__file__).parents[3]

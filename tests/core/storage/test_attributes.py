@@ -11,9 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from core.maps import Enrolment
 from core.maps.place_filter import Scalar
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, Map
+from core.storage import Atlas, Map
 from core.storage.database.connections import FILE
 from core.storage.database.schema import LONGEST_INDEXED
 

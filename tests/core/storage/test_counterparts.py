@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from core.maps import Correspondence
+from core.maps import Correspondence, History, MapSettings
 from core.places import Neighborhood
-from core.storage import Atlas, History, Map, MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 

@@ -9,8 +9,9 @@ from dataclasses import replace
 import pytest
 
 from core.geometry.keypoints import Keypoints
+from core.maps import Enrolment, SameFrame
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, Map, SameFrame
+from core.storage import Atlas, Map
 from tests.core.storage.conftest import ROWS
 from tests.core.storage.frames import frame, keypoints_of
 

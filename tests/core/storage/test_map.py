@@ -22,9 +22,10 @@ from core.errors import (
 )
 from core.frames.images import decode, encode_png
 from core.judgement.verdict import Calibration
+from core.maps import Enrolment, MapSettings, SameFrame
 from core.maps.place_filter import PlaceFilter
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, Map, MapSettings, SameFrame
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, digest_of, frame, local_of
 
 EVENING = datetime(2026, 11, 20, 18, 30, 0, 250, tzinfo=UTC)

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from core.errors import StorageFailure, UnknownFrame, UnknownMap
-from core.storage import Atlas, MapSettings, ReviewSetting
+from core.maps import MapSettings, ReviewSetting
+from core.storage import Atlas
 from core.storage.review import FILE, ReviewFrames
 
 ENCODER = "some@" + "0" * 64

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from core.maps import Enrolment, History, MapSettings
 from core.maps.records import Outline
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, History, Map, MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, digest_of, frame
 
 EARLIER = datetime(2026, 1, 2, 3, 4, 5, 678, tzinfo=UTC)

@@ -9,7 +9,8 @@ import pytest
 
 from core.errors import MapQuarantined
 from core.index.flat import vectors
-from core.storage import Atlas, Map, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas, Map
 from core.storage.database import keypoints
 from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import DESCRIPTOR_BYTES, DIMENSION, ENCODER, LOCAL_SHAPE, RECORD_BYTES, frame

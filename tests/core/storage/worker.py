@@ -15,8 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from core.errors import PlacerecError
+from core.maps import MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 LARGE = 4096

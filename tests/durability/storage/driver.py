@@ -24,9 +24,9 @@ import numpy as np
 
 from core.errors import PlacerecError
 from core.frames.masks import Mask
-from core.maps import Correspondence
+from core.maps import Correspondence, Enrolment, History, MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, History, MapSettings, opening
+from core.storage import Atlas, opening
 from core.storage.database import connections as database
 from core.storage.files.row_formats import inner_products, pack_descriptors
 from core.storage.search import index_files, recall

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from core.errors import StorageFailure
+from core.maps import Enrolment, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder, Encoding
 from core.places import PlaceFields
 from core.recognition.recognition import Answer, locate
-from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.storage import Atlas, Map
 from service.engine import searches
 from service.engine.searches import MOST_TOGETHER, Searches
 from tests.service.scenes import scene, seen_again

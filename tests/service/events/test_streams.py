@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from core.storage import MapSettings
+from core.maps import MapSettings
 from service.access.roles import OWNER
 from service.events.feed import MOST_KEPT
 from service.events.schemas import MapEvent

@@ -15,8 +15,9 @@ import pytest
 from starlette.types import Message
 
 from core.errors import StorageFull
+from core.maps import MapSettings
 from core.maps.archives.writing import Advance, Expect, Exported
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map
 from service.errors.faults import RangeNotSatisfiable, TooManyExports
 from service.maps.exports import FOLDER, Export, ExportResponse, Exports
 from service.places.staging import RESERVE

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from core.disk.files import write_at
-from core.storage import MapSettings
+from core.maps import MapSettings
 from core.storage.archives import unpacking
 from core.storage.files import segment_files as descriptors
 from service.app.runtime import Runtime

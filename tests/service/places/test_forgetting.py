@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from core.errors import InvalidCursor, TooManyToForget
+from core.maps import MapSettings
 from core.maps.place_filter import PlaceFilter
-from core.storage import Atlas, MapSettings
+from core.storage import Atlas
 from tests.core.storage.frames import DIMENSION, LOCAL_SHAPE, frame
 from tests.service.scenes import jpeg
 from tests.service.server import Server, assert_problem

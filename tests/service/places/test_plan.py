@@ -10,8 +10,9 @@ from typing import Any
 import httpx
 import pytest
 
+from core.maps import MapSettings
 from core.maps.store import HANDED_OVER, HAS_PICTURE
-from core.storage import Atlas, MapSettings
+from core.storage import Atlas
 from service.errors.faults import PlanTooLarge
 from service.http.headers import accepts_gzip
 from service.places import plans

@@ -14,7 +14,8 @@ import httpx
 import numpy as np
 import pytest
 
-from core.storage import Atlas, MapSettings, ReviewSetting
+from core.maps import MapSettings, ReviewSetting
+from core.storage import Atlas
 from service.access.keys import KeyStore
 from service.engine.review_keeper import MOST_WAITING, ReviewKeeper
 from tests.service.encoders import COARSE, install_coarse_encoder

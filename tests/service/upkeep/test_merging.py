@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from core.errors import StorageFull
+from core.maps import Enrolment, MapSettings
 from core.places import PlaceFields
-from core.storage import Atlas, Enrolment, MapSettings
+from core.storage import Atlas
 from core.storage.transfer import Transfer
 from service.app.runtime import Runtime
 from service.engine.engine import Engine

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from core.storage import MapSettings
+from core.maps import MapSettings
 from core.storage.transfer import Transfer
 from service.engine.engine import Engine
 from service.jobs.context import JobInterrupted

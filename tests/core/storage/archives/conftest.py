@@ -6,9 +6,9 @@ import pytest
 
 from core.frames.intrinsics import Intrinsics
 from core.frames.masks import Mask
-from core.maps import Correspondence
+from core.maps import Correspondence, Enrolment, MapSettings
 from core.places import PlaceFields, Pose
-from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.storage import Atlas, Map
 from tests.core.storage.archives.files import exported
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from core.errors import MapQuarantined, StorageFailure, StorageFull, UnknownMap
+from core.maps import MapSettings
 from core.maps.archives import writing
 from core.places import Neighborhood
-from core.storage import Atlas, Map, MapSettings
+from core.storage import Atlas, Map
 from core.storage.archives import exporter
 from core.storage.archives.exporter import Exporter
 from core.storage.files.row_formats import COMPRESSED, HALF

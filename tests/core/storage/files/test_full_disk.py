@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from core.errors import StorageFailure, StorageFull
-from core.storage import Atlas, Enrolment, Map, MapSettings
+from core.maps import Enrolment, MapSettings
+from core.storage import Atlas, Map
 from core.storage.files.segment_files import HEADER_BYTES
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, descriptor_of, frame
 from tests.core.storage.worker import LARGE

@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from core.index import Coder, Codes
-from core.storage import Atlas, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from core.errors import MapQuarantined, UnknownMap
 from core.index import Coder, Codes, table
-from core.storage import Atlas, IndexStatus, Map, MapSettings
+from core.maps import IndexStatus, MapSettings
+from core.storage import Atlas, Map
 from core.storage.files import array_files
 from core.storage.files.segment_files import HEADER_BYTES
 from core.storage.search import indexing, recall, snapshot, tiers

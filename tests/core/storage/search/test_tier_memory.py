@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from core.storage import Atlas, Map, MapSettings
+from core.maps import MapSettings
+from core.storage import Atlas, Map
 from core.storage.search.snapshot import threads
 from tests.core.storage.frames import DIMENSION, ENCODER, LOCAL_SHAPE, frame
 
