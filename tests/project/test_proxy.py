@@ -66,7 +66,7 @@ def proxied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxied]:
         "listen 443": f"listen 127.0.0.1:{port}",
     }
     try:
-        with nginx_with("tls.conf", changes, folder) as log:
+        with nginx_with("tls.conf", changes, folder, port) as log:
             server.wait()
             trust = ssl.create_default_context(cafile=str(folder / "authority.pem"))
             yield Proxied(port, server, trust, log, made.stdout.strip())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,11 +28,14 @@ http {{
 
 
 @contextmanager
-def nginx_with(name: str, changes: Mapping[str, str], folder: Path) -> Iterator[Path]:
+def nginx_with(name: str, changes: Mapping[str, str], folder: Path, port: int) -> Iterator[Path]:
     """An nginx with a file of docker/, in which texts are replaced, as long as the block runs; the path of its log.
 
+    Args:
+        port: that it listens on after the changes.
+
     Raises:
-        AssertionError: a text is not in the file, or nginx refuses it.
+        AssertionError: a text is not in the file, nginx refuses it, or it does not listen.
     """
     folder.chmod(0o755)
     log, text = folder / "access.log", (ROOT / "docker" / name).read_text()
@@ -45,13 +49,22 @@ def nginx_with(name: str, changes: Mapping[str, str], folder: Path) -> Iterator[
     assert checked.returncode == 0, checked.stderr
     nginx = subprocess.Popen(words)
     try:
-        until = time.monotonic() + 60
-        while not (folder / "nginx.pid").exists() and time.monotonic() < until:
-            time.sleep(0.02)
+        wait_for_listener(nginx, port)
         yield log
     finally:
         nginx.terminate()
         nginx.wait(10)
+
+
+def wait_for_listener(process: subprocess.Popen[bytes], port: int) -> None:
+    """Return when the process listens on a port of this machine; its file with a process id is there before that."""
+    until = time.monotonic() + 60
+    while True:
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        assert process.poll() is None and time.monotonic() < until, f"nobody listens on port {port}"
+        time.sleep(0.02)
 
 
 @contextmanager
@@ -63,5 +76,5 @@ def balanced(ports: Sequence[int], folder: Path) -> Iterator[str]:
     """
     port = free_port()
     services = {f"placerec-{number}:8000": f"127.0.0.1:{one}" for number, one in enumerate(ports, 1)}
-    with nginx_with("cluster.conf", {**services, "listen 8000": f"listen 127.0.0.1:{port}"}, folder):
+    with nginx_with("cluster.conf", {**services, "listen 8000": f"listen 127.0.0.1:{port}"}, folder, port):
         yield f"http://127.0.0.1:{port}"
