@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +27,9 @@ from benchmarks.cluster.stores import MilvusAddress, PostgresAddress, Stores, bo
 from benchmarks.maps.references import Material, material
 from benchmarks.maps.search import Array, Best, Contender, _enrolment, measure
 from benchmarks.report import report, verdict
-from core.maps.records import MapSettings
+from core.errors import StoreUnavailable
+from core.maps import Map
+from core.maps.records import Enrolment, MapSettings
 from core.method.catalogue import DEFAULT_ENCODER, EncoderCatalogue
 from core.method.encoder import Encoder
 from core.milvus.snapshot import SHORTLIST
@@ -35,7 +37,7 @@ from core.threads import cores, share_cores
 
 LEAST_RECALL = 0.98
 BLOCK, AT_ONCE = 2000, 256
-IDLE_SECONDS = 5.0
+IDLE_SECONDS, AGAIN_SECONDS, CLIENT_SECONDS = 5.0, 2.0, 600.0
 
 
 def fill(stores: Stores, encoder: Encoder, of: Material, places: int) -> NDArray[np.int64]:
@@ -53,9 +55,27 @@ def fill(stores: Stores, encoder: Encoder, of: Material, places: int) -> NDArray
             enrolments = [_enrolment(start + offset, row) for offset, row in enumerate(block)]
             maps[0].enrol(enrolments)
             for first in range(0, len(block), AT_ONCE):
-                maps[1].enrol(enrolments[first : first + AT_ONCE])
+                enrol_as_a_client(maps[1], enrolments[first : first + AT_ONCE])
                 progress.advance(task, len(enrolments[first : first + AT_ONCE]))
     return best.rows
+
+
+def enrol_as_a_client(there: Map, enrolments: Sequence[Enrolment]) -> None:
+    """Send again what is refused because a server is too busy; a batch is stored whole or not at all.
+
+    Raises:
+        StoreUnavailable: it was refused for ten minutes.
+    """
+    until = time.monotonic() + CLIENT_SECONDS
+    while True:
+        try:
+            there.enrol(enrolments)
+        except StoreUnavailable:
+            if time.monotonic() > until:
+                raise
+            time.sleep(AGAIN_SECONDS)
+        else:
+            return
 
 
 def run(stores: Stores, of: Material, truth: NDArray[np.int64], rounds: int) -> list[dict[str, Any]]:
