@@ -13,7 +13,6 @@ settings.load_profile("any machine")
 PAGES = "tests/documents/test_commands.py"
 LONGEST = (
     PAGES,
-    "tests/core/baselines/test_netvlad.py",
     "tests/service/places/",
     "tests/service/commands/",
     "tests/service/console/",
