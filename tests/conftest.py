@@ -1,7 +1,42 @@
 """What holds for all tests."""
 
+from __future__ import annotations
+
+import pytest
 from hypothesis import HealthCheck, settings
+from xdist.scheduler import LoadFileScheduling
 
 # No test may depend on the speed of the machine or on what else it does.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
+
+PAGES = "tests/documents/test_commands.py"
+LONGEST = (
+    PAGES,
+    "tests/service/places/",
+    "tests/service/commands/",
+    "tests/service/console/",
+    "tests/core/storage/files/test_failed_sync.py",
+    "tests/service/sessions/test_sessions.py",
+    "tests/service/upkeep/",
+    "tests/core/evaluation/report/",
+    "tests/clients/",
+    "tests/service/engine/",
+    "tests/benchmarks/",
+    "tests/training/",
+)
+"""Files and folders whose tests take longest: they are begun first, so that no process is left with one at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first."""
+    items.sort(key=lambda item: next((rank for rank, name in enumerate(LONGEST) if item.nodeid.startswith(name)), 99))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config) -> LoadFileScheduling:
+    """The tests of one file stay together, for they share a server; but not those of pages, which take a minute."""
+    config.option.loadscopereorder = False  # it begins with the files that have most tests, not with the longest
+    scheduling = LoadFileScheduling(config)
+    scheduling._split_scope = lambda test: test if test.startswith(PAGES) else test.partition("::")[0]
+    return scheduling

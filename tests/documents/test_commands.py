@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.service.command_forks import ForkedCommands
 from tests.service.server import ROOT, Server
 
 BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -83,37 +84,57 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     assert service.stop() == 0
 
 
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A ``.venv`` that is this one but for ``placerec``, which is forked off."""
+    folder = tmp_path_factory.mktemp("environment")
+    installed = Path(sys.prefix)
+    for path in installed.iterdir():
+        if path.name != "bin":
+            (folder / path.name).symlink_to(path)
+    (folder / "bin").mkdir()
+    for path in (installed / "bin").iterdir():
+        if path.name != "placerec":
+            (folder / "bin" / path.name).symlink_to(path)
+    forked = ForkedCommands(folder / "bin")
+    yield folder
+    forked.close()
+
+
 @pytest.mark.parametrize("document", [page for page in PAGES if page != OF_KEYS], ids=name_of)
-def test_the_commands_run_as_they_are_written(document: Path, shared: Server, tmp_path: Path, pictures: Path) -> None:
+def test_the_commands_run_as_they_are_written(
+    document: Path, shared: Server, tmp_path: Path, pictures: Path, environment: Path
+) -> None:
     try:
-        run_page(document, shared, tmp_path, pictures)
+        run_page(document, shared, tmp_path, pictures, environment)
     finally:
         for item in shared.client.get("/v1/maps").json()["items"]:
             shared.client.delete(f"/v1/maps/{item['id']}")
 
 
 def test_the_page_on_keys_runs_as_it_is_written(tmp_path: Path, pictures: Path) -> None:
+    """With the ``placerec`` that is installed."""
     service = Server(tmp_path / "service").wait()
     try:
-        run_page(OF_KEYS, service, tmp_path, pictures)
+        run_page(OF_KEYS, service, tmp_path, pictures, Path(sys.prefix))
     finally:
         status = service.stop()
     assert status == 0
 
 
-def run_page(document: Path, service: Server, folder: Path, pictures: Path) -> None:
-    """Run all commands of a document in a folder with the examples and their pictures."""
+def run_page(document: Path, service: Server, folder: Path, pictures: Path, installed: Path) -> None:
+    """Run all commands of a document in a folder with the examples, their pictures and a ``.venv``."""
     here = folder / "here"
     here.mkdir()
     shutil.copytree(ROOT / "examples", here / "examples")
-    (here / ".venv").symlink_to(sys.prefix)
+    (here / ".venv").symlink_to(installed)
     shutil.copytree(pictures, here / "pictures")
     root = str(service.client.base_url).rstrip("/")
     environment = {
         **os.environ,
         "url": root,
         "api": f"{root}/v1",
-        "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
+        "PATH": os.pathsep.join([str(installed / "bin"), os.environ["PATH"]]),
         "XDG_CACHE_HOME": str(folder / "cache"),
         "PLACEREC_DATA_DIR": str(service.data_dir),  # for what is done beside a running service
     }

@@ -48,7 +48,7 @@ def attached(process: int, arguments: Sequence[str]) -> Iterator[subprocess.Pope
         yield tracer
     finally:
         tracer.terminate()
-        tracer.communicate(timeout=30)
+        tracer.communicate(timeout=60)
 
 
 class ScriptProcesses:
@@ -68,7 +68,7 @@ class ScriptProcesses:
     ) -> None:
         assert self._process.stdin is not None
         self._process.stdin.close()
-        self._process.wait(30)
+        self._process.wait(60)
 
     def run(self, folder: Path, arguments: Sequence[str], indexed: bool = False) -> dict[str, Any]:
         """Run the script with its data in ``folder / "data"``; its report (:func:`tests.faults.script.run`)."""

@@ -34,7 +34,7 @@ class Fixtures:
     def __init__(self, url: str) -> None:
         key = os.environ.get("PLACEREC_KEY")
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-        self._client = httpx.Client(base_url=url, timeout=30, headers=headers)
+        self._client = httpx.Client(base_url=url, timeout=60, headers=headers)
         self.session = self.explanation = self.job = self.key = ""
 
     def put_back(self) -> None:

@@ -204,7 +204,7 @@ def replicas() -> Iterator[list[ThreadingHTTPServer]]:
 def robot(replicas: list[ThreadingHTTPServer], tmp_path: Path) -> Iterator[httpx.Client]:
     """Asks an nginx in front of both."""
     ports = [replica.server_port for replica in replicas]
-    with balanced(ports, tmp_path) as url, httpx.Client(base_url=url, timeout=30) as client:
+    with balanced(ports, tmp_path) as url, httpx.Client(base_url=url, timeout=60) as client:
         yield client
 
 

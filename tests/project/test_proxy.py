@@ -37,7 +37,7 @@ class Proxied:
 
     def client(self, key: str | None = None) -> httpx.Client:
         headers = {} if key is None else {"Authorization": f"Bearer {key}"}
-        return httpx.Client(base_url=f"https://localhost:{self.port}", verify=self.trust, headers=headers, timeout=30)
+        return httpx.Client(base_url=f"https://localhost:{self.port}", verify=self.trust, headers=headers, timeout=60)
 
 
 def certify(folder: Path) -> None:
@@ -96,7 +96,7 @@ def test_a_key_is_asked_for_and_passed_on(proxied: Proxied) -> None:
     with connect(address, ssl=proxied.trust, compression=None, additional_headers=headers) as stream:
         stream.send(json.dumps({"frame": 0}))
         stream.send(jpeg(1))
-        assert json.loads(stream.recv(timeout=30))["single"]["matches"][0]["place"]["id"] == "p1"
+        assert json.loads(stream.recv(timeout=60))["single"]["matches"][0]["place"]["id"] == "p1"
 
     # The address in a client's own header is not believed; the one from nginx is.
     transport = httpx.HTTPTransport(verify=proxied.trust, local_address="127.0.0.9")

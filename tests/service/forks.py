@@ -1,4 +1,4 @@
-"""Real servers forked off a process that has imported everything: a start costs a third of the processor time.
+"""Real servers forked off a process that has imported everything: a start costs an eighth of the processor time.
 
 What a server does after its imports is what ``placerec serve`` does; it opens its data directory, loads its encoder and
 listens.  The whole start, imports included, is tested where the command itself is (``tests/service/commands``,
@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 
 MODULES = (
     "torch",
+    "anyio._backends._asyncio",
     "uvicorn",
     "uvloop",
     "service.app.application",
@@ -28,10 +29,11 @@ MODULES = (
     "service.telemetry.native_output",
     "service.http.server",
     "tests.service.forks",
+    "tests.service.loaded",  # the last one
 )
 
-_context: ForkServerContext = multiprocessing.get_context("forkserver")
-_context.set_forkserver_preload(list(MODULES))
+context: ForkServerContext = multiprocessing.get_context("forkserver")
+context.set_forkserver_preload(list(MODULES))
 
 
 class ForkedServer:
@@ -44,7 +46,7 @@ class ForkedServer:
     """
 
     def __init__(self, environment: Mapping[str, str], log: Path, traced: bool = False) -> None:
-        self._process = _context.Process(target=_serve, args=(dict(environment), log, traced), daemon=True)
+        self._process = context.Process(target=_serve, args=(dict(environment), log, traced), daemon=True)
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid

@@ -16,9 +16,16 @@ from core.baselines.attention.attentive_attention import Attention
 from core.baselines.system import System
 from core.errors import InvalidModel
 from core.method.catalogue import EncoderCatalogue
+from core.networks import checkpoints
+from tests.core.networks import in_process
 from tests.core.networks.test_resnet import small_resnet
 
 Array = NDArray[Any]
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_process.use(monkeypatch, checkpoints.__name__)
 
 
 def build(path: Path) -> System:

@@ -25,7 +25,9 @@ from core.baselines.netvlad import (
 )
 from core.errors import InvalidModel
 from core.method.equations import assign, residuals
+from core.networks import checkpoints, matfiles
 from core.networks.vgg import torchvision_indices
+from tests.core.networks import in_process
 from tests.core.networks.vgg_writer import blocks, plain_maps, plain_vgg
 
 Array = NDArray[Any]
@@ -105,6 +107,13 @@ def test_nothing_gives_no_nan() -> None:
 
 
 # Files
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are read in this process; tests/core/networks reads them in one of their own."""
+    for module in (checkpoints, matfiles):
+        in_process.use(monkeypatch, module.__name__)
 
 
 WORDS, DEPTH, VALUES = 2, 3, 4

@@ -323,14 +323,14 @@ def test_a_stream_needs_a_key_and_ends_with_it(keyed: Keyed) -> None:
         assert json.loads(refused.value.response.body)["status"] == status
     with stream(keyed, token, "lab", session) as connection:
         connection.send(jpeg(1))
-        assert json.loads(connection.recv(timeout=30))["frames"] == 1
+        assert json.loads(connection.recv(timeout=60))["frames"] == 1
         keyed.store.revoke(key.id)
         assert eventually(lambda: alike.get("/v1/maps").status_code == 401)
         alike.close()
         connection.send(jpeg(1))
-        assert json.loads(connection.recv(timeout=30))["problem"]["type"].endswith("key-refused")
+        assert json.loads(connection.recv(timeout=60))["problem"]["type"].endswith("key-refused")
         with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(timeout=30)
+            connection.recv(timeout=60)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1008
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from playwright.sync_api import expect
 from service.access.keys import KeyStore
 from tests.service.console.conftest import Operator, Visit
 from tests.service.console.world import LAB, frame
+from tests.service.map_jobs import wait_until
 from tests.service.server import Server
 
 
@@ -144,7 +144,8 @@ def test_a_key_that_is_revoked_meanwhile_is_asked_for_again(visit: Visit, keyed:
     page.get_by_role("button", name="Use the key").click()
     page.get_by_role("link", name=LAB, exact=True).wait_for()
     KeyStore(keyed.data_dir).revoke(key.id)
-    time.sleep(1.5)  # the service looks at the file of keys once a second
+    there = {"Authorization": f"Bearer {text}"}
+    wait_until(lambda: keyed.client.get("/v1/maps", headers=there).status_code == 401)
     page.get_by_role("link", name="Jobs").click()
     page.get_by_role("alert").get_by_text("The key is not valid").wait_for()
 

@@ -18,7 +18,7 @@ def keep_busy(encoders: Encoders, encoder: Encoder) -> tuple[list[QueuedFrame], 
 
     def wait(_: Encoded) -> None:
         begun.release()
-        done.wait(30)
+        done.wait(60)
 
     frames = [
         QueuedFrame(encoder, jpeg(0), None, time.monotonic() + 60, after_encoding=wait)
@@ -26,5 +26,5 @@ def keep_busy(encoders: Encoders, encoder: Encoder) -> tuple[list[QueuedFrame], 
     ]
     encoders.put(frames)
     for _ in frames:
-        assert begun.acquire(timeout=30)
+        assert begun.acquire(timeout=60)
     return frames, done

@@ -363,7 +363,7 @@ def test_robots_together_get_the_answers_of_robots_alone(server: Server, travers
     frames = [jpeg(seed) for seed in range(8)]
     alone = [server.query(traverse, data) for data in frames]
     with ThreadPoolExecutor(16) as robots:
-        together = list(robots.map(lambda index: server.query(traverse, frames[index % 8]), range(96)))
+        together = list(robots.map(lambda index: server.query(traverse, frames[index % 8]), range(48)))
     for index, answer in enumerate(together):
         expected = alone[index % 8]
         assert answer["verdict"] == expected["verdict"]

@@ -139,7 +139,7 @@ async def test_a_deadline_holds_while_the_encoder_is_loaded(monkeypatch: pytest.
     get = EncoderCatalogue.get
 
     def slow(self: EncoderCatalogue, identity: str) -> Encoder:
-        free.wait(30)
+        free.wait(60)
         return get(self, identity)
 
     monkeypatch.setattr(EncoderCatalogue, "get", slow)

@@ -95,7 +95,7 @@ def listening(
             closing = response.extensions.get("network_stream")
             if closing is not None and not ear.ended.is_set():
                 _hang_up(closing)
-            thread.join(30)
+            thread.join(60)
 
 
 def _collect(ear: Ear, response: httpx.Response) -> None:

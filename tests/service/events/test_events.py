@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 from service.access.keys import KeyStore
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.events.listening import listening
-from tests.service.map_jobs import asked, finished
+from tests.service.map_jobs import asked, finished, wait_until
 from tests.service.scenes import encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem, text, typed
 
@@ -81,7 +81,7 @@ def test_all_ways_of_asking_are_told(quick: Server, lab: str) -> None:
         assert quick.client.post(f"{frames}/frames?frame=4", content=jpeg(0), headers=typed(jpeg(0))).is_success
         with connect(f"ws://127.0.0.1:{quick.port}{frames}/stream", compression=None) as socket:
             socket.send(jpeg(1))
-            socket.recv(timeout=30)
+            socket.recv(timeout=60)
         told = ear.some(7)
     assert [one.data["operation"] for one in told] == [
         "query", "query_batch", "query_batch", "query_or_enrol", "query_maps", "send_frame", "stream_frames",
@@ -112,11 +112,11 @@ def test_a_session_is_told_from_its_beginning_to_its_end(quick: Server, lab: str
 
 
 def test_a_session_that_expires_was_ended_by_nobody(quick: Server, lab: str) -> None:
-    made = quick.client.post(f"/v1/maps/{lab}/sessions", json={"expires_after": 0.2}).json()
     with listening(quick, lab, parameters={"kinds": "session"}) as ear:
-        time.sleep(0.3)
-        assert quick.client.get(f"/v1/maps/{lab}/sessions").json()["items"] == []
-        (event,) = ear.some(1)
+        made = quick.client.post(f"/v1/maps/{lab}/sessions", json={"expires_after": 0.2}).json()
+        wait_until(lambda: quick.client.get(f"/v1/maps/{lab}/sessions").json()["items"] == [])
+        begun, event = ear.some(2)
+    assert begun.data["session"] == made["id"] and begun.data["change"] == "begun"
     assert event.data["session"] == made["id"] and event.data["change"] == "ended"
     assert event.data["request_id"] is None
 
@@ -171,7 +171,7 @@ def test_changes_of_the_map_and_its_end_are_told(quick: Server, lab: str) -> Non
         quick.client.delete(f"/v1/maps/{lab}/cameras/front")
         assert quick.client.delete(f"/v1/maps/{lab}").status_code == 204
         told = ear.some(5)
-        assert ear.ended.wait(30), "the stream ends with the map"
+        assert ear.ended.wait(60), "the stream ends with the map"
     assert [one.data["change"] for one in told] == ["edited", "edited", "cameras", "cameras", "deleted"]
     assert told[0].data["fields"] == ["description", "same_place_radius"] and told[0].data["revision"] == 2
     assert told[1].data["fields"] == ["calibration"]
@@ -322,7 +322,7 @@ def test_a_job_that_names_a_map_of_others_is_not_told(keyed: Keyed) -> None:
 
 def test_a_stream_ends_when_its_key_is_revoked(keyed: Keyed) -> None:
     key, token = keyed.store.create("guest", "query", ["lab"])
-    until = time.monotonic() + 30
+    until = time.monotonic() + 90
     there = {"Authorization": f"Bearer {token}"}
     while keyed.server.client.get("/v1/maps/lab", headers=there).status_code != 200:
         assert time.monotonic() < until
@@ -333,7 +333,7 @@ def test_a_stream_ends_when_its_key_is_revoked(keyed: Keyed) -> None:
             assert time.monotonic() < until
             time.sleep(0.5)
         keyed.server.query("lab", jpeg(1))
-        assert guest.ended.wait(30)
+        assert guest.ended.wait(60)
         admin.some(1, "query")
         assert guest.names() == ["listening"]
 
@@ -345,7 +345,7 @@ def test_listeners_do_not_keep_the_service_from_stopping(tmp_path: Path) -> None
     with listening(server, "lab") as ear:
         began = time.monotonic()
         assert server.stop() == 0
-        assert ear.ended.wait(30) and time.monotonic() - began < 60, "requests under way would have had two minutes"
+        assert ear.ended.wait(60) and time.monotonic() - began < 60, "requests under way would have had two minutes"
 
 
 def test_two_hundred_queries_from_eight_callers_are_each_told_once(quick: Server, lab: str) -> None:

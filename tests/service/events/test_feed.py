@@ -216,7 +216,7 @@ async def test_frames_whose_pictures_are_being_made_are_bounded(monkeypatch: pyt
     gate = threading.Event()
 
     def held(data: bytes, limits: Limits) -> Pixels:
-        gate.wait(30)
+        gate.wait(60)
         return decode(data, limits)
 
     monkeypatch.setattr(module, "decode", held)

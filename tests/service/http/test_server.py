@@ -31,7 +31,7 @@ class Seen:
 
 def drive(server: Server, name: str, enrols: bool, seen: Seen, until: threading.Event) -> None:
     """Enrol, or ask, one frame after the other."""
-    with httpx.Client(base_url=server.client.base_url, timeout=30) as client:
+    with httpx.Client(base_url=server.client.base_url, timeout=60) as client:
         number = 0
         while not until.is_set():
             number += 1
@@ -67,18 +67,18 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Server, lis
     address = f"ws://127.0.0.1:{server.port}/v1/maps/storm/sessions/{session}/stream"
     with connect(address, max_size=None, compression=None) as stream:
         stream.send(jpeg(1))
-        stream.recv(timeout=30)
+        stream.recv(timeout=60)
         for client in clients:
             client.start()
         assert eventually(lambda: all(len(one.statuses) >= 2 for one in seen))
         server.process.send_signal(signal.SIGTERM)
-        with httpx.Client(base_url=server.client.base_url, timeout=30) as probe:
+        with httpx.Client(base_url=server.client.base_url, timeout=60) as probe:
             assert_problem(ready := probe.get("/readyz"), 503, "not-ready")
             assert ready.json()["checks"]["service"] == "it is stopping" and ready.headers["connection"] == "close"
             assert probe.get("/livez").status_code == 200, "it lives on"
             assert probe.post("/v1/maps/storm/query", content=FRAMES[1], headers=typed(FRAMES[1])).status_code == 200
         with pytest.raises(ConnectionClosed) as raised:
-            stream.recv(timeout=30)
+            stream.recv(timeout=60)
     assert server.process.wait(60) == 0
     until.set()
     for client in clients:

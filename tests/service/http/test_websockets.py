@@ -43,7 +43,7 @@ def closed_with(connection: ClientConnection) -> int | None:
     """The code with which the service closes."""
     with pytest.raises(ConnectionClosed) as raised:
         while True:
-            connection.recv(timeout=30)
+            connection.recv(timeout=60)
     return raised.value.rcvd.code if raised.value.rcvd else None
 
 
@@ -89,11 +89,11 @@ def test_a_frame_is_held_until_it_is_answered_though_the_next_is_always_there(
         stream.send(data)
     for number in range(20):
         stream.send(data)
-        assert json.loads(stream.recv(timeout=30))["frames"] == number + 1
+        assert json.loads(stream.recv(timeout=60))["frames"] == number + 1
         most = max(most, held(strict))
     assert 0 < most <= 5 * len(data)
     for _ in range(3):
-        stream.recv(timeout=30)
+        stream.recv(timeout=60)
     assert eventually(lambda: held(strict) == 0), "though it goes on"
 
 

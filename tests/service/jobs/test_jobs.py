@@ -96,7 +96,7 @@ def test_jobs_take_turns_and_the_queue_is_bounded(tmp_path: Path) -> None:
 
     with running(tmp_path, longest_queue=2) as jobs:
         first = jobs.submit("gate", None, gate)
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
         waiting = [jobs.submit("note", None, noting(number)) for number in range(2)]
         with pytest.raises(JobQueueFull):
             jobs.submit("note", None, lambda _: {})
@@ -112,7 +112,7 @@ def test_two_workers_never_work_on_one_map(tmp_path: Path) -> None:
         jobs.submit("gate", "lab", first)
         second = jobs.submit("note", "lab", lambda _: {})
         jobs.submit("gate", "hall", other)
-        assert first.begun.wait(30) and other.begun.wait(30)
+        assert first.begun.wait(60) and other.begun.wait(60)
         assert jobs.get(second.id).state == "queued"
         first.open.set()
         assert end_of(jobs, second).state == "succeeded"
@@ -131,7 +131,7 @@ def test_cancelling(tmp_path: Path) -> None:
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, careful)
         waiting = jobs.submit("note", None, lambda _: {})
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
         assert jobs.cancel(waiting.id).state == "cancelled"
         assert jobs.cancel(job.id).cancelling
         assert end_of(jobs, job).state == "cancelled" and undone.is_set()
@@ -149,7 +149,7 @@ def test_a_job_interrupted_by_a_stop_is_resumed_at_the_next_start(tmp_path: Path
         job = jobs.submit("gate", "lab", arguments={"to": "hall"})
         waiting = jobs.submit("gate", None, arguments={"number": 2})
         lost = jobs.submit("note", None, lambda _: {})
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
     gate.open.set()
     with running(tmp_path, {"gate": gate}) as jobs:
         again = end_of(jobs, job)
@@ -164,7 +164,7 @@ def test_a_job_that_cannot_be_resumed_fails_when_the_service_stops(tmp_path: Pat
     gate = Gate()
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
     with running(tmp_path) as jobs:
         failed = jobs.get(job.id)
         assert failed.state == "failed" and failed.problem is not None
@@ -186,7 +186,7 @@ def test_a_resumed_job_has_its_notes_and_is_still_cancelled(tmp_path: Path) -> N
 
     with running(tmp_path, {"note": noting}) as jobs:
         job = jobs.submit("note", None, arguments={})
-        assert begun.wait(30)
+        assert begun.wait(60)
         assert jobs.cancel(job.id).cancelling
     with running(tmp_path, {"note": noting}) as jobs:
         assert end_of(jobs, job).state == "cancelled"
@@ -209,7 +209,7 @@ def test_progress_grows_and_its_versions_differ(tmp_path: Path) -> None:
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
         versions.add(job.version)
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
         now = jobs.get(job.id)
         assert (now.done, now.total, now.message) == (1, 4, "at the gate")
         versions.add(now.version)
@@ -259,7 +259,7 @@ def test_jobs_go_on_while_the_disk_refuses(tmp_path: Path, monkeypatch: pytest.M
     gate = Gate()
     with running(tmp_path) as jobs:
         job = jobs.submit("gate", None, gate)
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
 
         def refuse(_job: Job) -> None:
             raise sqlite3.OperationalError("disk I/O error")
@@ -278,7 +278,7 @@ def test_a_job_of_an_unknown_kind_fails_at_the_start(tmp_path: Path) -> None:
     gate, discarded = Gate(), list[str]()
     with running(tmp_path, {"gate": gate}) as jobs:
         job = jobs.submit("gate", "lab", arguments={"form": "f"})
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
     with running(tmp_path, {"other": gate}) as jobs:
         failed = jobs.get(job.id)
         assert failed.state == "failed" and failed.problem is not None
@@ -294,7 +294,7 @@ def test_jobs_of_damaged_records_are_listed_as_lost(tmp_path: Path, how: str) ->
     with running(tmp_path, {"gate": gate}) as jobs:
         done = end_of(jobs, jobs.submit("note", None, lambda _: {"kept": True}))
         job = jobs.submit("gate", "lab", arguments={})
-        assert gate.begun.wait(30)
+        assert gate.begun.wait(60)
     connection = sqlite3.connect(tmp_path / FILE)
     if how == "a record":
         connection.execute("UPDATE jobs SET arguments = '{' WHERE id = ?", (job.id,))
@@ -327,7 +327,7 @@ def test_the_files_of_a_job_are_discarded_however_it_ends(tmp_path: Path) -> Non
         jobs.register(kind, work, lambda job: discarded.append(job.id))
     jobs.start()
     first, second, third = (jobs.submit(kind, None, arguments={}) for kind in ("gate", "refuse", "gate"))
-    assert gate.begun.wait(30)
+    assert gate.begun.wait(60)
     jobs.cancel(third.id)
     assert discarded == [third.id], "cancelled before it began"
     gate.open.set()
@@ -345,7 +345,7 @@ def test_a_job_fails_if_its_map_was_replaced(tmp_path: Path) -> None:
     lab = atlas.create("lab", "some@" + "0" * 64, 8)
 
     def look(context: JobContext) -> dict[str, Any]:
-        assert gate.wait(30)
+        assert gate.wait(60)
         return {"places": context.map(atlas).count_places()}
 
     with running(tmp_path) as jobs:
@@ -368,7 +368,7 @@ def test_long_jobs_give_way_to_those_of_other_maps_in_turn(tmp_path: Path, monke
     order, ready = list[str](), threading.Event()
 
     def stepping(context: JobContext) -> dict[str, Any]:
-        assert ready.wait(30)
+        assert ready.wait(60)
         while (step := context.notes.get("step", 0)) < 3:
             order.append(f"{context.map_id}{context.arguments['name']}{step}")
             context.remember(step=step + 1)
@@ -389,14 +389,14 @@ def test_a_job_that_has_given_way_is_cancelled_at_once(tmp_path: Path, monkeypat
     gate, ready = Gate(), threading.Event()
 
     def yielding(context: JobContext) -> dict[str, Any]:
-        assert ready.wait(30)
+        assert ready.wait(60)
         context.give_way()
         return {}
 
     with running(tmp_path, {"yielding": yielding, "gate": gate}) as jobs:
         patient, other = jobs.submit("yielding", "x"), jobs.submit("gate", "y")
         ready.set()
-        assert gate.begun.wait(30) and jobs.get(patient.id).attempt == 1
+        assert gate.begun.wait(60) and jobs.get(patient.id).attempt == 1
         assert jobs.cancel(patient.id).state == "cancelled"
         gate.open.set()
         assert end_of(jobs, other).state == "succeeded" and jobs.get(patient.id).state == "cancelled"

@@ -194,7 +194,7 @@ def test_what_was_acknowledged_before_a_download_began_is_in_it(run: Run, monkey
         def slow(path: Path, advance: Advance, expect: Expect) -> Exported:
             def waiting(written: int) -> None:
                 begun.set()
-                assert free.wait(30)
+                assert free.wait(60)
                 advance(written)
 
             return write(path, waiting, expect)

@@ -22,7 +22,7 @@ from tests.service.places.test_bulk_enrolment import traverse
 from tests.service.scenes import jpeg
 from tests.service.server import Server
 
-SECONDS = 5.0
+SECONDS = 3.0
 FRAMES = [jpeg(number, 160, 120) for number in range(6)]
 
 

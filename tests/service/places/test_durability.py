@@ -56,11 +56,11 @@ def test_the_main_job(tmp_path: Path) -> None:
 
 
 def test_the_corridor(tmp_path: Path) -> None:
-    """The same with two real traverses of a corridor."""
+    """The same with every third frame of a corridor and every sixth of its second traverse."""
     corridor = Path(__file__).parents[4] / "shared" / "datasets" / "eval" / "corridor"
     if not corridor.is_dir():
         pytest.skip("the corridor data set is not beside the repository")
-    references = [path.read_bytes() for path in sorted((corridor / "ref").iterdir())]
+    references = [path.read_bytes() for path in sorted((corridor / "ref").iterdir())][::3]
     queries = [path.read_bytes() for path in sorted((corridor / "query").iterdir())][::6]
     server = Server(tmp_path).wait()
     server.create_map("corridor")
@@ -70,7 +70,7 @@ def test_the_corridor(tmp_path: Path) -> None:
     before = answers(server, "corridor", queries)
     right = 0
     for number, answer in enumerate(before):
-        right += abs(int(answer["matches"][0]["place"]["id"]) - 6 * number) <= 3
+        right += abs(3 * int(answer["matches"][0]["place"]["id"]) - 6 * number) <= 3
     assert right / len(queries) > 0.5
     server.kill()
     server = Server(tmp_path).wait()
@@ -88,7 +88,7 @@ def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> 
     server.create_map("lab")
 
     def enrol(worker: int, url: httpx.URL) -> None:
-        with httpx.Client(base_url=url, timeout=10) as client:
+        with httpx.Client(base_url=url, timeout=60) as client:
             for number in range(1000):
                 name, frame = f"w{worker}-{number}", (worker + number) % len(frames)
                 try:
@@ -110,7 +110,7 @@ def test_sigkill_during_enrolment_loses_nothing_acknowledged(tmp_path: Path) -> 
         time.sleep(0.01)
     server.kill()
     for worker in workers:
-        worker.join(30)
+        worker.join(60)
     assert len(acknowledged) >= 24
     server = Server(tmp_path, coarse).wait()
 
@@ -225,7 +225,7 @@ def test_a_2xx_is_sent_only_after_its_writes_are_synced(tmp_path: Path) -> None:
     children = Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
     for child in children:
         os.kill(int(child), signal.SIGKILL)
-    server.process.wait(30)
+    server.process.wait(60)
     client.close()
 
     report = audit(trace.read_text(), server.data_dir, is_success_response)

@@ -29,7 +29,7 @@ def ask(connection: ClientConnection, data: bytes, **parameters: object) -> dict
     if parameters:
         connection.send(json.dumps(parameters))
     connection.send(data)
-    answer: dict[str, Any] = json.loads(connection.recv(timeout=30))
+    answer: dict[str, Any] = json.loads(connection.recv(timeout=60))
     return answer
 
 
@@ -52,7 +52,7 @@ def test_frames_sent_ahead_are_answered_in_their_order(server: Server, traverse:
         for number in range(8):
             connection.send(json.dumps({"frame": number}))
             connection.send(again(number))
-        answers = [json.loads(connection.recv(timeout=30)) for _ in range(8)]
+        answers = [json.loads(connection.recv(timeout=60)) for _ in range(8)]
     assert [answer["frame"] for answer in answers] == list(range(8))
     assert [answer["frames"] for answer in answers] == list(range(1, 9))
 
@@ -68,10 +68,10 @@ def test_errors_are_reported_and_the_stream_goes_on(server: Server, traverse: st
         ]
         for message in ("{", "[]"):
             connection.send(message)
-            problems.append(json.loads(connection.recv(timeout=30)))
+            problems.append(json.loads(connection.recv(timeout=60)))
         for _ in range(2):
             connection.send('{"frame": 1}')
-        problems.append(json.loads(connection.recv(timeout=30)))
+        problems.append(json.loads(connection.recv(timeout=60)))
         slugs = [problem["problem"]["type"].rpartition(":")[2] for problem in problems]
         assert slugs == [
             "not-an-image", "truncated-image", "invalid-request", "invalid-request", "malformed-body", "malformed-body",
@@ -92,7 +92,7 @@ def test_a_frame_has_one_message_even_if_its_parameters_are_refused(server: Serv
             connection.send(again(1))
         connection.send('{"frame": 3}')
         connection.send(again(3))
-        answers = [json.loads(connection.recv(timeout=30)) for _ in range(3)]
+        answers = [json.loads(connection.recv(timeout=60)) for _ in range(3)]
         assert ["problem" in answer for answer in answers] == [True, True, False]
         assert (answers[2]["frame"], answers[2]["frames"]) == (3, 1), "the others were not taken in"
 
@@ -126,7 +126,7 @@ def test_a_session_deleted_during_a_stream(server: Server, traverse: str) -> Non
         server.client.delete(f"/v1/maps/{traverse}/sessions/{session}")
         assert ask(connection, again(1))["problem"]["type"].endswith("unknown-session")
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=30)
+            connection.recv(timeout=60)
 
 
 def test_frames_over_the_limit_and_a_service_that_stops(tmp_path: Path) -> None:
@@ -140,13 +140,13 @@ def test_frames_over_the_limit_and_a_service_that_stops(tmp_path: Path) -> None:
         assert ask(connection, jpeg(1))["frames"] == 1
         connection.send(bytes(200_000))
         with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(timeout=30)
+            connection.recv(timeout=60)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009, "message too big"
     with stream(server, "lab", session) as connection:
         assert ask(connection, jpeg(1))["frames"] == 2
         assert server.stop() == 0
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=30)
+            connection.recv(timeout=60)
 
 
 def test_a_plain_request_to_a_stream(server: Server, traverse: str) -> None:

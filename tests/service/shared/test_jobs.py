@@ -150,7 +150,7 @@ def test_a_job_is_taken_over_from_its_checkpoint(quick: str, tmp_path: Path) -> 
             seen.append((service, context.attempt, context.notes.get("step")))
             context.remember(step=context.attempt)
             if context.attempt == 1:
-                held.wait(30)  # deaf for a while, as a process that was stopped
+                held.wait(60)  # deaf for a while, as a process that was stopped
                 context.remember(step="too late")
             return {"by": service}
 
@@ -158,7 +158,7 @@ def test_a_job_is_taken_over_from_its_checkpoint(quick: str, tmp_path: Path) -> 
 
     one = Service(quick, tmp_path / "one", {"walk": work_of("one")}).start()
     job = one.jobs.submit("walk", "lab", arguments={})
-    here = one.jobs.submit("alone", "yard", lambda _: {"never": held.wait(30)})
+    here = one.jobs.submit("alone", "yard", lambda _: {"never": held.wait(60)})
     while not seen:
         time.sleep(0.01)
     other = Service(quick, tmp_path / "other", {"walk": work_of("other")}).start()

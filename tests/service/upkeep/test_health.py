@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import time
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from service.queries.statistics import map_key
+from service.queries.statistics import FILE, map_key
 from tests.service.encoders import COARSE, install_coarse_encoder
 from tests.service.engines import runtime_at
-from tests.service.map_jobs import enrol_frames, enrol_many, walk_frames
+from tests.service.map_jobs import enrol_frames, enrol_many, wait_until, walk_frames
 from tests.service.scenes import blank, encoded, jpeg, scene, seen_again
 from tests.service.server import Server, assert_problem
 
@@ -111,7 +112,8 @@ def test_counts_survive_a_restart(tmp_path: Path) -> None:
     server = Server(tmp_path, {"statistics_seconds": 0.2}).wait()
     enrol_many(server, "lab", 4)
     server.query("lab", jpeg(1))
-    time.sleep(1.0)
+    with closing(sqlite3.connect(f"file:{server.data_dir / FILE}?mode=ro", uri=True)) as written:
+        wait_until(lambda: written.execute("SELECT count(*) FROM weeks").fetchone() == (1,))
     server.kill()
     server = Server(tmp_path).wait()
     assert server.client.get("/v1/maps/lab/health").json()["answers"]["queries"] == 1

@@ -149,7 +149,7 @@ def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
     def ask() -> None:
         """A robot that queries without a pause: the merge gives way to each query, and so takes long."""
         nonlocal answered
-        with suppress(httpx.TransportError), httpx.Client(base_url=server.client.base_url, timeout=30) as client:
+        with suppress(httpx.TransportError), httpx.Client(base_url=server.client.base_url, timeout=60) as client:
             while client.post("/v1/maps/lab/query", content=jpeg(3), headers=typed(jpeg(3))).status_code == 200:
                 answered += 1
 
@@ -165,7 +165,7 @@ def test_a_kill_in_the_middle_of_a_merge(tmp_path: Path) -> None:
     server.kill()
     assert going["state"] == "running" and going["progress"]["done"] < MANY, (going, answered - before)
     for robot in robots:
-        robot.join(30)
+        robot.join(60)
     server = Server(tmp_path).wait()
     done = finished(server, job)
     assert (done["state"], done["attempt"]) == ("succeeded", 2), done

@@ -189,7 +189,7 @@ def test_a_job_and_those_who_follow_it_do_not_keep_the_service_from_stopping(fol
     enrol_many(server, "lab", 64)
     job = start(server, "lab", "lab-2")
     reaching(server, job, 1)
-    with httpx.Client(base_url=server.client.base_url, timeout=30) as watcher:
+    with httpx.Client(base_url=server.client.base_url, timeout=60) as watcher:
         with watcher.stream("GET", f"/v1/jobs/{job['id']}/events") as response:
             stream = response.iter_lines()
             next(stream)

@@ -108,7 +108,7 @@ def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: py
 
     def slowly(self: Coder, descriptors: NDArray[np.float32]) -> Codes:
         reached.set()
-        assert gone.wait(30)
+        assert gone.wait(60)
         return encode(self, descriptors)
 
     monkeypatch.setattr(Coder, "encode", slowly)
@@ -122,12 +122,12 @@ def test_a_map_that_is_deleted_or_searched_exactly(atlas: Atlas, monkeypatch: py
 
     thread = threading.Thread(target=work)
     thread.start()
-    assert reached.wait(30)
+    assert reached.wait(60)
     deleting = threading.Thread(target=atlas.delete, args=("lab",))
     deleting.start()
     gone.set()
-    thread.join(30)
-    deleting.join(30)
+    thread.join(60)
+    deleting.join(60)
     assert [type(error) for error in failed] == [UnknownMap]
 
 

@@ -58,7 +58,7 @@ def priorities(directory: Path) -> None:
     all_there = threading.Barrier(count)
 
     def priority() -> int:
-        all_there.wait(30)
+        all_there.wait(60)
         return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
     print({task.result() for task in [pool.submit(priority) for _ in range(count)]}, os.getpriority(os.PRIO_PROCESS, 0))
