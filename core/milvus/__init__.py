@@ -8,6 +8,7 @@ of Milvus is never changed; it counts as long as PostgreSQL names its key.  docs
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING
 
 from core.errors import MissingExtra
@@ -28,6 +29,7 @@ def open_store(
     Raises:
         MissingExtra: what speaks to them is not installed.
     """
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what it would write beside the log is in the errors
     try:
         from core.milvus.store import MilvusStore
     except ModuleNotFoundError as error:

@@ -6,8 +6,7 @@ Every function takes a connection of its caller, within the transaction to which
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from math import nan
@@ -17,13 +16,11 @@ from typing import Any
 import numpy as np
 import psycopg
 from psycopg import Connection
-from psycopg_pool import PoolTimeout
 
-from core.errors import MapExists, StorageFailure, StorageFull, StoreUnavailable, UnknownMap
+from core.errors import MapExists, UnknownMap
 from core.maps.counterparts import Standing
 from core.maps.place_filter import PlaceFilter
 from core.maps.records import KeptFrame, MapRecord, Outline, SequenceSummary
-from core.milvus.outage import Unreachable
 from core.milvus.tokens import tokens_of
 from core.places import GEOGRAPHIC, METRIC, NO_POSE, NO_SEQUENCE, NO_TIME, Place, Whereabouts, microseconds
 
@@ -42,26 +39,6 @@ LEFT_SECONDS = 60
 """What no place names any more is deleted after so many seconds; a query that still needs it has ended by then."""
 
 LEAVINGS_AT_ONCE = 1000
-
-
-@contextmanager
-def postgres_errors(action: str) -> Iterator[None]:
-    """Turn what PostgreSQL refuses into our errors."""
-    try:
-        yield
-    except psycopg.errors.DiskFull as error:
-        raise StorageFull(f"PostgreSQL has no room left to {action}.") from error
-    except psycopg.errors.LockNotAvailable as error:
-        raise StoreUnavailable(
-            f"PostgreSQL refuses to {action}: others are writing to the map for too long."
-        ) from error
-    except (psycopg.OperationalError, psycopg.InterfaceError) as error:
-        if isinstance(error, PoolTimeout):
-            raise
-        text = str(error).strip().splitlines()
-        raise Unreachable("PostgreSQL", f"cannot be reached, or refuses: {' '.join(text)[:300]}") from error
-    except psycopg.Error as error:
-        raise StorageFailure(f"PostgreSQL refuses to {action}: {str(error).strip()[:300]}") from error
 
 
 @dataclass(frozen=True)

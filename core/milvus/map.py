@@ -44,6 +44,7 @@ from core.milvus.parts.exporter import MilvusExporter
 from core.milvus.parts.plan import MilvusPlan
 from core.milvus.parts.review import MilvusReview
 from core.milvus.parts.transfer import MilvusTransfer
+from core.milvus.postgres import postgres_errors
 from core.milvus.snapshot import MilvusScope, MilvusSnapshot, scope_of
 from core.milvus.writing import Write, expect_place
 from core.places import Place, PlaceFields
@@ -346,7 +347,7 @@ class MilvusMap:
         """A transaction in which this thread may write to the map."""
         paused: Connection[Any] | None = getattr(self._paused, "connection", None)
         if paused is not None:
-            with ledger.postgres_errors("write to a map"), paused.transaction():
+            with postgres_errors("write to a map"), paused.transaction():
                 paused.execute("SET LOCAL synchronous_commit TO on")
                 yield paused
             return

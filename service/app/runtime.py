@@ -81,6 +81,7 @@ class Runtime:
         self.stopping = False
         """Whether the service is about to stop, so that it is no longer ready for new requests."""
         self._maps_state, self._disk_state, self._disk_checked = "ok", "ok", 0.0
+        self._not_ready = ""
         self._register_jobs()
 
     def _register_jobs(self) -> None:
@@ -167,9 +168,20 @@ class Runtime:
         if self.stopping:
             checks["service"] = "it is stopping"
         bad = [f"{name}: {state}" for name, state in checks.items() if state != "ok"]
+        self._note_readiness("; ".join(bad))
         if bad:
             raise NotReady(f"The service is not ready: {'; '.join(bad)}.", checks)
         return checks
+
+    def _note_readiness(self, bad: str) -> None:
+        """Log when it becomes another one; that the encoder is being loaded is no news."""
+        if bad == "encoder: loading":
+            return
+        before, self._not_ready = self._not_ready, bad
+        if bad and bad != before:
+            log.warning("the service is not ready: %s", bad)
+        elif before and not bad:
+            log.info("the service is ready")
 
     def _check_store(self) -> tuple[str, str]:
         """The states of the servers that have the maps, if there are such, and of the disk."""

@@ -58,9 +58,9 @@ class Load(threading.Thread):
         self._over.set()
         self.join()
 
-    def served(self, since: tuple[int, int]) -> bool:
-        """Whether it was served some more since ``done`` was so."""
-        return all(now >= then + SERVED for now, then in zip(self.done, since, strict=True))
+    def served(self, since: tuple[int, int], times: int) -> bool:
+        """Whether it had so many writes and so many queries answered since ``done`` was so."""
+        return all(now >= then + times for now, then in zip(self.done, since, strict=True))
 
     @property
     def done(self) -> tuple[int, int]:
@@ -146,22 +146,18 @@ def check(lab: MilvusMap, may: May) -> None:
 
 @dataclass
 class Recovery:
-    """Seconds from the start of a part: until it answered at all, did its work for somebody who asks it directly, and
-    both clients were served again; and the load of the machine then."""
+    """Seconds from the start of a part: until it answered at all, did its work for somebody who asks it directly, both
+    clients had a write and a query answered, and ``SERVED`` of each; and the load of the machine then."""
 
     answered: float
     worked: float
+    first: float
     served: float
     load: float
 
     def __str__(self) -> str:
-        times = f"answered {self.answered:.1f} s, worked {self.worked:.1f} s, served {self.served:.1f} s"
-        return f"{times} after its start, load {self.load:.0f}"
-
-    @property
-    def ours(self) -> float:
-        """What clients waited for although the part worked."""
-        return max(0.0, self.served - self.worked)
+        times = f"answered {self.answered:.1f} s, worked {self.worked:.1f} s, first served {self.first:.1f} s"
+        return f"{times}, {SERVED} times {self.served:.1f} s after its start, load {self.load:.0f}"
 
 
 @dataclass
@@ -176,8 +172,9 @@ class Tally:
         kills = sum(map(len, self.recoveries.values()))
         return f"{kills} kills, {self.answered} answered, {self.refused} refused" + "".join(
             f"\n  {part}, {len(these)} kills: answers after {_middle([one.answered for one in these])}, works after"
-            f" {_middle([one.worked for one in these])}, clients wait {_middle([one.ours for one in these])} longer;"
-            f" served again after {_middle([one.served for one in these])} under a load of"
+            f" {_middle([one.worked for one in these])}, clients are first served"
+            f" {_middle([max(0.0, one.first - one.worked) for one in these])} later, and {SERVED} times after"
+            f" {_middle([one.served for one in these])} in all, under a load of"
             f" {statistics.median(one.load for one in these):.0f}"
             for part, these in self.recoveries.items()
         )
@@ -221,13 +218,9 @@ class Campaign:
             worked: list[float] = []
             asking = threading.Thread(target=lambda: worked.append(_works_at(killed) - began))
             asking.start()
-            while not all(load.served(then) for load, then in zip(loads, before, strict=True)):
-                late = time.monotonic() - began
-                assert late < GIVEN_UP and all(load.is_alive() for load in loads), f"{late:.0f} s after {part} returned"
-                time.sleep(0.02)
-            served = time.monotonic() - began
+            first, served = (_served_at(loads, before, times, began + GIVEN_UP, part) - began for times in (1, SERVED))
             asking.join()
-            recovery = Recovery(answered, min(worked[0], served), served, os.getloadavg()[0])
+            recovery = Recovery(answered, min(worked[0], first), first, served, os.getloadavg()[0])
             self.tally.recoveries.setdefault(part, []).append(recovery)
         for load in loads:
             assert not load.wrong, load.wrong
@@ -245,6 +238,15 @@ class Campaign:
         with suppress(UnknownMap):
             self._store.delete("lab")
         self._store.close()
+
+
+def _served_at(loads: Sequence[Load], before: Sequence[tuple[int, int]], times: int, until: float, part: str) -> float:
+    """When all clients have been served so many times."""
+    while not all(load.served(then, times) for load, then in zip(loads, before, strict=True)):
+        assert all(load.is_alive() for load in loads), "a client is gone"
+        assert time.monotonic() < until, f"{part} is back, but clients are not served"
+        time.sleep(0.02)
+    return time.monotonic()
 
 
 def _works_at(part: Part) -> float:

@@ -91,13 +91,13 @@ initial-cluster: default=http://127.0.0.1:{peer}
 
 def fixed_ports(count: int) -> list[int]:
     """Ports that nobody listens at, and of which the system makes no use."""
-    found: list[int] = []
+    found: set[int] = set()
     while len(found) < count:
         port = random.choice(_FIXED_PORTS)
         with socket.socket() as listener, suppress(OSError):
             listener.bind(("127.0.0.1", port))
-            found.append(port)
-    return found
+            found.add(port)
+    return list(found)
 
 
 class Server:
