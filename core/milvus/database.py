@@ -10,7 +10,7 @@ import psycopg
 from psycopg import Connection
 
 from core.errors import StoreOfAnotherVersion
-from core.milvus.ledger import TABLES, VERSION, version_of
+from core.milvus.ledger import OLDEST_VERSION, TABLES, VERSION, version_of
 from core.milvus.outage import Unreachable
 from core.milvus.postgres import Postgres
 
@@ -21,7 +21,7 @@ _LOCK = 7_061_636_572  # any number that nothing else in the database uses
 def _make_tables(connection: Connection[Any]) -> None:
     connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
     found = version_of(connection)
-    if found is None:
+    if found is None or OLDEST_VERSION <= found < VERSION:
         connection.execute(TABLES)
     elif found != VERSION:
         raise StoreOfAnotherVersion(
@@ -60,17 +60,21 @@ class Database(Postgres):
             yield connection
 
     @contextmanager
-    def locked(self, action: str, kind: int, number: int, wait: bool = True) -> Iterator[Connection[Any] | None]:
+    def locked(
+        self, action: str, kind: int, number: int, wait: bool = True, shared: bool = False
+    ) -> Iterator[Connection[Any] | None]:
         """Hold a lock of the database on a connection of its own; None if another has it and ``wait`` is not set.
+
+        Others may hold a ``shared`` one as well, if theirs is shared too.
 
         The block ends its transactions on that connection itself.  The lock is gone when the connection is lost, and
         then the connection takes no further statement.
         """
-        key = (kind, number % 2**31)
+        key, how = (kind, number % 2**31), "_shared" if shared else ""
         with self.connection(action) as connection:
             if wait:
-                connection.execute("SELECT pg_advisory_lock(%s::int, %s::int)", key)
-            elif connection.execute("SELECT pg_try_advisory_lock(%s::int, %s::int)", key).fetchone() != (True,):
+                connection.execute(f"SELECT pg_advisory_lock{how}(%s::int, %s::int)", key)
+            elif connection.execute(f"SELECT pg_try_advisory_lock{how}(%s::int, %s::int)", key).fetchone() != (True,):
                 yield None
                 return
             connection.commit()
@@ -79,7 +83,7 @@ class Database(Postgres):
             finally:
                 with suppress(psycopg.Error):  # a lost connection has no lock
                     connection.rollback()
-                    connection.execute("SELECT pg_advisory_unlock(%s::int, %s::int)", key)
+                    connection.execute(f"SELECT pg_advisory_unlock{how}(%s::int, %s::int)", key)
                     connection.commit()
 
     def check(self) -> None:
