@@ -41,6 +41,9 @@ LISTED_AT_ONCE = 1000
 CONNECT_SECONDS, ANSWER_SECONDS = 2, 10
 """A request that takes longer has failed; a write to a map does not wait much longer for others either."""
 
+PROBE_SECONDS = 1.5
+"""A store that was gone, and does not answer in so long, is still gone."""
+
 PROBE = "probe"
 """The name of the object that is written to see whether objects can be written."""
 
@@ -59,12 +62,13 @@ class Objects:
     """The objects of one bucket.  Any thread may use it; it is connected to when it is first used."""
 
     def __init__(self, bucket: Bucket) -> None:
-        self._outage = Outage(SERVER)
+        self._outage = Outage(SERVER, probe=self._ask)
         self._bucket = bucket
         self._changing = threading.Lock()
         self._refusal: str | None = None
         self._workers = ThreadPoolExecutor(AT_ONCE, "objects")
         self._store: S3Store | None = None
+        self._impatient: S3Store | None = None
 
     def put(self, pictures: Mapping[str, bytes]) -> None:
         """Store pictures by the names of their objects; they are durable when this returns.
@@ -180,9 +184,16 @@ class Objects:
         """Wait for what is under way."""
         self._workers.shutdown()
 
+    def _ask(self) -> None:
+        """See in little time whether the store, which was gone, answers again: it may take requests and not answer."""
+        with suppress(FileNotFoundError), self._answers():
+            if self._impatient is None:
+                self._impatient = _opened(self._bucket, PROBE_SECONDS)
+            obstore.get(self._impatient, PROBE)
+
     def _connected(self) -> S3Store:
         if self._store is None:
-            self._store = _opened(self._bucket)
+            self._store = _opened(self._bucket, ANSWER_SECONDS)
         return self._store
 
     @contextmanager
@@ -211,11 +222,11 @@ class Objects:
         return Unreachable(SERVER, f"cannot be reached, or fails: {_reason(text)}.")
 
 
-def _opened(bucket: Bucket) -> S3Store:
+def _opened(bucket: Bucket, seconds: float) -> S3Store:
     options: ClientConfig = {
         "allow_http": True,
         "connect_timeout": timedelta(seconds=CONNECT_SECONDS),
-        "timeout": timedelta(seconds=ANSWER_SECONDS),
+        "timeout": timedelta(seconds=seconds),
     }
     if bucket.certificate is not None:
         options["root_certificate"] = Path(bucket.certificate).read_bytes()

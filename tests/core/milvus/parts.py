@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from hashlib import sha256
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,8 @@ from pymilvus.exceptions import MilvusException
 
 from core.errors import StorageFailure
 from core.milvus.collection import collection_name
+from core.milvus.objects import Objects
+from core.milvus.pictures import StoredObject
 from tests.core.milvus.clients import ProcessClient
 from tests.core.milvus.servers import Server, Servers
 from tests.core.storage.frames import DIMENSION, ENCODER
@@ -84,6 +87,25 @@ class Milvus(_OfServer):
                 connections.remove_connection("asking")
 
 
+class ObjectStore(_OfServer):
+    """Asked to write an object and to read it."""
+
+    def __init__(self, servers: Servers, _: ProcessClient) -> None:
+        super().__init__(servers.objects)
+        self._bucket = servers.bucket
+
+    def ask(self) -> None:
+        content = b"asked"
+        asked = StoredObject("asked", len(content), sha256(content).digest())
+        objects = Objects(self._bucket)
+        try:
+            objects.put({asked.name: content})
+            if objects.read([asked]) != [content]:
+                raise StorageFailure("it does not read what it wrote")
+        finally:
+            objects.close()
+
+
 class Client:
     """A client in a process of its own; it takes as long as Python does to start."""
 
@@ -105,5 +127,6 @@ class Client:
 PARTS: Mapping[str, Callable[[Servers, ProcessClient], Part]] = {
     "milvus": Milvus,
     "postgres": Postgres,
+    "objects": ObjectStore,
     "client": Client,
 }
