@@ -142,8 +142,11 @@ class Server:
                 return
             except (psycopg.Error, StorageFailure) as error:
                 if time.monotonic() > until or self._process.poll() is not None:
+                    ended = self._process.poll()
                     self.end(signal.SIGKILL)
-                    raise TimeoutError(f"{self._command[0]} does not answer; see {self._folder}/output.log") from error
+                    said = (self._folder / "output.log").read_text(errors="replace")[-2000:]
+                    text = f"{self._command[0]} does not answer ({error}), or has ended ({ended}); it said: …{said}"
+                    raise TimeoutError(text) from error
                 time.sleep(0.2)
 
     def end(self, by: signal.Signals = signal.SIGTERM) -> None:
